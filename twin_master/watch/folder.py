@@ -197,7 +197,6 @@ class Watch:
             self.is_quiet, self._heard = "quiet" in last, time.monotonic()
             if patched is not None:
                 self._patch(*patched)
-            feed.begun(self)
             yield
 
     def decisions(self) -> Iterator[dict[str, Any]]:

@@ -18,10 +18,10 @@ from typing import Any
 
 from reporting.files import atomic_write_text, written
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.mission.journal import JOURNAL_NAME, last_turn, records
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
-from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, parsed, shown
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, shown
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed
@@ -278,6 +278,7 @@ class Topic(Feed):
     def __init__(
         self, session: Session, topic: str, scenario: Scenario, failed: Callable[[Exception], None]
     ) -> None:
+        super().__init__()
         self._session, self._topic, self._failed = session, topic, failed
         self._reader = MessageReader(scenario)
         self.came: deque[bytes] = deque(maxlen=HELD)
@@ -294,16 +295,16 @@ class Topic(Feed):
         """Return the observation in a message, which must name its turn or time."""
         if payload is None:
             return None, ""
-        message = parsed(self._reader, payload)
+        message = self._reader.message(payload)
         if isinstance(message, Message) and message.turn is None and message.time is None:
             message = Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
         return message, shown(payload)
 
     def begun(self, watch: Watch) -> None:
-        """Publish what the journal of a watch has, which was begun or taken up again."""
+        """Publish what the journal of a watch has, which is begun or taken up again."""
         self.watch = watch
         self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
-        size = self._journal.stat().st_size  # decisions before may have been published
+        _, size = last_turn(self._journal)  # decisions before may have been published
         if not self._path.is_file():
             atomic_write_text(self._path, f"{size:020d}\n")
         text = self._path.read_text(encoding="utf-8", errors="replace").strip()
@@ -383,6 +384,7 @@ class MqttFeed(Topic):
     ) -> None:
         session = Session(broker, watch.scenario.mission.name, watch.folder, note, self._pulse)
         super().__init__(session, broker.topic, scenario or watch.scenario, _raised)
+        self.begun(watch)
 
     def _pulse(self) -> dict[str, Any]:
         assert self.watch is not None

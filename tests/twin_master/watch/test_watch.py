@@ -39,7 +39,7 @@ from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, MappingFeed, file_feed
+from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines, mappings
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
@@ -193,7 +193,7 @@ def test_another_file_is_read_from_its_beginning(base, mission, plain, tmp_path)
     assert (counts.received, counts.missing, counts.duplicates, counts.rejected) == (52, 0, 0, 2)
     assert belief_of(watch) == mission.filtered[-1].tolist()
     counts = ran(watch, CsvFeed(tmp_path / "1.csv", watch.scenario))
-    assert (counts.missing, counts.late, counts.duplicates) == (0, 0, 0)
+    assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 8, 2 + 1 + 7)
     counts = ran(watch, CsvFeed(plain, watch.scenario))
     assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 13, 2 + 37)
     assert belief_of(watch) == mission.filtered[-1].tolist()
@@ -304,7 +304,7 @@ def test_silence_is_told_and_journalled(base, mission, plain, tmp_path, source):
     if source == "standard input":
         read, write = os.pipe()
         stream = os.fdopen(read, "rb")
-        feed: Feed = JsonLinesFeed(watch.scenario, stream)
+        feed: Feed = json_lines(watch.scenario, stream)
         texts = [json.dumps({"turn": turn, "strain_1": 1e-3}) + "\n" for turn in range(3)]
     else:
         header, *texts = plain.read_text().splitlines(keepends=True)[:4]
@@ -530,5 +530,5 @@ def test_silence_is_told_among_messages_that_are_all_refused(base, tmp_path):
         while not told and time.monotonic() < end:
             yield {"turn": 0, "no_sensor": 1.0}
 
-    watch.run(MappingFeed(flood(), watch.scenario), told.append)
+    watch.run(mappings(watch.scenario, flood()), told.append)
     assert [notice["kind"] for notice in told[0]["notices"]] == ["quiet"]

@@ -108,7 +108,8 @@ def of_gauge(path: Path, gain: float, channel: str = "g5") -> Path:
 
 def wait_until(found: Callable[[], object]) -> None:
     limit = time.monotonic() + 60.0
-    while not found() and time.monotonic() < limit:
+    while not found():
+        assert time.monotonic() < limit
         time.sleep(0.02)
 
 
