@@ -73,10 +73,12 @@ def watching(where: Broker, watch: Watch, turns: int) -> Iterator[list[str]]:
 
 
 def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, list[Told]]:
-    """Return a client and what it hears of a topic."""
-    heard = list[Told]()
+    """Return a client and what it hears of a topic, once the broker has let it."""
+    heard, let = list[Told](), list[object]()
     client = broker.client(name, heard)
+    client.on_subscribe = lambda *told: let.append(told)
     client.subscribe(topic, qos=1)
+    wait_until(lambda: let)
     return client, heard
 
 
@@ -267,7 +269,8 @@ def test_a_subscription_that_is_refused(base, broker, tmp_path):
 
 def test_a_watch_that_hears_nothing_says_so(base, broker, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.1)
-    watch, heard = soon_quiet(begun(base, tmp_path / "watch")), list[Told]()
+    watch = soon_quiet(begun(base, tmp_path / "watch"))
+    client, heard = heard_at(broker, "client", f"{TOPIC}/+")
 
     def begin() -> int:
         if not (child := os.fork()):
@@ -292,8 +295,6 @@ def test_a_watch_that_hears_nothing_says_so(base, broker, tmp_path, monkeypatch)
         return [one["state"] for one in heard if "state" in one][-1:]
 
     child = begin()
-    client = broker.client("client", heard)
-    client.subscribe(f"{TOPIC}/+", qos=1)
     wait_until(lambda: has(-1, "quiet"))
     wait_until(lambda: states() == ["quiet"])
     client.publish(TOPIC, b"garbage", qos=1)

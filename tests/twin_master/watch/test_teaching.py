@@ -24,9 +24,10 @@ from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.viewer.messages import Request, Teller
 from twin_master.watch.feeds import CsvFeed
-from twin_master.watch.folder import Tutor, Watch
-from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
-from twin_master.watch.trial import Outcome, patched_model, policy_change
+from twin_master.watch.folder import Watch
+from twin_master.watch.teaching import Teaching
+from twin_master.watch.trial import Outcome, both_patches, patched_model, policy_change
+from twin_master.watch.tutor import TRIED, Tutor, trial_sentence
 
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
@@ -48,19 +49,21 @@ place.rename(out)
 """
 
 
-def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-") -> Search:
+def tutor(
+    watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-", wait: bool = True
+) -> Tutor:
     answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
     answer.write_text(json.dumps([kind, patch_of(gain)]))
     script.write_text(ANSWER)
-    return Search(watch.folder, 7, (sys.executable, str(script), str(answer), gate))
+    return Tutor(watch, wait=wait, command=(sys.executable, str(script), str(answer), gate))
 
 
 def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, loose, tmp_path):
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
     decisions: list[dict[str, Any]] = []
-    told = search(watch, tmp_path, "named", -0.3)
-    watch.run(CsvFeed(loose, watch.scenario), lambda d: decisions.append(dict(d)), search=told)
+    teach = tutor(watch, tmp_path, "named", -0.3).act
+    watch.run(CsvFeed(loose, watch.scenario), lambda d: decisions.append(dict(d)), teach)
     records = journal(watch.folder)
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]
@@ -86,8 +89,8 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     stopped = watchful(base, tmp_path / "stopped")
     asked = verdict["to_turn"]
     for end in (asked + 5, asked + 15, None):
-        told = search(stopped, tmp_path, "named", -0.3)
-        stopped.run(CsvFeed(loose, stopped.scenario), str, turns=end, search=told)
+        teach = tutor(stopped, tmp_path, "named", -0.3).act
+        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, turns=end)
         again = watchful(stopped, tmp_path / f"{end}")
         check_same(again.folder, stopped.folder, JOURNAL_NAME)
         stopped = again
@@ -125,8 +128,7 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
-        finder = search(watch, tmp_path, kind, gain)
-        watch.run(CsvFeed(loose, watch.scenario), str, turns=44, search=finder)
+        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, turns=44)
         records = journal(watch.folder)
         assert not any("model" in record for record in records)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
@@ -134,11 +136,20 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         assert sum("searched for the cause" in text for text in notices) == 2
 
 
+def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence(base, recorded, tmp_path):
+    watch = watchful(base, tmp_path / "watch")
+    notice = {"kind": "verdict", "sentence": "It is so.", "sensors": []}
+    with watch.begun(CsvFeed(recorded, watch.scenario)):
+        watch.write(verdict={"tried": False, "to_turn": 0, "notice": notice})
+        watch.is_quiet = True
+        kinds = [[told["kind"] for told in next(watch.decisions())["notices"]] for _ in range(2)]
+    assert kinds == [["verdict", "heard"], []]
+
+
 def test_live_turns_do_not_wait_for_the_search(base, loose, tmp_path):
     watch = watchful(base, tmp_path / "watch")
-    feed, gate = CsvFeed(loose, watch.scenario), tmp_path / "gate"
-    feed.replayable = False  # as a broker
-    finder = search(watch, tmp_path, "group", -0.3, str(gate))
+    gate = tmp_path / "gate"
+    live = tutor(watch, tmp_path, "group", -0.3, str(gate), wait=False)
 
     def decide(decision: Any) -> None:
         if decision["turn"] == 40:
@@ -148,7 +159,7 @@ def test_live_turns_do_not_wait_for_the_search(base, loose, tmp_path):
                     return
                 time.sleep(0.02)
 
-    watch.run(feed, decide, search=finder)
+    watch.run(CsvFeed(loose, watch.scenario), decide, live.act)
     (verdict, *_) = [record for record in journal(watch.folder) if "verdict" in record]
     assert (verdict["turn"], verdict["verdict"]["turn"]) == (40, 40)
     assert verdict["verdict"]["to_turn"] < 35
@@ -156,20 +167,9 @@ def test_live_turns_do_not_wait_for_the_search(base, loose, tmp_path):
 
 def test_live_turns_do_not_wait_for_the_patched_model(base, mission, loose, tmp_path, monkeypatch):
     """It is built beside them, and believed behind the turn that the journal says, to the bit."""
-    tutors: list[Tutor] = []
-
-    class Kept(Tutor):
-        def __init__(self, *words: Any, wait: bool) -> None:
-            super().__init__(*words, wait=wait)
-            tutors.append(self)
-
-    monkeypatch.setattr("twin_master.watch.folder.Tutor", Kept)
-    monkeypatch.setattr("twin_master.watch.teaching.COURTESY", 0)
+    monkeypatch.setattr("twin_master.watch.tutor.COURTESY", 0)
     watch = watchful(base, tmp_path / "watch")
-    feed = CsvFeed(loose, watch.scenario)
-    feed.replayable = False  # as a broker
-    finder = search(watch, tmp_path, "group", -0.3)
-    trial_end = 0
+    live, trial_end = tutor(watch, tmp_path, "group", -0.3, wait=False), 0
 
     def decide(decision: Any) -> None:
         nonlocal trial_end
@@ -180,10 +180,10 @@ def test_live_turns_do_not_wait_for_the_patched_model(base, mission, loose, tmp_
         trial_end = verdict["turn"] + 10 if verdict else 0
         if trial_end and decision["turn"] == trial_end + 3:
             # The turns between were decided while it was built.
-            while tutors[0].outcome is None or not tutors[0].outcome.done():
+            while live.outcome is None or not live.outcome.done():
                 time.sleep(0.02)
 
-    watch.run(feed, decide, search=finder)
+    watch.run(CsvFeed(loose, watch.scenario), decide, live.act)
     model = next(record for record in journal(watch.folder) if "model" in record)
     assert model["turn"] == trial_end + 3
     assert model["model"]["from_turn"] < 20
@@ -256,7 +256,7 @@ def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():
         teaching.take(turn(number, math.log(100.0) - 0.1))
     assert teaching.question is None  # it did not hold ten turns after the alarm
     teaching.take(turn(16, math.log(100.0)))
-    assert teaching.question == Question(3, 16)
+    assert teaching.question == (3, 16)
     told = {"kind": "verdict", "sentence": "v"}
     teaching.take({"turn": 16, "verdict": {"to_turn": 16, "turn": 16, "tried": False, "notice": told}})
     assert teaching.question is None
@@ -264,13 +264,13 @@ def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():
     for number in range(17, 40):
         teaching.take(turn(number, 10.0))
         assert (teaching.question is not None) == (number >= 27)
-    assert teaching.question == Question(3, 27)
+    assert teaching.question == (3, 27)
     assert teaching.untold == []
     teaching.take({"turn": 40, "model": {"from_turn": 8, "notice": told, "alarms": [alarm]}})
     assert (teaching.question, teaching.untold) == (None, [told, alarm])
     for number in range(41, 60):
         teaching.take(turn(number, 10.0))
-    assert teaching.question == Question(8, 49)  # the alarm of the new model, and not before it was believed
+    assert teaching.question == (8, 49)  # the alarm of the new model, and not before it was believed
 
 
 def test_a_second_patch_stands_beside_the_first(tmp_path):
