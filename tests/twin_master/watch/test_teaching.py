@@ -17,7 +17,7 @@ from discrepancy.verdict_folder import write_verdict_folder
 from tests.command_line import refused
 from tests.discrepancy.rigs import ORIGIN, drag_found
 from tests.twin_master.runs import check_same, journal, text_of, written
-from tests.twin_master.watch.watches import decided, of_gauge, patch_of, ran, viewed, watchful
+from tests.twin_master.watch.watches import beliefs_of, decided, of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.mission.replay import replay
@@ -181,16 +181,10 @@ def test_live_turns_do_not_wait_for_the_patched_model(noticing, mission, loose, 
     assert model["turn"] == trial_end + 3
     assert model["model"]["from_turn"] < 20
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
-    twin, first = noticing.models[0].knowledge.twin(), model["model"]["from_turn"]
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
-    knew = noticing.models[1].knowledge.twin()
-    for number, row in enumerate(observed):
-        if number == first:
-            knew.restore_state(twin.save_state())
-            twin = knew
-        found = twin.turn(row, int(mission.control_index[number]))
-    assert journal(noticing.folder)[-1]["filtered"] == found.filtered.tolist()
+    beliefs = beliefs_of(noticing, observed, mission.control_index, model["model"]["from_turn"])
+    assert journal(noticing.folder)[-1]["filtered"] == beliefs[-1]
     again = watchful(noticing, tmp_path / "again")
     twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)]
     assert twins[0].save_state() == twins[1].save_state()
