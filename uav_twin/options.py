@@ -24,25 +24,16 @@ def refuse_before(context: typer.Context) -> None:
 def show(command: str, *, words: "Words | None" = None, **values: Any) -> None:
     """Print what a command found as `[printed]` of a file of words says, by default `words.toml` here.
 
-    It lists blocks. `say` is a line, and `table` a table of the file that is printed where it has rows; `of`
-    is an expression of the values that gives the rows, or what is said one by one, each as `row`. A block
-    whose `when` is false is left out, and so is a line that is empty.
+    It lists blocks as `Words.told` takes them.
     """
-    from reporting.page import Words, evaluated, rendered
+    from reporting.page import Words
 
     words = words or Words("uav_twin")
-    for block in words.content["printed"][command]:
-        if "when" in block and not evaluated(block["when"], **values):
-            continue
-        rows = evaluated(block["of"], **values) if "of" in block else None
-        if "table" in block:
-            columns, cells = words.table(block["table"], rows or (), **values)
-            if cells:
-                terminal.print_table([column.name for column in columns], cells)
-            continue
-        for row in (None,) if rows is None else rows:
-            if line := rendered(block["say"], **values, row=row):
-                terminal.say(line)
+    for kind, what in words.told(words.content["printed"][command], **values):
+        if kind == "table":
+            terminal.print_table([column.name for column in what[1].columns], what[1].rows)
+        else:
+            terminal.say(what)
 
 
 def say_packed(info: "FmuInfo") -> None:

@@ -12,11 +12,9 @@ from reporting.words import listing
 
 from .text import WORDS, number, unit_text
 
-HEADINGS = tuple(column.name for column in WORDS.table("decide", ())[0])
-
 
 def rows_of(found: Separability) -> list[tuple[str, ...]]:
-    """Return one row for each effect that can be tested, under `HEADINGS`."""
+    """Return one row for each effect that can be tested, in the columns of the table `decide`."""
     return [_row(found, item) for item in found.detectability if not item.reason]
 
 

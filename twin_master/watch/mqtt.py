@@ -84,7 +84,7 @@ class Session:
         self._last: Any = None
         self._flying: dict[int, Topic] = {}
         self.behind: dict[Topic, None] = {}
-        self._connected = self._begun = False
+        self._begun = False
         self._failure = self._told = ""
         self._retry, self._pause, self._beat = 0.0, _RETRY_SECONDS[0], 0.0
 
@@ -92,6 +92,10 @@ class Session:
     def room(self) -> bool:
         """Whether a decision can be sent at once."""
         return self._connected and len(self._flying) < _DECISIONS_WAITING
+
+    @property
+    def _connected(self) -> bool:
+        return self._client is not None and self._client.is_connected()
 
     def _connect(self) -> None:
         """Connect with nothing of the connection before: it is in the topices, and at the broker."""
@@ -125,7 +129,6 @@ class Session:
         if reason.is_failure:
             self._failure = said("watch.user", where=self._where, why=reason, variable=PASSWORD_VARIABLE)
             return
-        self._connected = True
         if self._clean:
             return
         if self._kept and not flags.session_present:
@@ -156,7 +159,6 @@ class Session:
     def _lost(self) -> None:
         """Let go of a connection, to try again later; the first time it ends the watch."""
         failure, self._failure, self._client = self._failure, "", None
-        self._connected = False
         if not self._begun:
             raise MissionInputError(f"{failure}.")
         if failure != self._told:
@@ -193,7 +195,7 @@ class Session:
         if self._clean and self._connected:
             # The old session has ended. One that begins so is forgotten by brokers that start again.
             self._client.disconnect()
-            self._client, self._clean, self._connected, self._failure = None, False, False, ""
+            self._client, self._clean, self._failure = None, False, ""
             return
         for topic in [*self.behind]:
             topic.publish()
