@@ -144,18 +144,18 @@ FUNCTIONS = (
     evidence_rows, not_compared_rows, parameter_rows, score_rows, effect_rows, what_is_missing,
     sizes_sentence, deciding, calibration_rows, group_lines, rows_of, when_sentence, words.hypothesis_name,
     words.headline, words.meaning, words.shares_sentence,
-    words.remainders_sentence, words.residual_sizes, words.tested_shares,
+    words.remainders_sentence, words.residual_sizes, words.tested_shares, words.force_sentence,
 )  # fmt: skip
-"""What templates of the page call."""
+"""What templates of the page and of the command call."""
 
 
 def said_on_page(content: ReportInput) -> dict[str, Any]:
-    """Return by name what templates of the page say of an investigation."""
+    """Return by name what templates of the page, and of the command, say of an investigation."""
     found = content.investigation
     verdict, proof, search = found.verdict, found.proof, found.search
     told = {fault.sentence for fault in found.faults}
     return {
-        **{function.__name__: function for function in FUNCTIONS}, "words": WORDS.content,
+        **{function.__name__: function for function in FUNCTIONS}, "texts": WORDS.content,
         "content": content, "found": found, "origin": content.origin, "tried": content.self_calibration,
         "able": content.separability, "verdict": verdict, "proof": proof, "force": verdict.force,
         "location": found.location, "fitted": verdict.kind is not VerdictKind.DATA_ERROR,
