@@ -11,7 +11,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
 from discrepancy.judgement.when import NO_GAP, when_sentence
 from discrepancy.report import text as words
-from discrepancy.report.check_tables import group_lines, rows_of
+from discrepancy.report.check_tables import group_lines, neighbours, seen_of
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import WORDS
 from discrepancy.self_calibration import SelfCalibration, Share, outcomes
@@ -142,8 +142,8 @@ def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Share]]:
 
 FUNCTIONS = (
     evidence_rows, not_compared_rows, parameter_rows, score_rows, effect_rows, what_is_missing,
-    sizes_sentence, deciding, calibration_rows, group_lines, rows_of, when_sentence, words.hypothesis_name,
-    words.headline, words.meaning, words.shares_sentence,
+    sizes_sentence, deciding, calibration_rows, group_lines, neighbours, seen_of, when_sentence,
+    words.hypothesis_name,    words.headline, words.meaning, words.shares_sentence,
     words.remainders_sentence, words.residual_sizes, words.tested_shares, words.force_sentence,
 )  # fmt: skip
 """What templates of the page and of the command call."""
