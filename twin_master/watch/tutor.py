@@ -20,7 +20,7 @@ from twin_master.errors import TwinMasterError
 from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.watch.folder import Watch
-from twin_master.watch.trial import CANNOT, Outcome
+from twin_master.watch.teaching import CANNOT, Outcome
 
 TRIAL_TURNS = 10
 """Turns behind a verdict, none of which it has seen, in which model and patched model are compared."""
@@ -186,4 +186,4 @@ def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str
     said = f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
     if trial["kind"] == GROUP:
         said += " It is one of a group: which of them is true these data cannot tell."
-    return f"{said} {outcome.policy_change}".rstrip()
+    return f"{said} {outcome.record['policy_change']}".rstrip()

@@ -23,6 +23,7 @@ from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
 from tests.twin_master.watch.watches import (
     begun,
+    beliefs_of,
     decided,
     killed_at,
     of_gauge,
@@ -42,7 +43,6 @@ from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines, mappings
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
-from twin_master.watch.message import Message
 from twin_master.watch.opening import flown, resumed_watch
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -371,11 +371,8 @@ def test_a_changed_journal_and_other_folders_are_refused(scenario, whole, tmp_pa
     fed = [list(FolderFeed(folder, scenario.scenario).messages(None)) for folder in (whole, copy)]
     assert "line 11 of journal.jsonl was changed or is damaged" in str(fed[1].pop(9)[0])
     del fed[0][9]
-    for (one, _), (other, _) in zip(*fed, strict=True):
-        assert isinstance(one, Message)
-        assert isinstance(other, Message)
-        np.testing.assert_array_equal(one.observed, other.observed)
-        assert one.turn == other.turn
+    rows = [[(message.turn, *message.observed) for message, _ in own] for own in fed]
+    np.testing.assert_array_equal(*rows)
     with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
         uav_twin.fly(scenario, tmp_path / "run")
 
@@ -416,15 +413,9 @@ def test_a_patch_is_believed_from_a_stated_turn_on(watch, mission, tmp_path):
         watch.run(feed, str, patched=(patch, 41))
     watch.run(feed, str, turns=45, patched=(patch, 20))
     watch.store(ran(watch, feed), report=False)
-    twin, beliefs = watch.models[0].knowledge.twin(), []
-    for turn, row in enumerate(observed):
-        if turn == 20:
-            knew = watch.models[1].knowledge.twin()
-            knew.restore_state(twin.save_state())
-            twin = knew
-        beliefs.append(twin.turn(row, int(mission.control_index[turn])).filtered)
     run = uav_twin.open_run(watch.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 20)
+    beliefs = beliefs_of(watch, observed, mission.control_index, 20)
     np.testing.assert_array_equal(run["filtered"]["probability"].values, beliefs)
     figures = figures_of(watch.folder)
     assert figures["gap_after_patch_20"] < 0.97 * figures["gap_before_patch_20"]
