@@ -13,7 +13,7 @@ from reporting.arrays import Float, Index, Unsigned
 from twin_master.errors import FleetError
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.twin import build_graphical_model, state_tables
 from twin_master.scenario.schema import Scenario
 
 
@@ -60,7 +60,7 @@ def _on_points(
 class Worsening:
     """The K probabilities to worsen of a scenario, and what its transitions make of them.
 
-    An entry of the joint table is a product: p for each factor that worsens, 1 - p for each that could.
+    An entry of the joint table is a product over the F factors of the state, each linear in one probability.
 
     Attributes
     ----------
@@ -70,8 +70,10 @@ class Worsening:
         What the scenario assumes.
     start, source
         Of the predecessor lists of all states.
-    worsens, stays : (non-zeros, K)
-        How often each probability, and its complement, is a factor of an entry.
+    place : (F, non-zeros)
+        Place of the probability among the K.
+    never, always : (F, non-zeros)
+        What each factor has of an entry where that probability is 0, and where it is 1.
     prior : (S,)
         p(D_0).
     """
@@ -80,8 +82,9 @@ class Worsening:
     assumed: Float
     start: Unsigned
     source: Unsigned
-    worsens: Float
-    stays: Float
+    place: Index
+    never: Float
+    always: Float
     prior: Float
 
     @classmethod
@@ -101,29 +104,35 @@ class Worsening:
             own = entry if isinstance(entry, dict) else {None: entry}
             keys += [(control, name) for name in own]
             assumed += list(own.values())
-        halved = scenario.transition.model_copy(
-            update={"probability": dict.fromkeys(scenario.control_names, 0.5)}
-        )
-        model = build_graphical_model(scenario.model_copy(update={"transition": halved}))
+
+        def worsening(probability: float) -> Scenario:
+            moves = {"probability": dict.fromkeys(scenario.control_names, probability)}
+            return scenario.model_copy(update={"transition": scenario.transition.model_copy(update=moves)})
+
+        model = build_graphical_model(worsening(0.5))
         _, _, start, source, *_ = predecessor_lists([model.transition.matrix])
         shape, size = model.states.shape, model.states.size
         row = np.repeat(np.arange(len(start) - 1), (start[1:] - start[:-1]).astype(np.int64))
         in_force, to = np.divmod(row, size)
         before, after = np.unravel_index(source.astype(np.int64), shape), np.unravel_index(to, shape)
-        worsens, stays = np.zeros((len(row), len(keys))), np.zeros((len(row), len(keys)))
+        place, never, always = [], [], []
         for factor, name in enumerate(scenario.state_names):
-            for number, chosen in enumerate(scenario.control_names):
-                k = keys.index((chosen, name) if (chosen, name) in keys else (chosen, None))
-                here = in_force == number
-                worsens[:, k] += here & (after[factor] == before[factor] + 1)
-                can = before[factor] < shape[factor] - 1
-                stays[:, k] += here & can & (after[factor] == before[factor])
+            owned = [(chosen, name if (chosen, name) in keys else None) for chosen in scenario.control_names]
+            place.append(np.array([keys.index(key) for key in owned])[in_force])
+            for found, probability in ((never, 0.0), (always, 1.0)):
+                tables = state_tables(worsening(probability))
+                own = np.array([tables[chosen][name] for chosen in scenario.control_names])
+                found.append(own[in_force, before[factor], after[factor]])
         names = tuple(control if name is None else f"{control}, {name}" for control, name in keys)
-        return cls(names, np.array(assumed), start, source, worsens, stays, model.prior)
+        parts = np.array(place), np.array(never), np.array(always)
+        return cls(names, np.array(assumed), start, source, *parts, model.prior)
 
     def probability(self, points: Float) -> Float:
-        """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""
-        return np.asarray(np.exp(np.log(points) @ self.worsens.T + np.log1p(-points) @ self.stays.T))
+        """Return the entries of the lists (P, non-zeros) for probabilities (P, K)."""
+        result = np.ones((len(points), len(self.source)))
+        for place, never, always in zip(self.place, self.never, self.always, strict=True):
+            result *= never + points[:, place] * (always - never)
+        return result
 
 
 def scaled_likelihood(model: GaussianSensorModel, observed: Float, control: Index) -> tuple[Float, Float]:

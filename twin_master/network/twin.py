@@ -38,21 +38,10 @@ DEFAULT_LAG = 50
 """Turns back that a twin smooths and may be revised."""
 
 
-def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
-    """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
+def state_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
+    """Return for each control the transitions (L, L) of each factor of the state, by their names.
 
-    Its factors move independently given the control, and are independent before the first observation.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    leaving : float
-        Factor on the probabilities of each factor of the state to leave a level.
-
-    Raises
-    ------
-    InvalidModelError
-        The factor makes a probability larger than one.
+    Parameters and errors are those of `build_graphical_model`.
     """
     tables: dict[str, dict[str, Float]] = {}
     for control in scenario.control_names:
@@ -77,10 +66,28 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
             tables[action.name][name] = graphical_model.repaired_table(
                 tables[action.name][name], action.success
             )
+    return tables
+
+
+def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
+    """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
+
+    Its factors move independently given the control, and are independent before the first observation.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    leaving : float
+        Factor on the probabilities of each factor of the state to leave a level.
+
+    Raises
+    ------
+    InvalidModelError
+        The factor makes a probability larger than one.
+    """
     levels = {factor.name: factor.levels for factor in scenario.state}
-    return GraphicalModel.from_tables(
-        levels, tables, {factor.name: factor.prior for factor in scenario.state}
-    )
+    prior = {factor.name: factor.prior for factor in scenario.state}
+    return GraphicalModel.from_tables(levels, state_tables(scenario, leaving), prior)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -61,6 +61,20 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability):
             assert found[twin, row] == pytest.approx(expected.sum(), abs=1e-12)
 
 
+def test_evidence_of_twins_that_are_repaired_is_that_of_all_paths():
+    table = tiny({"2g": 0.07, "3g": 0.2}).to_dict()
+    repair = {"control": "2g", "cost": 1.0, "repairs": ["z1"], "success": 0.7}
+    table["action"] = [{"name": "mend", **repair}, {"name": "renew", **repair, "success": 1.0}]
+    scenario = parse_scenario(table, "repaired")
+    worsening, model = Worsening.of(scenario), build_graphical_model(scenario)
+    generator = np.random.default_rng(6)
+    likelihood, control = generator.random((3, 4, 9)), np.array([[1, 2, 0, 1], [1, 1, 3, 0], [0, 3, 2, 2]])
+    found = transition_evidence(worsening, worsening.assumed[None], likelihood, control)[:, 0]
+    for twin in range(3):
+        *_, expected = enumerate_trajectories(model, control[twin], np.log(likelihood[twin]))
+        assert found[twin] == pytest.approx(expected.sum(), abs=1e-12)
+
+
 def test_evidence_is_that_of_the_filter():
     scenario = tiny({"2g": 0.07, "3g": 0.2}, levels=5)
     model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
