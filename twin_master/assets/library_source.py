@@ -21,7 +21,7 @@ from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetSource, FlownAndBelieved
+from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import ParameterDraws
@@ -276,11 +276,6 @@ class LibrarySource(AssetSource):
         other = {True: " of another FMU", False: " of it", None: ""}[self._other_fmu]
         return f"observation library{other}"
 
-    @property
-    def origin(self) -> FlownAndBelieved:
-        """The library, twice."""
-        return FlownAndBelieved(self.words, self.words, differ=self._other_fmu is True)
-
     @cached_property
     def library(self) -> ObservationLibrary:
         """The library, which has what the scenario asks for.
@@ -336,6 +331,7 @@ class LibrarySource(AssetSource):
         hashes = self._model.prepare(self._folder, progress) if own else {}
         # Of several FMUs each has its own hash.
         self._other_fmu = self.library.fmu_hash != hash_file(fmu) if fmu.exists() else None
+        self.differ = self._other_fmu is True
         return {**hashes, "observation_library": hash_file(self.path(OBSERVATIONS_COPY))}
 
     def draws(self, seed: int) -> ParameterDraws:

@@ -190,13 +190,8 @@ class RecordedStructure(Asset):
         begin, names = bound.observation_slice("acceleration").start, self._section.accelerometers
         variables = bound.observation["acceleration"].variables
         self._chosen = [begin + variables.index(f"acceleration.{name}") for name in names]
-        self._units = {name: item.unit for name, item in (*bound.parameter.items(), *bound.control.items())}
+        self.units = {name: item.unit for name, item in (*bound.parameter.items(), *bound.control.items())}
         self._turn = 0
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units of parameters and control inputs."""
-        return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make and identify the record of a turn.

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 from pydantic import ModelWrapValidatorHandler, model_validator
 
 from reporting.toml_file import shown
-from scenarios import asset_scripts, binding_files, structure_files
+from scenarios import asset_scripts, binding_files, recording_files, structure_files
 from twin_master.scenario.section import Section, short
 
 KIND_FOLDER = Path(__file__).parents[1] / "assets"
@@ -37,6 +37,7 @@ class FileSection(Section):
     shipped: ClassVar = {
         "binding": binding_files,
         "design": _shipped_designs,
+        "observations": recording_files,
         "script": asset_scripts,
         "structure": structure_files,
     }

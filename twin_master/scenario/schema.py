@@ -130,9 +130,7 @@ class Calibration(FileSection):
     mean: Number | None = None
     standard_deviation: NotNegative | None = None
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copy of the calibration file stands in a run folder."""
-        return {"file": CALIBRATION_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"file": CALIBRATION_COPY}
 
     def faults(self) -> Iterator[Fault]:
         """Yield what a source needs, or does not take."""
