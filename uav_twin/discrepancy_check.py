@@ -11,10 +11,8 @@ from uav_twin.options import show, told
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
-    from discrepancy.catalogue.entry import Effect
     from discrepancy.checks.fault import DataFault
     from discrepancy.judgement.separability import Separability
-    from discrepancy.models.interface import Model
 
 
 @told("discrepancy check")
@@ -27,6 +25,8 @@ def check(
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.judgement.separability import separability
     from discrepancy.model_choice import choose_model
+    from discrepancy.report.check_tables import group_lines, needs, neighbours, seen_of
+    from discrepancy.report.text import WORDS
     from discrepancy.workflow import checked
 
     data = read_campaign(campaign)
@@ -43,7 +43,9 @@ def check(
     if json:
         terminal.print_json(_record(data, choice.model.name, faults, able))
     else:
-        _show(data, choice.model, faults, able, catalogue)
+        of_able = {item.__name__: item for item in (seen_of, neighbours, group_lines, needs)}
+        given = {"data": data, "model": choice.model, "faults": faults, "catalogue": catalogue}
+        show("check", words=WORDS, able=able, **given, **of_able)
     if able is None:
         typer.secho("Mend the faults first: conclusions from these data would be wrong.", fg="red", err=True)
         raise typer.Exit(1)
@@ -73,22 +75,3 @@ def _record(
         ],
         "confusion_groups": [] if able is None else [list(group) for group in able.groups],
     }  # fmt: skip
-
-
-def _show(
-    data: "Campaign",
-    model: "Model",
-    faults: "Sequence[DataFault]",
-    able: "Separability | None",
-    catalogue: "Sequence[Effect]",
-) -> None:
-    from discrepancy.report import check_tables as said
-    from discrepancy.report.text import WORDS
-
-    rows, lines = [], list[str]()
-    if able is not None:
-        rows = [(name, *row[1:-1]) for name, *row in map(list, said.rows_of(able))]
-        lines = [*said.untested_lines(able), *said.confused_lines(able)]
-        lines += said.group_lines(able, "to which is said above")
-        lines += said.needs(able, data, catalogue, model.kinds)
-    show("check", words=WORDS, data=data, model=model, faults=faults, rows=rows, lines=lines)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import shlex
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,8 @@ if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
     from discrepancy.document import Origin
     from discrepancy.model_choice import ModelChoice
-    from discrepancy.report.figures import Pack
+    from discrepancy.report.figures import Pack, ReportInput
     from discrepancy.self_calibration import SelfCalibration
-    from discrepancy.verdict import Proof, Verdict
     from discrepancy.workflow import Investigation
     from reporting.progress import Progress
 
@@ -85,22 +83,21 @@ def run(
         place = write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
     if json:
         terminal.print_json(_record(folder, report=None if no_report else place))
-    _conclude(found, tried, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
+    _conclude(content, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
 
 
-def _conclude(
-    found: "Investigation", tried: "SelfCalibration | None", folder: Path, place: str, *, silent: bool
-) -> None:
+def _conclude(content: "ReportInput", folder: Path, place: str, *, silent: bool) -> None:
     """Print the conclusion; data at fault end the command with 1."""
     from discrepancy.application import gives
     from discrepancy.verdict import VerdictKind
 
+    found = content.investigation
     fault = found.verdict.kind is VerdictKind.DATA_ERROR
     if fault:
         for sentence in (found.verdict.sentence, *(fault.sentence for fault in found.faults[1:])):
             typer.secho(sentence, fg="red", err=True)
     elif not silent:
-        _show(found, tried, folder)
+        _show(content, folder)
     if not silent:
         terminal.say(place)
     if fault:
@@ -219,66 +216,13 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
     return pack
 
 
-def _show(found: "Investigation", tried: "SelfCalibration | None", folder: Path) -> None:
+def _show(content: "ReportInput", folder: Path) -> None:
     from discrepancy.files.verdict import PATCH_NAME, read_patch
-    from discrepancy.judgement.conclusion import probability_text
-    from discrepancy.judgement.when import when_sentence
-    from discrepancy.report import text
-    from discrepancy.verdict import VerdictKind
+    from discrepancy.report.page import said_on_page
+    from discrepancy.report.text import WORDS
 
-    verdict, sizes, probability = found.verdict, "", ""
     if (patch_file := folder / PATCH_NAME).is_file():
-        stored = read_patch(patch_file)
-        sizes = text.size_sentence(found, stored.effects, [effect.intervals for effect in stored.effects])
-    when = when_sentence(verdict.windows)
-    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
-        none = verdict.kind is VerdictKind.NOTHING_MISSING
-        probability = f"Probability {probability_text(verdict.probability)}{'' if none else against}."
-    estimates = [
-        (
-            effect.identifier, effect.place, item.name.replace("_", " "), *text.estimate_text(item),
-            text.unit_text(item.unit),
-        )
-        for effect in verdict.effects
-        for item in (*effect.parameters, *effect.shape)
-    ]  # fmt: skip
-    conclusion = (
-        text.headline(verdict),
-        sizes,
-        text.force_sentence(verdict.force) if verdict.force else "",
-        text.shares_sentence(verdict),
-        text.remainders_sentence(verdict),
-        "" if when in verdict.sentence else when,
-        probability,
-    )
-    terminal.say(f"Verdict: {verdict.kind.value}", bold=True)
-    show(
-        "run",
-        words=text.WORDS,
-        verdict=verdict,
-        conclusion=conclusion,
-        estimates=estimates,
-        proof="" if found.proof is None else _proof_sentence(found.proof, verdict, found.campaign),
-        faults=[fault.sentence for fault in found.faults],
-        tried=tried,
-    )
-
-
-def _proof_sentence(proof: "Proof", verdict: "Verdict", campaign: "Campaign") -> str:
-    from discrepancy.report.text import number, percent, residual_sizes, rests_on_force, scored
-
-    first, second, which = scored(proof)
-    held_out = ", ".join(trial.name for trial in campaign.held_out)
-    where = f"{which} trials ({held_out if which == 'held-out' else 'none is held out'})"
-    if verdict.explained is not None and not rests_on_force(verdict):
-        before, after = residual_sizes(verdict.explained)
-        return f"Residuals on {where}: rms of {before} noise deviations before, {after} with the effect."
-    if not isfinite(first.chi_square_per_dof):
-        return proof.remaining
-    closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
-    why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
-    return (
-        f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "
-        f"{number(second.chi_square_per_dof)} with the effect{closed}.{why}"
-    )
+        intervals = [effect.intervals for effect in read_patch(patch_file).effects]
+        content = dataclasses.replace(content, intervals=intervals)
+    terminal.say(f"Verdict: {content.investigation.verdict.kind.value}", bold=True)
+    show("run", words=WORDS, **said_on_page(content))

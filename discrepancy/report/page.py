@@ -11,7 +11,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
 from discrepancy.judgement.when import NO_GAP, when_sentence
 from discrepancy.report import text as words
-from discrepancy.report.check_tables import group_lines, rows_of
+from discrepancy.report.check_tables import group_lines, neighbours, seen_of
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import WORDS
 from discrepancy.self_calibration import SelfCalibration, Share, outcomes
@@ -142,20 +142,20 @@ def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Share]]:
 
 FUNCTIONS = (
     evidence_rows, not_compared_rows, parameter_rows, score_rows, effect_rows, what_is_missing,
-    sizes_sentence, deciding, calibration_rows, group_lines, rows_of, when_sentence, words.hypothesis_name,
-    words.headline, words.meaning, words.shares_sentence,
-    words.remainders_sentence, words.residual_sizes, words.tested_shares,
+    sizes_sentence, deciding, calibration_rows, group_lines, neighbours, seen_of, when_sentence,
+    words.hypothesis_name,    words.headline, words.meaning, words.shares_sentence,
+    words.remainders_sentence, words.residual_sizes, words.tested_shares, words.force_sentence,
 )  # fmt: skip
-"""What templates of the page call."""
+"""What templates of the page and of the command call."""
 
 
 def said_on_page(content: ReportInput) -> dict[str, Any]:
-    """Return by name what templates of the page say of an investigation."""
+    """Return by name what templates of the page, and of the command, say of an investigation."""
     found = content.investigation
     verdict, proof, search = found.verdict, found.proof, found.search
     told = {fault.sentence for fault in found.faults}
     return {
-        **{function.__name__: function for function in FUNCTIONS}, "words": WORDS.content,
+        **{function.__name__: function for function in FUNCTIONS}, "texts": WORDS.content,
         "content": content, "found": found, "origin": content.origin, "tried": content.self_calibration,
         "able": content.separability, "verdict": verdict, "proof": proof, "force": verdict.force,
         "location": found.location, "fitted": verdict.kind is not VerdictKind.DATA_ERROR,

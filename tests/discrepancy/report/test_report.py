@@ -12,17 +12,16 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.report.check_tables import (
-    confused_lines,
     group_lines,
     needs,
     neighbours,
-    rows_of,
-    untested_lines,
+    seen_of,
 )
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import parameter_rows, render_report
 from discrepancy.report.residual_figures import size_table
 from discrepancy.report.text import (
+    WORDS,
     headline,
     number,
     percent,
@@ -147,11 +146,6 @@ def test_what_was_not_compared_is_told_by_reason_and_each_confusion_by_name(drag
     text = page_of(drag, not_fitted=left)
     assert "<td>No flight trial.</td><td>washout and inertia relief</td>" in text
     assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in text
-    assert untested_lines(able) == ["Not testable: washout. The campaign has no flight trial to fit."]
-    lines = confused_lines(able)
-    assert len(lines) == sum(bool(neighbours(able, name)) for name in able.identifiers)
-    for line in lines:
-        assert all(other in line for other in neighbours(able, line.split()[1]))
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -170,10 +164,19 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     assert told.endswith("with noise 2 times smaller or 4 times as many trials.")
 
 
-def test_rows_of_what_can_be_decided(drag, able):
-    rows = {row[0]: row for row in rows_of(able)}
+def test_what_can_be_decided(drag, able):
+    words = {"neighbours": neighbours, "seen_of": seen_of, "able": able}
+    _, cells = WORDS.table("decide", [item for item in able.detectability if not item.reason], **words)
+    rows = {row[0].replace(" ", "_"): row for row in cells}
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
+    told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
+    said = list(WORDS.told(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told))
+    assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
+    confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
+    assert len(confused) == sum(bool(neighbours(able, name)) for name in able.identifiers)
+    for line in confused:
+        assert all(other in line for other in neighbours(able, line.split()[1]))
     for row, name in enumerate(able.identifiers):
         near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSED
         near[row] = False
