@@ -365,11 +365,17 @@ FLOWN_DESIGN_HASH = "flown_design"
 BINDING_COPY = "asset/binding.toml"
 PATCH_COPY = "asset/patch.json"
 MODEL_PATCH_COPY = "asset/model_patch.json"
+LIBRARY_COPY = "asset/UAVconfig.json"
+OBSERVATIONS_COPY = "asset/observation_library.nc"
+SSP_COPY = "asset/system.ssp"
 HASHED = {
     "binding": BINDING_COPY,
     "calibration": CALIBRATION_COPY,
     "patch": PATCH_COPY,
     "model_patch": MODEL_PATCH_COPY,
+    "observation_library": OBSERVATIONS_COPY,
+    "ssp": SSP_COPY,
+    "strain_library": LIBRARY_COPY,
 }
 """Files whose hashes a run tells, and where their copies stand in its folder."""
 

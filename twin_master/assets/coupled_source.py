@@ -20,7 +20,7 @@ from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from reporting.toml_file import Fault
-from twin_master.assets.asset_source import BINDING_COPY
+from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource
 from twin_master.errors import MissionInputError
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, FileSection
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from fmu_asset.coupling.wiring import Wiring
     from twin_master.assets.fmu_source import Session
 
-SSP_COPY = "asset/system.ssp"
 COMPONENT_FOLDER = "asset/components"
 
 
@@ -148,8 +147,8 @@ class SeveralSource(FmuSource):
         raise NotImplementedError
 
     def _packed(self, progress: Progress) -> dict[str, Path]:
-        """Pack what is not an FMU yet; return the files that are hashed."""
-        raise NotImplementedError
+        """Pack what is not an FMU yet; return what is flown, by the names of the hashes."""
+        return {}
 
     def _make(self, progress: Progress) -> dict[str, str]:
         hashes = {name: hash_file(file) for name, file in self._packed(progress).items()}
@@ -188,9 +187,6 @@ class SspSource(SeveralSource):
             raise MissionInputError(sentence)
         self._session(binding, self.parameters(), wiring)
         return binding
-
-    def _packed(self, progress: Progress) -> dict[str, Path]:
-        return {"ssp": self.path(SSP_COPY)}
 
 
 class CoupledSource(SeveralSource):

@@ -1,6 +1,7 @@
 """The wing FMU on the test bench: the laboratory experiments of the calibration, flown through FMI."""
 
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -55,11 +56,7 @@ class FmuTestBench(ExitStack):
         self._binding = load_binding(binding_files()[BINDING]).with_regions(regions)
         check_recorded(len(self._binding.observation["strain"].variables))
         self._parameters = {
-            "young_modulus_factor": truth.young_modulus_factor,
-            "servo_mass": truth.servo_mass,
-            "pitot_mass": truth.pitot_mass,
-            "damping_alpha": truth.damping_alpha,
-            "damping_beta": truth.damping_beta,
+            name: value for name, value in asdict(truth).items() if name not in ("geometry", "stiffness_loss")
         }
         self._health = dict(zip(regions, losses_of(truth.stiffness_loss, tuple(regions)), strict=True))
         self._static = self._session(self._binding, {"response": float(QUASI_STATIC)})

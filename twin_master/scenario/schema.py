@@ -252,7 +252,7 @@ class Scenario(Section):
     @property
     def another_model(self) -> bool:
         """Whether what is flown is known to be another model than the one that the twin believes."""
-        return self.asset.differs_from(self.belief)
+        return self.belief.kind != "asset" and (self.asset.departs or self.belief.departs)
 
     def moved(self, folder: Path) -> Self:
         """Return the scenario with its relative paths from a folder."""
