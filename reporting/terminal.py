@@ -185,7 +185,7 @@ def _extend(command: Any, options: Sequence[Any]) -> None:
 def _interruptible(call: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(call)
     def guarded(*arguments: Any, **options: Any) -> Any:
-        before, reporting.progress.narrator = reporting.progress.narrator, progress
+        before, reporting.progress.narrator = reporting.progress.narrator, functools.cache(progress)
         try:
             return call(*arguments, **options)
         except KeyboardInterrupt:

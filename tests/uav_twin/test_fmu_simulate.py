@@ -14,7 +14,6 @@ from fmu_asset.door.binding import load_binding, parse_binding
 from fmu_asset.door.experiment import default_experiment, fly, read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
-from reporting.progress import SilentProgress
 from tests.command_line import refused, said
 from tests.refusals import Inputs
 
@@ -180,7 +179,7 @@ def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu):
     planned = default_experiment(read_fmu(fmu))
     assert (planned.binding.binding.start_time, planned.binding.step_size, planned.steps) == (2.0, 0.25, 4)
     with FmiAsset(fmu, planned.binding, isolated=False) as asset:
-        history = fly(asset, planned, SilentProgress())
+        history = fly(asset, planned)
     assert history.time.tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
     assert history.values[0].tolist() == [1.0, 0.0, 0.0]
 
