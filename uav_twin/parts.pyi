@@ -139,6 +139,7 @@ from reporting.figures import to_svg as to_svg
 from reporting.provenance import collect_provenance as collect_provenance
 from reporting.provenance import hash_file as hash_file
 from reporting.record_json import plain as plain
+from reporting.toml_file import read_toml as read_toml
 from twin_master.assets.resolution import Overrides as Overrides
 from twin_master.assets.system_export import export_design as export_design
 from twin_master.assets.system_export import export_scenario as export_scenario
@@ -150,4 +151,3 @@ from twin_master.library.sampling import sample_library as sample_library
 from twin_master.scenario.reading import load_scenario as load_scenario
 from twin_master.scenario_check import check_scenario as check_scenario
 from twin_master.watch.opening import flown as flown
-from reporting.toml_file import read_toml as read_toml
