@@ -6,15 +6,17 @@ load, all channels alike hum or temperature.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from discrepancy.campaign.noise_tests import holm, variance_p_value
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 from discrepancy.sentences import said
 
-from .dependence import Disagreement, excess, explanations, kinds, mode_shares, predicted_frequencies
+from .dependence import Dependence, dependences, excess, mode_shares, predicted_frequencies
 from .map import Cell, residual_map
 from .omnibus_tests import OmnibusTest, coloured_noise, mean_square, noise_groups, serial_tests, variance_test
 from .residuals import FittedTrial, ResidualSet
@@ -24,65 +26,95 @@ ALIKE = 0.9
 
 PATTERN_LEVEL = 0.01
 """Largest p-value of a pattern that is told."""
+MOST_PATTERNS = 3
 
-_SIMULATIONS = 999
 
+@dataclass(frozen=True)
+class Disagreement:
+    """One finding.
 
-def singular_patterns(
-    residuals: ResidualSet, white: Sequence[FloatArray], generator: np.random.Generator
-) -> tuple[Disagreement, ...]:
-    """Return the significant singular patterns of each kind of trial, largest first.
-
-    Vectors of the residual matrix (samples x channels, in units of the noise). Their p-value is the share of
-    simulated noise matrices of this size whose largest singular value is larger.
-
-    Parameters
+    Attributes
     ----------
-    residuals : ResidualSet
-        Fitted trials.
-    white : sequence of (N, C) ndarray
-        What its `white` returned.
-    generator : numpy.random.Generator
-        For the null distribution of singular values.
+    trials : str
+        Kind of the trials where it shows.
+    subject : str
+        "mode 1", "channel g17", "all channels", ...; of a pattern over channels what it means.
+    dependence : str
+        What it goes with: "amplitude", "time", "load (not proportional)", "channels", ...
+    share : float
+        Of the excess variance of these trials.
+    p_value : float
+        Of the finding.
+    sentence : str
+        In words.
+    channel : str
+        Where a pattern over channels is strongest.
+    """
+
+    trials: str
+    subject: str
+    dependence: str
+    share: float
+    p_value: float
+    sentence: str
+    channel: str = ""
+
+
+class Kind(NamedTuple):
+    """Trials of one kind with the same channels, and their white residuals (N, C)."""
+
+    name: str
+    items: list[FittedTrial]
+    white: list[FloatArray]
+
+    def disagreement(self, subject: str, dependence: str, what: str, share: float, p: float) -> Disagreement:
+        """Return a finding in these trials, `what` it is in words."""
+        told = "p < 1e-6" if p < 1e-6 else f"p = {p:.1g}"
+        sentence = said("location.explains", what=what, trials=self.name, percent=100.0 * share, p=told)
+        return Disagreement(self.name, subject, dependence, share, p, sentence)
+
+
+def kinds_of(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Kind]:
+    """Return the trials by kind and channels: the groups that form one matrix each."""
+    groups: dict[tuple[str, tuple[str, ...]], Kind] = {}
+    for item, values in zip(residuals.trials, white, strict=True):
+        kind = item.trial.kind.value.replace("ringdown", "ring-down")
+        same = sum(name == kind for name, _ in groups)
+        own = groups.setdefault(
+            (kind, item.trial.channels), Kind(kind if not same else f"{kind} ({len(groups) + 1})", [], [])
+        )
+        own.items.append(item)
+        own.white.append(values)
+    return list(groups.values())
+
+
+def singular_patterns(residuals: ResidualSet, kind: Kind) -> list[Disagreement]:
+    """Return the significant singular patterns of a kind of trial, largest first.
+
+    Vectors of the residual matrix (samples x channels, in units of the noise). Their p-value is that of the
+    largest singular value of a noise matrix of this size: Tracy and Widom's law (Johnstone 2001, Ann.
+    Statist. 29, 295-327) by the gamma distribution of its moments (Chiani 2014, J. Multivar. Anal. 129,
+    69-81).
     """
     found: list[Disagreement] = []
-    for name, members in kinds(residuals).items():
-        items = [residuals.trials[number] for number in members]
-        channels = items[0].trial.channels
-        matrix = np.vstack([white[number] for number in members])
-        rows, columns = matrix.shape
-        if columns < 2 or rows < 2:
-            continue
-        _, singular, right = np.linalg.svd(matrix, full_matrices=False)
-        null = _largest_singular_squares(rows, columns, generator)
-        surplus = max(float(np.sum(singular**2)) - rows * columns, 1e-9)
-        expected = rows * columns / min(rows, columns)
-        for number, (value, weights) in enumerate(zip(singular**2, right, strict=True)):
-            # After k patterns the rest is compared with whole noise matrices: a little too strict, never lax.
-            p = (1.0 + float(np.sum(null >= value))) / (null.size + 1.0)
-            if p > PATTERN_LEVEL:
-                break
-            share = float(np.clip((value - expected) / surplus, 0.0, 1.0))
-            meaning, words = _meaning(residuals, items, weights)
-            told = f"p {'<=' if p <= 1.0 / _SIMULATIONS else '='} {p:.1g}"
-            sentence = said("location.explains", what=words, trials=name, percent=100.0 * share, p=told)
-            channel = channels[int(np.argmax(np.abs(weights)))]
-            found.append(Disagreement(name, meaning, "channels", share, p, 0, sentence, channel))
-            if number >= 2:
-                break
-    return tuple(found)
-
-
-def _largest_singular_squares(rows: int, columns: int, generator: np.random.Generator) -> FloatArray:
-    """Return draws of the largest squared singular value of a standard normal matrix.
-
-    Bartlett's decomposition: the triangular factor of a Wishart matrix is drawn, not the matrix.
-    """
-    size, longer = min(rows, columns), max(rows, columns)
-    factor = np.tril(generator.standard_normal((_SIMULATIONS, size, size)), -1)
-    diagonal = np.sqrt(generator.chisquare(longer - np.arange(size), (_SIMULATIONS, size)))
-    factor[:, np.arange(size), np.arange(size)] = diagonal
-    return np.asarray(np.linalg.norm(factor, ord=2, axis=(1, 2)) ** 2)
+    matrix = np.vstack(kind.white)
+    rows, columns = matrix.shape
+    if min(rows, columns) < 2:
+        return found
+    _, singular, right = np.linalg.svd(matrix, full_matrices=False)
+    surplus = max(float(np.sum(singular**2)) - rows * columns, 1e-9)
+    roots = np.sqrt(max(rows, columns) - 1.0), np.sqrt(min(rows, columns))
+    scale = sum(roots) * sum(1.0 / root for root in roots) ** (1.0 / 3.0)
+    # After k patterns the rest is compared with whole noise matrices: a little too strict, never lax.
+    for value, weights in zip(singular[:MOST_PATTERNS] ** 2, right, strict=False):
+        p = float(stats.gamma.sf((value - sum(roots) ** 2) / scale + 9.84801, 46.446, scale=0.186054))
+        if p > PATTERN_LEVEL:
+            break
+        share = float(np.clip((value - max(rows, columns)) / surplus, 0.0, 1.0))
+        meaning, words = _meaning(residuals, kind.items, weights)
+        channel = kind.items[0].trial.channels[int(np.argmax(np.abs(weights)))]
+        found.append(replace(kind.disagreement(meaning, "channels", words, share, p), channel=channel))
+    return found
 
 
 def _meaning(residuals: ResidualSet, items: Sequence[FittedTrial], weights: FloatArray) -> tuple[str, str]:
@@ -158,7 +190,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     residuals : ResidualSet
         Residuals of one hypothesis; held-out trials are not looked at.
     seed : int
-        Of the draw that restores what the fit absorbed, and of the null distribution of singular values.
+        Of the draw that restores what the fit absorbed.
 
     Returns
     -------
@@ -173,27 +205,24 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     fitted = residuals.fitted
     if fitted is None:
         raise FitError("Nothing can be located: every trial is held out, and at least one fitted is needed.")
-    generator = np.random.default_rng(seed)
-    white = fitted.white(generator)
+    white = fitted.white(np.random.default_rng(seed))
     coloured = coloured_noise(fitted)
     tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
     rejected = holm([test.p_value for test in tests], GLOBAL_LEVEL)
     tests = tuple(replace(test, rejected=flag) for test, flag in zip(tests, rejected, strict=True))
-    patterns = singular_patterns(fitted, white, generator)
-    disagrees = any(rejected)
+    found: list[tuple[float, Disagreement]] = []
+    for kind in kinds_of(fitted, white) if any(rejected) else ():
+        # shares are of one kind of trial; what explains most of the whole gap is told first
+        gap = sum(max(excess([item]), 0.0) for item in kind.items)
+        patterns = singular_patterns(fitted, kind)
+        told = (_disagreement(kind, patterns), *patterns)
+        found += [(gap * item.share, item) for item in told if item is not None]
     cells = residual_map(fitted, white, MAP_RATE)
-    judged = any(cell.axis != "frequency" for cell in cells)
-    return Location(
-        disagrees=disagrees,
-        tests=tests,
-        cells=cells,
-        disagreements=_disagreements(fitted, white, patterns) if disagrees else (),
-        remarks=(
-            *coloured.values(),
-            *_noise_remarks(fitted),
-            *(() if judged else (said("location.not_judged"),)),
-        ),
-    )
+    remarks = [*coloured.values(), *_noise_remarks(fitted)]
+    if all(cell.axis == "frequency" for cell in cells):
+        remarks.append(said("location.not_judged"))
+    disagreements = tuple(item for _, item in sorted(found, key=lambda row: -row[0]))
+    return Location(any(rejected), tests, cells, disagreements, tuple(remarks))
 
 
 def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
@@ -238,71 +267,46 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     return (said("location.outliers", far=_FAR_OUT, names=listed),)
 
 
-def _disagreements(
-    residuals: ResidualSet, white: Sequence[FloatArray], patterns: Sequence[Disagreement]
-) -> tuple[Disagreement, ...]:
-    found: list[Disagreement] = []
-    explained = explanations(residuals)
-    gap: dict[str, float] = {}
-    for name, members in kinds(residuals).items():
-        items = [residuals.trials[number] for number in members]
-        gap[name] = sum(max(excess([item]), 0.0) for item in items)
-        rows = [row for row in explained if row.trials == name]
-        told = _smallest_sufficient(rows)
-        if told is None:
-            continue
-        subject = told.subject or _subject(name, items, [white[n] for n in members], patterns)
-        line = told.dependence.startswith("a ")
-        if line and subject.startswith("mode"):
+def _disagreement(kind: Kind, patterns: Sequence[Disagreement]) -> Disagreement | None:
+    """Return the finding on what the excess of a kind of trial goes with."""
+    rows = list(dependences(kind.items))
+    told = _smallest_sufficient(rows)
+    if told is None:
+        return None
+    subject = told.subject or _subject(kind, patterns)
+    words = f"by {_dependence_words(told, rows)}"
+    if told.name.startswith("a "):
+        words = told.name
+        if subject.startswith("mode"):
             subject = "all channels"  # a line of its own frequency is no matter of a mode that the model has
-        words = told.dependence if line else f"by {_dependence_words(told, rows)}"
-        whose = f"{subject[0].upper()}{subject[1:]}, {words},"
-        p = "p < 1e-6" if told.p_value < 1e-6 else f"p = {told.p_value:.1g}"
-        sentence = said("location.explains", what=whose, trials=name, percent=100.0 * told.share, p=p)
-        found.append(replace(told, subject=subject, sentence=sentence))
-    # Shares are of one kind of trial; what explains most of the whole gap is told first.
-    return tuple(sorted((*found, *patterns), key=lambda item: -item.share * gap[item.trials]))
+    what = f"{subject[0].upper()}{subject[1:]}, {words},"
+    return kind.disagreement(subject, told.name, what, told.share, told.p_value)
 
 
-def _subject(
-    name: str,
-    items: Sequence[FittedTrial],
-    white: Sequence[FloatArray],
-    patterns: Sequence[Disagreement],
-) -> str:
+def _subject(kind: Kind, patterns: Sequence[Disagreement]) -> str:
     """Return what disagrees: a channel alone, the mode with most of the excess, or all channels."""
-    channels = items[0].trial.channels
-    if len(channels) == 1:
-        return f"channel {channels[0]}"
-    for pattern in patterns:
-        if pattern.trials == name and pattern.subject == "sensor" and pattern.share > 0.5:
-            return f"channel {pattern.channel}"
-    if items[0].trial.is_dynamic:
-        at = predicted_frequencies(items)
-        shares = mode_shares(items, white, at) if at else np.zeros(1)
-        if shares.max() > 0.5:
-            return f"mode {int(np.argmax(shares)) + 1}"
-    return "all channels"
+    channels = kind.items[0].trial.channels
+    alone = [item.channel for item in patterns if item.subject == "sensor" and item.share > 0.5]
+    if len(channels) == 1 or alone:
+        return f"channel {[*alone, *channels][0]}"
+    at = predicted_frequencies(kind.items) if kind.items[0].trial.is_dynamic else ()
+    shares = mode_shares(kind.items, kind.white, at) if at else np.zeros(1)
+    return f"mode {int(np.argmax(shares)) + 1}" if shares.max() > 0.5 else "all channels"
 
 
-def _smallest_sufficient(rows: Sequence[Disagreement]) -> Disagreement | None:
+def _smallest_sufficient(rows: Sequence[Dependence]) -> Dependence | None:
     """Return the dependence with fewest coefficients among those within 2 % of the largest share."""
     rows = [row for row in rows if row.share >= _WORTH_TELLING and row.p_value < 1e-3]
-    if not rows:
-        return None
-    best = max(row.share for row in rows)
-    return min(
-        (row for row in rows if row.share >= best - _CLOSE), key=lambda row: (row.coefficients, -row.share)
-    )
+    best = max((row.share for row in rows), default=0.0)
+    close = [row for row in rows if row.share >= best - _CLOSE]
+    return min(close, key=lambda row: (row.coefficients, -row.share), default=None)
 
 
-def _dependence_words(told: Disagreement, rows: Sequence[Disagreement]) -> str:
+def _dependence_words(told: Dependence, rows: Sequence[Dependence]) -> str:
     """Return the dependence, and its rival where one release amplitude cannot tell the two apart."""
-    rivals = {"amplitude": "time", "time": "amplitude"}
-    if told.dependence not in rivals:
-        return told.dependence
-    wanted = (told.subject, rivals[told.dependence])
-    other = next((row for row in rows if (row.subject, row.dependence) == wanted), None)
-    if other is None or other.share < told.share - _CLOSE:
-        return told.dependence
-    return "amplitude or time (these releases do not tell the two apart)"
+    rival = {"amplitude": "time", "time": "amplitude"}.get(told.name)
+    if any(
+        (row.subject, row.name) == (told.subject, rival) and row.share >= told.share - _CLOSE for row in rows
+    ):
+        return "amplitude or time (these releases do not tell the two apart)"
+    return told.name

@@ -9,6 +9,7 @@ column that the fit absorbs is not tested.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -203,23 +204,39 @@ def state_of(trial: Trial) -> str:
 def _cells(residuals: ResidualSet, item: FittedTrial, white: FloatArray) -> Iterator[Cell]:
     trial = item.trial
     for column, channel in enumerate(trial.channels):
-        used = item.used[:, column]
-        count = int(used.sum())
-        if count == 0:
+        freedom, used = residuals.degrees_of_freedom(channel), item.used[:, column]
+        if not used.any():
             continue
-        base = Cell(trial.name, channel, state_of(trial), "whole", np.nan, np.nan, count, "", np.nan, 1.0)
-        freedom = residuals.degrees_of_freedom(channel)
-        yield from _whole(item, column, base, freedom)
-        yield from _bins(item, column, base, freedom)
-        if trial.is_dynamic and count == len(used):
+        base = Cell(trial.name, channel, state_of(trial), "whole", np.nan, np.nan, 0, "", np.nan, 1.0)
+        for axis, low, high, where in _stretches(item, column):
+            cell = replace(base, axis=axis, low=low, high=high, count=int(where.sum()))
+            tables = features(item, column) if axis == "whole" else {"mean": np.ones((cell.count, 1))}
+            for name, table in tables.items():
+                yield from _along(item, column, where, table, replace(cell, statistic=name), freedom)
+            yield from _size(item, column, where, cell, freedom)
+        if trial.is_dynamic and used.all():
             yield from _bands(white[:, column], trial.interval, base, freedom)
 
 
-def _whole(item: FittedTrial, column: int, base: Cell, freedom: float) -> Iterator[Cell]:
-    used = item.used[:, column]
-    for name, table in features(item, column).items():
-        yield from _along(item, column, used, table, replace(base, statistic=name), freedom)
-    yield from _size(item, column, used, base, freedom)
+def _stretches(item: FittedTrial, column: int) -> Iterator[tuple[str, float, float, BoolArray]]:
+    """Yield axis, ends, and which used samples (N,) lie between: of the whole record, then of the bins."""
+    trial, used = item.trial, item.used[:, column]
+    yield "whole", np.nan, np.nan, used
+    axes: list[tuple[str, FloatArray, FloatArray]] = []
+    if trial.is_dynamic:
+        axes.append(("time", trial.time, np.linspace(trial.time[0], trial.time[-1], BINS + 1)))
+    else:
+        load = trial.force if np.any(trial.force) else trial.load_factor
+        axes.append(("load", load, np.linspace(load.min(), load.max(), 4)))
+    if trial.is_dynamic and item.rates is not None and (amplitude := envelope(item, column)).any():
+        least = max(amplitude.min(), 1e-4 * amplitude.max())
+        axes.append(("amplitude", amplitude, np.geomspace(least, amplitude.max(), BINS + 1)))
+    for axis, values, edges in axes:
+        place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
+        for number, (low, high) in enumerate(pairwise(edges.tolist())):
+            where = used & (place == number)
+            if low < high and where.any():
+                yield axis, low, high, where
 
 
 def _along(
@@ -235,54 +252,19 @@ def _along(
     if cell.statistic != "mean":
         along = part.along / (float(np.linalg.norm(residual)) or 1.0)
         value = float(along[0] if count == 1 else np.linalg.norm(along))
-    p = variance_p_value(statistic / count, count, freedom or np.inf)
-    yield replace(cell, count=int(where.sum()), value=value, p_value=p)
+    yield replace(cell, value=value, p_value=variance_p_value(statistic / count, count, freedom or np.inf))
 
 
-def _size(item: FittedTrial, column: int, where: BoolArray, base: Cell, freedom: float) -> Iterator[Cell]:
-    count = int(where.sum())
-    if freedom <= 0.0 or count < (1 if base.axis == "whole" else _FEWEST):
+def _size(item: FittedTrial, column: int, where: BoolArray, cell: Cell, freedom: float) -> Iterator[Cell]:
+    """Yield a cell on the size of the residuals at some samples, where the noise is recorded."""
+    if freedom <= 0.0 or cell.count < (1 if cell.axis == "whole" else _FEWEST):
         return
     sensitive = None if item.sensitivity is None else item.sensitivity[where, column]
     mean, own = quadratic_moments([(item.expected_variance[where, column], sensitive)])
-    if own < 0.5:
-        return
-    value = float(np.sum(item.standardised[where, column] ** 2)) / mean
-    yield replace(
-        base, count=count, statistic="variance", value=value, p_value=variance_p_value(value, own, freedom)
-    )
-
-
-def _edges(values: FloatArray, bins: int, *, logarithmic: bool = False) -> FloatArray:
-    low, high = float(values.min()), float(values.max())
-    if logarithmic:
-        low = max(low, 1e-4 * high)
-        return np.geomspace(low, high, bins + 1) if high > low > 0.0 else np.array([low, high])
-    return np.linspace(low, high, bins + 1) if high > low else np.array([low, high])
-
-
-def _bins(item: FittedTrial, column: int, base: Cell, freedom: float) -> Iterator[Cell]:
-    trial, used = item.trial, item.used[:, column]
-    if trial.is_dynamic:
-        axes = [("time", trial.time, _edges(trial.time, BINS))]
-        if item.rates is not None:
-            amplitude = envelope(item, column)
-            axes.append(("amplitude", amplitude, _edges(amplitude, BINS, logarithmic=True)))
-    else:
-        load = trial.force if np.any(trial.force) else trial.load_factor
-        axes = [("load", load, _edges(load, 3))]
-    for axis, values, edges in axes:
-        if edges.size < 3 or edges[-1] <= edges[0]:
-            continue
-        place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
-        for number in range(edges.size - 1):
-            where = used & (place == number)
-            if not where.any():
-                continue
-            cell = replace(base, axis=axis, low=float(edges[number]), high=float(edges[number + 1]))
-            ones = np.ones((int(where.sum()), 1))
-            yield from _along(item, column, where, ones, replace(cell, statistic="mean"), freedom)
-            yield from _size(item, column, where, cell, freedom)
+    if own >= 0.5:
+        value = float(np.sum(item.standardised[where, column] ** 2)) / mean
+        p = variance_p_value(value, own, freedom)
+        yield replace(cell, statistic="variance", value=value, p_value=p)
 
 
 def _bands(series: FloatArray, interval: float, base: Cell, freedom: float) -> Iterator[Cell]:
@@ -290,12 +272,11 @@ def _bands(series: FloatArray, interval: float, base: Cell, freedom: float) -> I
     ordinates = periodogram(series)
     if ordinates.size < 4 * BINS or freedom <= 0.0:
         return
-    edges = np.unique(np.round(np.geomspace(4, ordinates.size, BINS)).astype(int))
+    edges = np.unique(np.round(np.geomspace(4, ordinates.size, BINS)).astype(int)).tolist()
     step = 1.0 / (series.size * interval)
-    for first, last in zip([0, *edges[:-1]], edges, strict=True):
-        value = float(ordinates[first:last].mean())
-        p = variance_p_value(value, 2.0 * (last - first), freedom)
-        yield replace(
-            base, axis="frequency", low=(first + 0.5) * step, high=(last + 0.5) * step,
-            count=int(2 * (last - first)), statistic="variance", value=value, p_value=p,
-        )  # fmt: skip
+    cell = replace(base, axis="frequency", statistic="variance")
+    for first, last in pairwise([0, *edges]):
+        count, value = 2 * (last - first), float(ordinates[first:last].mean())
+        ends = {"low": (first + 0.5) * step, "high": (last + 0.5) * step}
+        p = variance_p_value(value, count, freedom)
+        yield replace(cell, **ends, count=count, value=value, p_value=p)

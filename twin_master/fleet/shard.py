@@ -7,7 +7,7 @@ of times: the result is the same to the last bit.
 import pickle
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -34,22 +34,11 @@ from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one,
 from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import Fed
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
-
-
-class _Recorded(Feed):
-    """Messages as a feed."""
-
-    def __init__(self, messages: Sequence[Fed]) -> None:
-        self._messages = messages
-
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        return iter(self._messages)
 
 
 def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
@@ -77,7 +66,7 @@ def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
     scenario = knowledge.scenario
     twin = knowledge.twin(lag=scenario.watch.lag)
     history = History(twin, scenario.observation.count)
-    intake, seen, late = Intake(scenario, _Recorded(messages)), {}, False
+    intake, seen, late = Intake(scenario, Feed(messages)), {}, False
     lost: list[tuple[int, Notice]] = []
     for turn in operate(twin, intake, history.add):
         at = intake.observation_turn

@@ -277,6 +277,8 @@ class FleetWatch:
         with ExitStack() as closing:
             watch = closing.enter_context(opened)
             closing.enter_context(watch.begun(feed))
+            if isinstance(feed, Topic):
+                feed.begun(watch)
             asset = WatchedAsset(key, watch, feed, self._told_before.get(key))
             asset.close = closing.pop_all().close
         self.closing.callback(asset.close)

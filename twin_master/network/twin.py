@@ -38,22 +38,8 @@ DEFAULT_LAG = 50
 """Turns back that a twin smooths and may be revised."""
 
 
-def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
-    """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
-
-    Its factors move independently given the control, and are independent before the first observation.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    leaving : float
-        Factor on the probabilities of each factor of the state to leave a level.
-
-    Raises
-    ------
-    InvalidModelError
-        The factor makes a probability larger than one.
-    """
+def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
+    """Return the transitions (levels, levels) of each factor under each control, with what actions repair."""
     tables: dict[str, dict[str, Float]] = {}
     for control in scenario.control_names:
         if scenario.transition.kind == "independent_tables":
@@ -77,9 +63,28 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
             tables[action.name][name] = graphical_model.repaired_table(
                 tables[action.name][name], action.success
             )
+    return tables
+
+
+def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
+    """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
+
+    Its factors move independently given the control, and are independent before the first observation.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    leaving : float
+        Factor on the probabilities of each factor of the state to leave a level.
+
+    Raises
+    ------
+    InvalidModelError
+        The factor makes a probability larger than one.
+    """
     levels = {factor.name: factor.levels for factor in scenario.state}
     return GraphicalModel.from_tables(
-        levels, tables, {factor.name: factor.prior for factor in scenario.state}
+        levels, factor_tables(scenario, leaving), {factor.name: factor.prior for factor in scenario.state}
     )
 
 

@@ -1,18 +1,18 @@
 """Messages from files, recorded or growing, from standard input, from a program; addresses of brokers."""
 
 import csv
+import io
 import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
 from ssl import create_default_context
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
@@ -24,44 +24,102 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
-from twin_master.watch.growing import GrowingFile, Pipe, Place, found, rotated
+from twin_master.watch.growing import GrowingFile, Pipe, Place, first_line, found, holds, rotated
 from twin_master.watch.intake import MISSING, Feed
 from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
-_LOST = ("", "nan", "null", "none")
-_TURN_COLUMNS = ("turn", "step")
-_OTHERS = ("turn", "time", "control")
-_FIRST = 8
-"""First steps by which a file of steps is known again."""
-
-
 Observations = Iterable[Mapping[str, Any]] | str | Path
 STANDARD_INPUT = "-"
+Content = bytes | Mapping[str, object] | Message | Refused
+
+
+def fed(scenario: Scenario, contents: Iterable[bytes | Refused | None]) -> Iterator[Fed]:
+    """Return JSON objects about the asset of a scenario as messages."""
+    reader = MessageReader(scenario)
+    for content in contents:
+        yield (None, "") if content is None else (reader.message(content), shown(content))
+
+
+def json_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
+    """Return the feed of a stream of JSON objects, one a line; it is looked at where silence is noticed."""
+    return Feed(fed(scenario, Pipe(stream, looks=scenario.watch.quiet_after_seconds is not None)))
+
+
+def mappings(scenario: Scenario, messages: Iterable[Mapping[str, Any]]) -> Feed:
+    """Return the feed of messages of a program; arrays of numbers may stand where JSON has lists."""
+    return Feed(fed(scenario, (json.dumps(message, default=_plain).encode() for message in messages)))
+
+
+def _plain(value: Any) -> Any:
+    return np.asarray(value).tolist()
+
+
+def shown(line: bytes | Refused) -> str:
+    """Return the begin of a message, for people."""
+    return "" if isinstance(line, Refused) else line[:300].decode("utf-8", "replace").rstrip(os.linesep)
 
 
 class RecordedFeed(Feed):
-    """What a file holds, and may be read again."""
-
-    replayable = True
-    path: Path
-    _follow = False
-
-    def holds(self, place: Place) -> bool:
-        """Return whether a place is in the file; where it is followed, also under its name of today."""
-        return found(self.path, place, follow=self._follow) is not None
-
-
-class CsvFeed(RecordedFeed):
-    """A CSV file with a header: `turn` (or `step`) or `time`, `control`, and sensors by their names.
+    """What a file of lines holds, and may be read again.
 
     Parameters
     ----------
     path : Path
     scenario : Scenario
-        What its columns may be called.
+        Of the asset.
     follow : bool
-        Its end is not the last: more may come, also in a file that takes its place. That one has a header of
-        its own, or the same columns.
+        Its end is not the last: more may come, also in a file that takes its place.
+    """
+
+    replayable = True
+    longest: float = LARGEST_MESSAGE
+
+    def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
+        super().__init__()
+        self.path, self.follow = path, follow
+        self.scenario, self.reader = scenario, MessageReader(scenario)
+
+    def holds(self, place: Place) -> bool:
+        """Return whether a place is in the file; where it is followed, also under its name of today."""
+        with self.opened(place) as file:
+            return holds(file, place)
+
+    def opened(self, place: Place | None) -> BinaryIO:
+        """Return the file that a place is in, or that of the name."""
+        return (found(self.path, place, follow=self.follow) or self.path).open("rb", buffering=0)
+
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        """Return the messages behind a place."""
+        lines = GrowingFile(self.opened(place), place, self.path if self.follow else None)
+        lines.longest = self.longest
+        for line in lines:
+            content = self.content(line, lines.begin) if isinstance(line, bytes) else line
+            self.place = lines.place
+            if content is not None:
+                yield self.reader.message(content), shown(line or b"")
+            elif line is None:
+                yield None, ""
+
+    def content(self, line: bytes, begin: int) -> Content | None:
+        """Return what a line says that begins at so many bytes of a file; None where it is no message."""
+        return line
+
+
+def _whole(cell: str) -> int:
+    """Return a whole number, also one that a table of floating-point numbers has written as `12.0`."""
+    number, point, zeros = cell.partition(".")
+    return int(number if point and not zeros.strip("0") else cell)
+
+
+_OTHERS: dict[str, Callable[[str], object]] = {"turn": _whole, "time": float, "control": str}
+"""Columns that are no sensor."""
+_NAMES_OF_TURN, _LOST = ("turn", "step"), ("nan", "null", "none")
+
+
+class CsvFeed(RecordedFeed):
+    """A CSV file with a header: `turn` (or `step`) or `time`, `control`, and sensors by their names.
+
+    A file that takes the place of one that is followed has a header of its own, or the same columns.
 
     Raises
     ------
@@ -70,24 +128,19 @@ class CsvFeed(RecordedFeed):
     """
 
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
-        self.path = path
-        self._follow = follow
-        self._reader = MessageReader(scenario)
+        super().__init__(path, scenario, follow=follow)
         # A file that was begun a moment ago may have no header yet.
         self._read_header(path, *(reversed(rotated(path)) if follow else ()))
 
     def _read_header(self, *files: Path) -> None:
-        """Take the columns of the first of these files that has a header; the error is that of the first."""
-        errors = []
-        for path in files:
-            try:
-                with path.open("rb") as file:
-                    return self._take_columns(_cells(file.readline(LARGEST_MESSAGE)))
-            except MissionInputError as error:
-                errors.append(error)
-            except (OSError, ValueError) as error:
-                errors.append(MissionInputError(f"{path} cannot be read as CSV: {str(error).rstrip('.')}."))
-        raise errors[0] from None
+        """Take the columns of the first of these files whose header is whole, or else of the first."""
+        try:
+            headers = [first_line(file) for file in files]
+            names = _cells(next((line for line in headers if line.endswith(b"\n")), headers[0]))
+        except (OSError, ValueError) as error:
+            reason = str(error).rstrip(".")
+            raise MissionInputError(f"{self.path} cannot be read as CSV: {reason}.") from None
+        self._take_columns(names)
 
     def _take_columns(self, names: list[str]) -> None:
         path = self.path
@@ -95,10 +148,10 @@ class CsvFeed(RecordedFeed):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
             raise MissionInputError(said("watch.json_lines", path=path))
-        called = ["turn" if name in _TURN_COLUMNS else name for name in names]
+        called = ["turn" if name in _NAMES_OF_TURN else name for name in names]
         sensors = [name for name in called if name not in _OTHERS and name[:1] != "_"]
         try:
-            columns = [column for column in map(self._reader.column, sensors) if column is not None]
+            columns = [column for column in map(self.reader.column, sensors) if column is not None]
         except Refused as refusal:
             raise MissionInputError(said("watch.column", path=path, refusal=refusal)) from None
         once = {sensor for sensor, _ in columns}
@@ -106,48 +159,40 @@ class CsvFeed(RecordedFeed):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
         self._names = called
 
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return the rows behind a place."""
+    def opened(self, place: Place | None) -> BinaryIO:
+        """Return the file that a place is in, after its columns were taken."""
+        file = super().opened(place)
         with suppress(MissionInputError):
-            self._read_header(found(self.path, place, follow=self._follow) or self.path)
-        stream = GrowingFile(self.path, place, follow=self._follow)
-        for line in stream:
-            if line is None:
-                yield None, ""
-                continue
-            if stream.cut:
-                yield Refused(said("watch.cut", name=self.path.name, byte=stream.cut)), ""
-                stream.cut = 0
-            self.place = stream.place
-            if not (stream.begins and self._is_header(line)):
-                yield self._message(line), shown(line)
+            self._read_header(Path(file.name))
+        return file
 
-    def _is_header(self, line: bytes | Refused) -> bool:
-        with suppress(MissionInputError, ValueError):
-            self._take_columns(_cells(line) if isinstance(line, bytes) else [])
-            return True
-        return False
-
-    def _message(self, line: bytes | Refused) -> Message | Refused:
-        if isinstance(line, Refused):
-            return line
+    def content(self, line: bytes, begin: int) -> Content | None:
+        """Return the record of a row; None for a header."""
         try:
             cells = _cells(line)
         except ValueError as error:
             return Refused(f"it is no line of CSV: {str(error)[:80]}")
+        if not begin:
+            with suppress(MissionInputError):
+                self._take_columns(cells)
+                return None
         if len(cells) != len(self._names):
             return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
-        record: dict[str, object] = {
-            name: cell for name, cell in zip(self._names, cells, strict=True) if cell
-        }
         try:
-            for name, reader in (("control", str), ("turn", _whole), ("time", float)):
-                if name in record:
-                    cell = str(record[name])
-                    record[name] = None if cell.lower() in _LOST else reader(cell)
+            return {
+                name: _OTHERS.get(name, str)(cell)
+                for name, cell in zip(self._names, cells, strict=True)
+                if cell and not (name in _OTHERS and cell.lower() in _LOST)
+            }
         except (ValueError, OverflowError) as error:
             return Refused(f"a cell is no number: {str(error)[:80]}")
-        return parsed(self._reader, record)
+
+
+def _cells(line: bytes) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line.decode("utf-8-sig").rstrip("\r\n")]), [])]
+    except csv.Error as error:
+        raise ValueError(str(error)) from None
 
 
 class RunFeed(RecordedFeed):
@@ -160,7 +205,7 @@ class RunFeed(RecordedFeed):
     """
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        self.path, self._reader = path, MessageReader(scenario)
+        super().__init__(path, scenario)
         role, names = scenario.observation.role, dict(enumerate(scenario.control_names))
         try:
             group: xr.Dataset = read_groups(path)["observed"].to_dataset()
@@ -170,26 +215,17 @@ class RunFeed(RecordedFeed):
                 raise ValueError(
                     said("watch.shape", count=scenario.observation.count, came=group[role].shape)
                 )
-            self._records = [{role: row, "turn": int(turn)} for row, turn in zip(rows, turns, strict=True)]
-            for record, control in zip(self._records, controls, strict=False):
-                record["control"] = names[control]
+            records = [{role: row, "turn": int(turn)} for row, turn in zip(rows, turns, strict=True)]
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
             reason = str(error).rstrip(".")
             raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None
+        for record, control in zip(records, controls, strict=False):
+            record["control"] = names[control]
+        self._lines = "".join(f"{json.dumps(record)}\n" for record in records).encode()
 
-    def _place(self, read: int) -> Place:
-        first = json.dumps(self._records[: min(read, _FIRST)]).encode()
-        return {"beginning": sha256(first).hexdigest(), "read": read}
-
-    def holds(self, place: Place) -> bool:
-        """Return whether its first steps are those of a place."""
-        return self._place(place["read"]) == place
-
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return the steps behind a place."""
-        for row in range(place["read"] if place else 0, len(self._records)):
-            self.place = self._place(row + 1)
-            yield parsed(self._reader, self._records[row]), f"row {row}"
+    def opened(self, place: Place | None) -> BinaryIO:
+        """Return its steps as lines of JSON."""
+        return io.BytesIO(self._lines)
 
 
 class FolderFeed(RecordedFeed):
@@ -203,82 +239,39 @@ class FolderFeed(RecordedFeed):
         The folder holds no journal.
     """
 
+    longest = math.inf
+
     def __init__(self, folder: Path, scenario: Scenario) -> None:
-        self.path = folder / JOURNAL_NAME
-        self._scenario = scenario
+        super().__init__(folder / JOURNAL_NAME, scenario)
         if not self.path.is_file():
             raise MissionInputError(f"{folder} holds no journal of a run or a watch ({JOURNAL_NAME}).")
 
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return the observations behind a place."""
-        stream = GrowingFile(self.path, place)
-        stream.longest = math.inf
-        for line in stream:
-            if not isinstance(line, bytes) or not line.endswith(b"\n"):
-                return  # cut off by a kill
-            record, self.place = whole_record(line), stream.place
-            if record is None:
-                with self.path.open("rb") as journal:
-                    number = journal.read(self.place["read"]).count(b"\n")
-                yield Refused(f"line {number} of {self.path.name} was changed or is damaged"), ""
-            elif _came(record):
-                yield self._message(record), f"turn {record.get('turn')}"
-
-    def _message(self, record: Mapping[str, Any]) -> Message | Refused:
+    def content(self, line: bytes, begin: int) -> Content | None:
+        """Return the observation of a line; None where it is of none, or was cut off by a kill."""
+        record = whole_record(line)
+        if record is None and line.endswith(b"\n"):
+            number = self.path.read_bytes()[:begin].count(b"\n") + 1
+            return Refused(f"line {number} of {self.path.name} was changed or is damaged")
+        if record is None or not _came(record):
+            return None
         try:
             observed, control = array_of(record["observed"]), int(record["control_index"])
             turn = int(record.get("observation_turn", record["turn"]))
         except (KeyError, TypeError, ValueError):
             return Refused("the line has another layout")
-        sensors = self._scenario.observation
-        if len(observed) not in (sensors.count, self._scenario.row_width) or control >= len(
-            self._scenario.control
-        ):
+        count, width = self.scenario.observation.count, self.scenario.row_width
+        if len(observed) not in (count, width) or control >= len(self.scenario.control):
             return Refused("it is of an asset with other sensors or controls")
-        return Message(observed, turn, None, control)
+        row = np.full(width, np.nan)  # it may have been recorded without covariances
+        row[: len(observed)] = observed
+        return Message(row, control, turn=turn)
 
 
-class JsonLinesFeed(Feed):
-    """JSON objects, one a line, from a stream such as standard input."""
-
-    def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
-        self._reader = MessageReader(scenario)
-        self._stream = stream
-        self._looks = scenario.watch.quiet_after_seconds is not None
-
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return what comes; where silence is to be noticed, None while nothing does."""
-        stream = self._stream or sys.stdin.buffer
-        for line in Pipe(stream, looks=self._looks):
-            yield (None, "") if line is None else (parsed(self._reader, line), shown(line))
-
-
-class MappingFeed(Feed):
-    """Messages of a program, as mappings; arrays of numbers may stand where JSON has lists."""
-
-    def __init__(self, messages: Iterable[Mapping[str, Any]], scenario: Scenario) -> None:
-        self._reader = MessageReader(scenario)
-        self._messages = messages
-
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return what comes."""
-        for message in self._messages:
-            line = json.dumps(message, default=_plain).encode()
-            yield parsed(self._reader, line), shown(line)
-
-
-def _plain(value: Any) -> Any:
-    return np.asarray(value).tolist()
-
-
-def parsed(reader: MessageReader, content: bytes | dict[str, object] | Refused) -> Message | Refused:
-    """Return the observation in a JSON object, or a record, or why there is none."""
-    if isinstance(content, Refused):
-        return content
-    try:
-        return reader.read(content) if isinstance(content, dict) else reader.parse(content)
-    except Refused as refusal:
-        return refusal
+def _came(record: Mapping[str, Any]) -> bool:
+    """Return whether a line of a journal is of something observed, not of a turn for which nothing came."""
+    given = record.get("intake", {}).get("given", "")
+    predicted = given.endswith(str(MISSING)) and record.get("observation_turn") == record.get("turn")
+    return "observed" in record and not predicted
 
 
 def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFeed | RunFeed | FolderFeed:
@@ -299,31 +292,6 @@ def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFee
     if is_netcdf:
         return RunFeed(path, scenario)
     return CsvFeed(path, scenario, follow=follow)
-
-
-def _whole(cell: str) -> int:
-    """Return a whole number, also one that a table of floating-point numbers has written as `12.0`."""
-    number, point, zeros = cell.partition(".")
-    return int(number if point and not zeros.strip("0") else cell)
-
-
-def _came(record: Mapping[str, Any]) -> bool:
-    """Return whether a line of a journal is of something observed, not of a turn for which nothing came."""
-    given = record.get("intake", {}).get("given", "")
-    predicted = given.endswith(str(MISSING)) and record.get("observation_turn") == record.get("turn")
-    return "observed" in record and not predicted
-
-
-def _cells(line: bytes) -> list[str]:
-    try:
-        return [cell.strip() for cell in next(csv.reader([line.decode("utf-8-sig").rstrip("\r\n")]), [])]
-    except csv.Error as error:
-        raise ValueError(str(error)) from None
-
-
-def shown(line: bytes | Refused) -> str:
-    """Return the begin of a message, for people."""
-    return "" if isinstance(line, Refused) else line[:300].decode("utf-8", "replace").rstrip(os.linesep)
 
 
 PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
@@ -408,12 +376,12 @@ def feed_of(
         if observations is None:
             continue
         if not isinstance(observations, str | Path):
-            return MappingFeed(observations, scenario)
+            return mappings(scenario, observations)
         if is_broker(str(observations)):
             return broker_of(str(observations), authority)
         if str(observations) != STANDARD_INPUT:
             return file_feed(Path(observations), scenario, follow=follow)
         if follow:
             raise MissionInputError(said("watch.follow"))
-        return JsonLinesFeed(scenario)
+        return json_lines(scenario, sys.stdin.buffer)
     raise MissionInputError(said("watch.recording", name=scenario.mission.name))

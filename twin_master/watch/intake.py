@@ -2,12 +2,13 @@
 
 import base64
 import json
+import math
 import signal
 import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,12 +42,21 @@ MISSING, _ASSUMED, _GIVEN = 0, 1, 2
 
 
 class Feed:
-    """Where messages come from; of itself one that is not read twice: it goes on where it is."""
+    """Where messages come from; of itself one that is not read twice: it goes on where it is.
+
+    Parameters
+    ----------
+    fed : iterable of Fed
+        Its messages.
+    """
 
     replayable = False
     """Whether it begins anew with every process, so that what was read before is read again."""
     place: Place | None = None
     """Where it stands behind the message that it gave last."""
+
+    def __init__(self, fed: Iterable[Fed] = ()) -> None:
+        self._fed = fed
 
     def holds(self, place: Place) -> bool:
         """Return whether a place is one of it, and not of another source."""
@@ -54,10 +64,7 @@ class Feed:
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the messages behind a place, or all of them."""
-        raise NotImplementedError
-
-    def begun(self, watch: Any) -> None:
-        """Begin with a watch whose journal is open."""
+        return iter(self._fed)
 
     def decide(self, decision: Mapping[str, Any]) -> None:
         """Tell whoever sends the messages what was decided, where they listen."""
@@ -295,73 +302,53 @@ class Intake:
             file.write(json.dumps(record, ensure_ascii=True) + "\n")
 
     def _turn_of(self, twin: Twin, message: Message) -> int:
-        if message.turn is not None:
-            return message.turn
-        if message.time is None:
-            return twin.turns
-        if self._section.seconds_per_turn is None:
+        """Return the turn that a message names, or that of its time, or the next one."""
+        step, gap = self._section.seconds_per_turn, self._section.longest_gap
+        if message.turn is not None or message.time is None:
+            return twin.turns if message.turn is None else message.turn
+        if step is None:
             raise Refused("it has a time and no turn, and the scenario has no `watch.seconds_per_turn`")
-        turn = self._turn_at(twin, message.time)
-        gap = self._section.longest_gap
-        wrong = turn is None or not -gap <= turn <= twin.turns + gap
-        if self._first is not None and wrong:
-            # Two times that do not go together, and none that bears either out: a clock that was set in
-            # between. The turns seen so far stay, and time is counted from this message on.
-            self._origin = None
-            turn = self._turn_at(twin, message.time)
-        elif self._first is not None and turn != self._first:
+        turn = math.nan if self._origin is None else (message.time - self._origin) / step
+        alone = self._origin is None or self._first is not None
+        if alone and not -gap <= turn <= twin.turns + gap:
+            # The first time, or two that do not go together, and none that bears either out: a clock that was
+            # set in between. The turns seen so far stay, and time is counted from this message on.
+            turn = self._first = twin.turns
+            self._origin = message.time - step * turn
+        elif self._first is not None and round(turn) != self._first:
             self._first = None  # two turns agree about the time
-        if turn is None:
+        if not math.isfinite(turn):
             raise Refused("its time lies too far from the first")
-        if turn < 0:
-            raise Refused(f"its time lies {-turn} turns before the first")
-        return turn
-
-    def _turn_at(self, twin: Twin, time: float) -> int | None:
-        """Return the turn of a time; None if it is too far from the first to be counted."""
-        assert self._section.seconds_per_turn is not None
-        if self._origin is None:
-            self._origin, self._first = time - self._section.seconds_per_turn * twin.turns, twin.turns
-        try:
-            return round((time - self._origin) / self._section.seconds_per_turn)
-        except OverflowError:
-            return None
+        if turn < -0.5:
+            raise Refused(f"its time lies {-round(turn)} turns before the first")
+        return round(turn)
 
     def _sort(self, twin: Twin, message: Message) -> None:
-        turn = self._turn_of(twin, message)
-        if len(message.observed) < self._width:  # recorded without covariances
-            row = np.full(self._width, np.nan)
-            row[: len(message.observed)] = message.observed
-            message = replace(message, observed=row)
-        ahead = turn - twin.turns
-        given = _ASSUMED if message.control is None else _GIVEN
-        if ahead > (most := self._section.longest_gap):
+        """Take in a message: the next turn, one ahead with the gap before it, or one that was before."""
+        turn, most = self._turn_of(twin, message), self._section.longest_gap
+        ahead, given = turn - twin.turns, _ASSUMED if message.control is None else _GIVEN
+        if ahead > most:
             raise Refused(said("watch.ahead", turn=turn, ahead=ahead, next=twin.turns, most=most))
-        if ahead < 0:
-            self._sort_late(twin, turn, message, given)
+        if turn < twin.first_kept and ahead < 0:
+            raise Refused(said("watch.late", turn=turn, late=-1 - ahead, lag=self._section.lag))
+        if ahead >= 0:
+            lost = Reading(np.full(self._width, np.nan))
+            self._pending += [(twin.turns + gap, lost, MISSING) for gap in range(ahead)]
+            self._pending.append((turn, message, given))
             return
-        lost = np.full(self._width, np.nan)
-        self._pending += [(twin.turns + gap, Reading(lost), MISSING) for gap in range(ahead)]
-        reading = Reading(message.observed, message.control, unreadable=message.unreadable)
-        self._pending.append((turn, reading, given))
-
-    def _sort_late(self, twin: Twin, turn: int, message: Message, given: int) -> None:
-        if turn < twin.first_kept:
-            late = twin.turns - 1 - turn
-            raise Refused(said("watch.late", turn=turn, late=late, lag=self._section.lag))
-        before, control = twin.observed(turn), message.control
+        before = twin.observed(turn)
         both = ~np.isnan(before) & ~np.isnan(message.observed)
         if not np.array_equal(before[both], message.observed[both]):
             raise Refused(f"it contradicts what was received of turn {turn} before")
-        another = control not in (None, twin.control_of(turn))
-        if another and self._given[turn - twin.turns] != MISSING:
+        another = message.control not in (None, twin.control_of(turn))
+        if another and self._given[ahead] != MISSING:
             raise Refused(f"it contradicts the control of turn {turn}")
         merged = np.where(np.isnan(before), message.observed, before)
         if not another and np.array_equal(merged, before, equal_nan=True):
             self.counts.duplicates += 1
             return
         self._before = before
-        self._pending.append((turn, Reading(merged, control, turn, message.unreadable), given))
+        self._pending.append((turn, replace(message, observed=merged, revises=turn), given))
 
 
 class _Asked(BaseException):

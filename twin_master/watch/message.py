@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
 
@@ -16,6 +16,7 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import parse_json
 from reporting.words import listing
+from twin_master.mission.turns import Reading
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
 from twin_master.sentences import said
@@ -26,9 +27,9 @@ LARGEST_STRAIN = 0.5
 """A strain beyond this is one whose unit was forgotten."""
 LARGEST = 1e30
 """The same of any other sensor, SI: far beyond what exists, and its powers are still numbers."""
-_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
+_PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
-_NAMED = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]$")
+_NAMED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
 
 
 class Refused(Exception):  # noqa: N818 - what it is, not what went wrong
@@ -36,28 +37,19 @@ class Refused(Exception):  # noqa: N818 - what it is, not what went wrong
 
 
 @dataclass(frozen=True)
-class Message:
-    """An observation as it was sent.
+class Message(Reading):
+    """An observation as it was sent, SI; where modes are observed, a row with their covariance.
 
     Attributes
     ----------
-    observed : (G,)
-        SI; NaN where a sensor is absent or unreadable. Where modes are observed, a row with their covariance.
     turn : int or None
         Its turn, if it says so.
     time : float or None
         Its time [s], if it says so.
-    control : int or None
-        Index of the control in force, if it says so.
-    unreadable : dict of int to str
-        What came in the place of a reading, of each sensor that has none, from 0.
     """
 
-    observed: Float
     turn: int | None = None
     time: float | None = None
-    control: int | None = None
-    unreadable: Mapping[int, str] = field(default_factory=dict)
 
 
 Fed = tuple[Message | Refused | None, str]
@@ -79,14 +71,15 @@ class MessageReader:
         role, count = scenario.observation.role, scenario.observation.count
         self._index = {f"{role}_{number + 1}": number for number in range(count)}
         self._index |= {title: number for number, title in enumerate(scenario.observation.titles)}
-        self._columns: dict[str, tuple[int, float]] = {}
         units, self._width = scenario.observation.sensor_units, scenario.row_width
         self._largest = [LARGEST_STRAIN if role == "strain" and unit == "1" else LARGEST for unit in units]
         self._index |= {name: count + place for place, (*_, name, _) in enumerate(scenario.readings)}
         self._units = [*units, *(scenario.state[place].unit for _, place, *_ in scenario.readings)]
         self._largest += [LARGEST] * len(scenario.readings)
+        # Names that mean the same come without end.
+        self.column = lru_cache(maxsize=2 * len(self._index))(self._column)
 
-    def column(self, name: str) -> tuple[int, float] | None:
+    def _column(self, name: str) -> tuple[int, float] | None:
         """Return the index of the sensor that a name stands for, and what its values are multiplied by.
 
         None for a name that is no sensor, where the scenario allows them.
@@ -96,49 +89,33 @@ class MessageReader:
         Refused
             It is no sensor, or not in a unit of this sensor.
         """
-        if name in self._columns:
-            return self._columns[name]
         base, unit = name, ""
         if name not in self._index:
             named = _NAMED.match(name)
-            if named is not None:
-                base, unit = named["name"], named["unit"]
-            else:
-                base, _, unit = name.rpartition("_")
+            base, unit = named.groups() if named else name.rpartition("_")[::2]
         if base not in self._index and self._allows_unknown:
             return None
         if base not in self._index:
             near = _near(name[:60], *self._index)
             raise Refused(said("watch.no_sensor", name=name[:60], near=near, count=len(self._units)))
         sensor = self._index[base]
-        found = sensor, self._factor(sensor, unit)
-        if len(self._columns) < len(self._index):  # names that mean the same come without end
-            self._columns[name] = found
-        return found
-
-    def _factor(self, sensor: int, unit: str) -> float:
         own = self._units[sensor]
-        if unit in ("", own):
-            return 1.0
-        if own == "1" and unit in _WITHOUT_UNIT:
-            return _WITHOUT_UNIT[unit]
-        if own != "1" and unit[1:] == own and unit[0] in _PREFIXES:
-            return _PREFIXES[unit[0]]
-        known = (
-            "1, percent or microstrain"
-            if own == "1"
-            else f"{own}, or {own} with n, u, m, k, M or G before it"
-        )
-        raise Refused(f"`{unit[:30]}` is no unit of sensor {sensor + 1}: it is read in {known}")
+        known = {prefix + own: factor for prefix, factor in _PREFIXES.items()}
+        known = _WITHOUT_UNIT if own == "1" else known
+        if unit and unit not in known:
+            what = f"`{unit[:30]}` is no unit of sensor {sensor + 1}"
+            raise Refused(f"{what}: it is read in {listing(known, 'or')}")
+        return sensor, known[unit or own]
 
-    def parse(self, content: bytes | str) -> Message:
-        """Return the observation in a JSON object.
+    def message(self, content: bytes | Mapping[str, object] | Message | Refused) -> Message | Refused:
+        """Return the observation in a JSON object, or in a record of one, or why there is none."""
+        try:
+            content = self._parsed(content) if isinstance(content, bytes) else content
+            return content if isinstance(content, Message | Refused) else self._read(content)
+        except Refused as refusal:
+            return refusal
 
-        Raises
-        ------
-        Refused
-            It is none.
-        """
+    def _parsed(self, content: bytes) -> dict[str, object]:
         if len(content) > LARGEST_MESSAGE:
             raise Refused(f"a message has at most {LARGEST_MESSAGE} bytes, and {len(content)} came")
         try:
@@ -147,16 +124,9 @@ class MessageReader:
             raise Refused("it is nested too deeply") from None
         if not isinstance(record, dict):
             raise Refused("it is no JSON object")
-        return self.read(record)
+        return record
 
-    def read(self, record: Mapping[str, object]) -> Message:
-        """Return the observation in a record.
-
-        Raises
-        ------
-        Refused
-            It is none.
-        """
+    def _read(self, record: Mapping[str, object]) -> Message:
         observed = np.full(self._width, np.nan)
         given: set[int] = set()
         unreadable: dict[int, str] = {}
@@ -175,14 +145,16 @@ class MessageReader:
                 unreadable[sensor] = shown
             else:
                 observed[sensor] = shown
-        turn, time = record.get("turn"), record.get("time")
+        turn, time, control = (record.get(name) for name in ("turn", "time", "control"))
         if turn is not None and (type(turn) is not int or not 0 <= turn <= LARGEST_SEED):
             raise Refused("`turn` is a whole number from 0")
         time = float(time) if type(time) is int else time
         if time is not None and not (isinstance(time, float) and math.isfinite(time)):
             raise Refused("`time` is a number of seconds")
-        control = self._control(record.get("control"))
-        return Message(observed, turn if type(turn) is int else None, time, control, unreadable)
+        if control not in (None, *self._controls):
+            raise Refused(f"`control` is one of {', '.join(self._controls)}, or absent")
+        number = None if control is None else self._controls.index(str(control))
+        return Message(observed, number, unreadable=unreadable, turn=turn, time=time)
 
     def _readings(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
         """Return names and values of a record; each of a list has the name of its sensor."""
@@ -228,13 +200,6 @@ class MessageReader:
         forgotten = factor == 1.0 and self._largest[sensor] == LARGEST_STRAIN
         unit = f"; give its unit, such as `strain_{sensor + 1}_microstrain`" if forgotten else ""
         return f"{number:g}{unit}"
-
-    def _control(self, control: object) -> int | None:
-        if control is None:
-            return None
-        if not isinstance(control, str) or control not in self._controls:
-            raise Refused(f"`control` is one of {', '.join(self._controls)}, or absent")
-        return self._controls.index(control)
 
 
 @lru_cache(maxsize=1000)

@@ -18,10 +18,10 @@ from typing import Any
 
 from reporting.files import atomic_write_text, written
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.mission.journal import JOURNAL_NAME, last_turn, records
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
-from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, parsed, shown
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, shown
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed
@@ -84,7 +84,7 @@ class Session:
         self._last: Any = None
         self._flying: dict[int, Topic] = {}
         self.behind: dict[Topic, None] = {}
-        self._connected = self._begun = False
+        self._begun = False
         self._failure = self._told = ""
         self._retry, self._pause, self._beat = 0.0, _RETRY_SECONDS[0], 0.0
 
@@ -92,6 +92,10 @@ class Session:
     def room(self) -> bool:
         """Whether a decision can be sent at once."""
         return self._connected and len(self._flying) < _DECISIONS_WAITING
+
+    @property
+    def _connected(self) -> bool:
+        return self._client is not None and self._client.is_connected()
 
     def _connect(self) -> None:
         """Connect with nothing of the connection before: it is in the topices, and at the broker."""
@@ -125,7 +129,6 @@ class Session:
         if reason.is_failure:
             self._failure = said("watch.user", where=self._where, why=reason, variable=PASSWORD_VARIABLE)
             return
-        self._connected = True
         if self._clean:
             return
         if self._kept and not flags.session_present:
@@ -156,7 +159,6 @@ class Session:
     def _lost(self) -> None:
         """Let go of a connection, to try again later; the first time it ends the watch."""
         failure, self._failure, self._client = self._failure, "", None
-        self._connected = False
         if not self._begun:
             raise MissionInputError(f"{failure}.")
         if failure != self._told:
@@ -193,7 +195,7 @@ class Session:
         if self._clean and self._connected:
             # The old session has ended. One that begins so is forgotten by brokers that start again.
             self._client.disconnect()
-            self._client, self._clean, self._connected, self._failure = None, False, False, ""
+            self._client, self._clean, self._failure = None, False, ""
             return
         for topic in [*self.behind]:
             topic.publish()
@@ -278,6 +280,7 @@ class Topic(Feed):
     def __init__(
         self, session: Session, topic: str, scenario: Scenario, failed: Callable[[Exception], None]
     ) -> None:
+        super().__init__()
         self._session, self._topic, self._failed = session, topic, failed
         self._reader = MessageReader(scenario)
         self.came: deque[bytes] = deque(maxlen=HELD)
@@ -294,16 +297,16 @@ class Topic(Feed):
         """Return the observation in a message, which must name its turn or time."""
         if payload is None:
             return None, ""
-        message = parsed(self._reader, payload)
+        message = self._reader.message(payload)
         if isinstance(message, Message) and message.turn is None and message.time is None:
             message = Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
         return message, shown(payload)
 
     def begun(self, watch: Watch) -> None:
-        """Publish what the journal of a watch has, which was begun or taken up again."""
+        """Publish what the journal of a watch has, which is begun or taken up again."""
         self.watch = watch
         self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
-        size = self._journal.stat().st_size  # decisions before may have been published
+        _, size = last_turn(self._journal)  # decisions before may have been published
         if not self._path.is_file():
             atomic_write_text(self._path, f"{size:020d}\n")
         text = self._path.read_text(encoding="utf-8", errors="replace").strip()
@@ -383,6 +386,7 @@ class MqttFeed(Topic):
     ) -> None:
         session = Session(broker, watch.scenario.mission.name, watch.folder, note, self._pulse)
         super().__init__(session, broker.topic, scenario or watch.scenario, _raised)
+        self.begun(watch)
 
     def _pulse(self) -> dict[str, Any]:
         assert self.watch is not None

@@ -4,6 +4,7 @@ All of it follows from a journal up to one of its lines, so that it may be worke
 which goes on.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +92,7 @@ def judged(
     from_turn : int
         From which on.
     compared : tuple of int
-        The first turn whose evidence is compared, and how many.
+        The first turn whose evidence is compared, behind that one, and how many.
     progress : Progress, optional
 
     Raises
@@ -104,9 +105,8 @@ def judged(
         file.write_bytes(patch)
         model = patched_model(scenario, file, from_turn, progress)
     begin, count = compared
-    wanted = min(from_turn, begin) if count else from_turn
     before, after = (
-        replay(journal, models, scenario.watch.lag, first_turn=wanted, end=end, question=question)[0]
+        replay(journal, models, scenario.watch.lag, first_turn=from_turn, end=end, question=question)[0]
         for question in (None, model)
     )
     known = models[-1].knowledge
@@ -122,6 +122,16 @@ def judged(
         after=gap_of(after, from_turn - after.first_turn, model.knowledge.sensor_model),
         policy_change=policy_change(known, model.knowledge),
     )
+
+
+def both_patches(before: Path | None, found: Path) -> bytes:
+    """Return the patch that the model has and the one that was found beside it, as one file."""
+    if before is None:
+        return found.read_bytes()
+    old, new = (json.loads(file.read_text(encoding="utf-8")) for file in (before, found))
+    effects, channels = old["effects"] + new["effects"], old.get("channels", {}) | new.get("channels", {})
+    text = json.dumps({"schema": new["schema"], "effects": effects, "channels": channels}, indent=1)
+    return (text + "\n").encode()
 
 
 def policy_change(before: Knowledge, after: Knowledge) -> str:

@@ -370,17 +370,9 @@ def test_two_damped_modes_are_split_up_to_the_ends():
         w = 2.0 * np.pi * f
         waves.append(size * np.exp((-zeta + 1j) * w * time))
     values = (waves[0] + waves[1]).real[:, np.newaxis] + 0.3
-    found = modal_motion(values, 0.005, (5.2, 28.3))
-    assert found is not None
-    for mode, wave in enumerate(waves):
-        size = np.abs(wave)
-        for part, exact in zip(found, (wave.real, -wave.imag, size), strict=True):
-            error = np.abs(part[mode, :, 0] - exact) / size[0]
-            # Frequencies are 1 to 2 % off, and at the ends a window looks to one side only.
-            assert error.max() < 0.08
-            assert error[80:-80].max() < 0.03
-
-
-@pytest.mark.parametrize("frequencies", [(), (5.0, 120.0), (5.0, 5.01), (0.01,)])
-def test_what_cannot_be_split_is_none(frequencies):
-    assert modal_motion(np.ones((100, 1)), 0.005, frequencies) is None
+    found = modal_motion(values, 0.005, (5.2, 28.3))[:, :, 0]
+    for part, wave in zip(found, waves, strict=True):
+        error = np.abs(part - wave) / np.abs(wave[0])
+        # The mirror image of a decay has a kink in its phase.
+        assert error.max() < 0.08
+        assert error[80:-80].max() < 0.03

@@ -18,7 +18,6 @@ from tests.twin_master.runs import journal
 from tests.twin_master.watch.watches import begun, ran, write_csv
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
-from twin_master.watch.growing import RECOGNISED_BY
 from twin_master.watch.message import Message, Refused
 
 pytestmark = pytest.mark.xdist_group("watches")
@@ -187,7 +186,7 @@ def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file
     ("turns", "left"),
     [
         ([0, 1], [*range(2, 9)]),  # longer than before: it is known by its rows
-        ([*range(3 * RECOGNISED_BY)], [*range(2 * RECOGNISED_BY)]),  # it begins as before: known by its size
+        ([*range(6000)], [*range(5000)]),  # it begins as before: known by its size
     ],
 )
 def test_a_cut_without_a_copy_is_told(begun_log, turns, left):

@@ -53,11 +53,11 @@ def watchful(base: Watch, folder: Path) -> Watch:
     return watch
 
 
-def soon_quiet(watch: Watch) -> Watch:
-    """Return a watch that notices a silence at once."""
-    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
-    watch.scenario = watch.scenario.model_copy(update={"watch": section})
-    return watch
+def decided(watch: Watch, feed: Feed, between: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+    """Run a watch to the end of its feed; return what was decided."""
+    decisions = list[dict[str, Any]]()
+    watch.run(feed, lambda decision: decisions.append(dict(decision)), between)
+    return decisions
 
 
 def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
@@ -108,7 +108,8 @@ def of_gauge(path: Path, gain: float, channel: str = "g5") -> Path:
 
 def wait_until(found: Callable[[], object]) -> None:
     limit = time.monotonic() + 60.0
-    while not found() and time.monotonic() < limit:
+    while not found():
+        assert time.monotonic() < limit
         time.sleep(0.02)
 
 
