@@ -1,10 +1,8 @@
 """The command line `uav-twin`: the commands of `commands.toml`, and how it ends."""
 
 import inspect
-import tomllib
 from collections.abc import Callable
 from importlib import import_module
-from importlib.resources import files
 from typing import Annotated, Any
 
 import typer
@@ -31,16 +29,14 @@ def _application() -> typer.Typer:
         help="A digital twin of a structure that loses stiffness: a wing, a mesh of yours, or any FMU.",
     )
     whole.callback()(_uav_twin)
-    groups, told = {"": whole}, terminal.told_by("uav_twin")
-    tables = tomllib.loads(files("uav_twin").joinpath("commands.toml").read_text(encoding="utf-8"))
-    tables.pop("shared")
-    for words, table in tables.items():
+    groups = {"": whole}
+    for words, table in terminal.commands_of("uav_twin").items():
         if "group" in table:
             groups[words] = typer.Typer(no_args_is_help="function" not in table, help=table["group"])
             whole.add_typer(groups[words], name=words)
         if "function" in table:
             module, _, name = table["function"].partition(":")
-            function = told(words)(getattr(import_module(module), name))
+            function = terminal.told(words, getattr(import_module(module), name))
             group, _, last = words.rpartition(" ")
             if words in groups:
                 groups[words].callback(invoke_without_command=True)(_alone(function))
