@@ -17,14 +17,9 @@ from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from tests.command_line import refused, said
 from tests.refusals import Inputs
 
-HISTORIES = Inputs(__file__).table("histories.toml")["refused"]
-ROOM = """
-binding = { name = "room", step_size = 60.0, start_time = 120.0 }
-control.power = { variable = "heater.u[1].P", unit = "kW" }
-load.outside = { variable = "ambient.T", unit = "degC", minimum = -40.0 }
-observation.room = { variables = ["room.T", "room.sensor.T"], unit = "degC" }
-record.variables = ["der(room.T)"]
-"""
+INPUTS = Inputs(__file__)
+HISTORIES = INPUTS.table("histories.toml")["refused"]
+ROOM = INPUTS.text("room.toml")
 
 
 @pytest.fixture
@@ -99,11 +94,7 @@ def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path, where):
     assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
 
 
-SIZED = """
-binding = { name = "sized", step_size = 1.0, structural_parameters = { n = 3 } }
-control.u = { variable = "u", unit = "1" }
-observation.y = { variables = "y", unit = "1" }
-"""
+SIZED = INPUTS.text("sized.toml")
 
 
 def test_an_array_may_be_empty(foreign_fmu, tmp_path):
