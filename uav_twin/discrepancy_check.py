@@ -25,7 +25,12 @@ def check(
     if json:
         terminal.print_json(_record(data, chosen.name, faults, able))
     else:
-        _show(data, chosen, faults, able, catalogue)
+        from discrepancy.report.text import WORDS
+
+        of_able = (parts.seen_of, parts.neighbours, parts.group_lines, parts.needs)
+        given: dict[str, Any] = {item.__name__: item for item in of_able}
+        given |= {"data": data, "model": chosen, "faults": faults, "catalogue": catalogue}
+        show("check", words=WORDS, able=able, **given)
     if able is None:
         raise refused("Mend the faults first: conclusions from these data would be wrong.")
 
@@ -54,22 +59,3 @@ def _record(
         ],
         "confusion_groups": [] if able is None else [list(group) for group in able.groups],
     }  # fmt: skip
-
-
-def _show(
-    data: "parts.Campaign",
-    model: "parts.Model",
-    faults: "Sequence[parts.DataFault]",
-    able: "parts.Separability | None",
-    catalogue: "Sequence[parts.Effect]",
-) -> None:
-    from discrepancy.report import check_tables as said
-    from discrepancy.report.text import WORDS
-
-    rows, lines = [], list[str]()
-    if able is not None:
-        rows = [(name, *row[1:-1]) for name, *row in map(list, said.rows_of(able))]
-        lines = [*said.untested_lines(able), *said.confused_lines(able)]
-        lines += said.group_lines(able, "to which is said above")
-        lines += said.needs(able, data, catalogue, model.kinds)
-    show("check", words=WORDS, data=data, model=model, faults=faults, rows=rows, lines=lines)

@@ -4,7 +4,6 @@ import dataclasses
 import shlex
 from functools import partial
 from json import loads
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -74,18 +73,12 @@ def run(
     content = parts.ReportInput(found, origin, able, tried, choice.design, pack=pack)
     with stage("Writing the verdict"):
         place = parts.write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
-    _conclude(found, tried, folder, None if no_report else place, json=json)
+    _conclude(content, folder, None if no_report else place, json=json)
 
 
-def _conclude(
-    found: "parts.Investigation",
-    tried: "parts.SelfCalibration | None",
-    folder: Path,
-    report: Path | None,
-    *,
-    json: bool,
-) -> None:
+def _conclude(content: "parts.ReportInput", folder: Path, report: Path | None, *, json: bool) -> None:
     """Print the conclusion; data at fault end the command with 1."""
+    found = content.investigation
     fault = found.verdict.kind is parts.VerdictKind.DATA_ERROR
     if json:
         record = {"folder": str(folder), "report": None if report is None else str(report)}
@@ -95,7 +88,7 @@ def _conclude(
         for sentence in (found.verdict.sentence, *(fault.sentence for fault in found.faults[1:])):
             typer.secho(sentence, fg="red", err=True)
     elif not json:
-        _show(found, tried, folder)
+        _show(content, folder)
     if not json:
         terminal.say(f"Verdict: {folder}" if report is None else f"Report: {report}")
     if fault:
@@ -143,61 +136,11 @@ def _command(source: Path, effects: list[Path], from_run: bool, **options: Any) 
     return shlex.join(words)
 
 
-def _show(found: "parts.Investigation", tried: "parts.SelfCalibration | None", folder: Path) -> None:
-    from discrepancy.report import text
+def _show(content: "parts.ReportInput", folder: Path) -> None:
+    from discrepancy.report.text import WORDS
 
-    verdict, sizes, probability = found.verdict, "", ""
     if (patch_file := folder / parts.PATCH_NAME).is_file():
-        stored = parts.read_patch(patch_file)
-        sizes = text.size_sentence(found, stored.effects, [effect.intervals for effect in stored.effects])
-    when = parts.when_sentence(verdict.windows)
-    if isfinite(verdict.probability) and verdict.kind is not parts.VerdictKind.UNEXPLAINED:
-        against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
-        none = verdict.kind is parts.VerdictKind.NOTHING_MISSING
-        probability = f"Probability {parts.probability_text(verdict.probability)}{'' if none else against}."
-    estimates = [
-        (
-            effect.identifier, effect.place, item.name.replace("_", " "), *text.estimate_text(item),
-            text.unit_text(item.unit),
-        )
-        for effect in verdict.effects
-        for item in (*effect.parameters, *effect.shape)
-    ]  # fmt: skip
-    conclusion = (
-        text.headline(verdict),
-        sizes,
-        text.force_sentence(verdict.force) if verdict.force else "",
-        text.shares_sentence(verdict),
-        text.remainders_sentence(verdict),
-        "" if when in verdict.sentence else when,
-        probability,
-    )
-    show(
-        "run",
-        words=text.WORDS,
-        verdict=verdict,
-        conclusion=conclusion,
-        estimates=estimates,
-        proof="" if found.proof is None else _proof_sentence(found.proof, verdict, found.campaign),
-        faults=[fault.sentence for fault in found.faults],
-        tried=tried,
-    )
-
-
-def _proof_sentence(proof: "parts.Proof", verdict: "parts.Verdict", campaign: "parts.Campaign") -> str:
-    from discrepancy.report.text import number, percent, residual_sizes, rests_on_force, scored
-
-    first, second, which = scored(proof)
-    held_out = ", ".join(trial.name for trial in campaign.held_out)
-    where = f"{which} trials ({held_out if which == 'held-out' else 'none is held out'})"
-    if verdict.explained is not None and not rests_on_force(verdict):
-        before, after = residual_sizes(verdict.explained)
-        return f"Residuals on {where}: rms of {before} noise deviations before, {after} with the effect."
-    if not isfinite(first.chi_square_per_dof):
-        return proof.remaining
-    closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
-    why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
-    return (
-        f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "
-        f"{number(second.chi_square_per_dof)} with the effect{closed}.{why}"
-    )
+        intervals = [effect.intervals for effect in parts.read_patch(patch_file).effects]
+        content = dataclasses.replace(content, intervals=intervals)
+    terminal.say(f"Verdict: {content.investigation.verdict.kind.value}", bold=True)
+    show("run", words=WORDS, **parts.said_on_page(content))

@@ -13,27 +13,20 @@ if TYPE_CHECKING:
 def show(command: str, *, words: "Words | None" = None, **values: Any) -> None:
     """Print what a command found as `[printed]` of a file of words says, by default `words.toml` here.
 
-    It lists blocks. `say` is a line, and `table` a table of the file that is printed where it has rows; `of`
-    is an expression of the values that gives the rows, or what is said one by one, each as `row`, and
-    `colour` one of the style of a row. A block whose `when` is false is left out, and so is a line that is
-    empty.
+    It lists blocks as `Words.told` takes them. A row of a table with `colours` has that of its first cell of
+    which they hold one.
     """
-    from reporting.page import Words, evaluated, rendered
+    from reporting.page import Words
 
     words = words or Words("uav_twin")
-    for block in words.content["printed"][command]:
-        if "when" in block and not evaluated(block["when"], **values):
-            continue
-        rows = evaluated(block["of"], **values) if "of" in block else None
-        if "table" in block:
-            columns, cells = words.table(block["table"], rows or (), **values)
-            if cells:
-                colours = [rendered(block.get("colour", ""), **values, row=row) for row in rows or ()]
-                terminal.print_table([column.name for column in columns], cells, colours)
-            continue
-        for row in (None,) if rows is None else rows:
-            if line := rendered(block["say"], **values, row=row):
-                terminal.say(line, bold=block.get("bold"))
+    for kind, what in words.told(words.content["printed"][command], **values):
+        if kind == "table":
+            name, table = what
+            colours = words.content["tables"][name].get("colours", {})
+            styles = [next((colours[cell] for cell in row if cell in colours), "") for row in table.rows]
+            terminal.print_table([column.name for column in table.columns], table.rows, styles)
+        else:
+            terminal.say(what)
 
 
 def answer(command: str, record: dict[str, Any], *, json: bool, **values: Any) -> None:

@@ -62,15 +62,11 @@ class Picture(NamedTuple):
 
 def _picture(turn: int, verdict: Path) -> Picture | None:
     """Return what the folder of a verdict shows of a missing force; None: nothing, or no whole verdict."""
-    drawing = verdict / PICTURE
-    if not drawing.is_file():
-        return None
-    try:
-        return Picture(
-            turn, drawing, str(read_json(verdict / VERDICT, DamagedFileError)["verdict"]["sentence"])
-        )
-    except (DamagedFileError, KeyError, TypeError):
-        return None
+    with suppress(DamagedFileError, KeyError, TypeError):
+        if (verdict / PICTURE).is_file():
+            record = read_json(verdict / VERDICT, DamagedFileError)["verdict"]
+            return Picture(turn, verdict / PICTURE, str(record["sentence"]))
+    return None
 
 
 class Flight:

@@ -12,7 +12,7 @@ from typing import Any
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
-from reporting.provenance import hash_file, hash_record
+from reporting.provenance import hash_record
 from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
@@ -36,8 +36,7 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
-from twin_master.watch.teaching import Teaching
-from twin_master.watch.trial import Outcome, both_patches, judged, patched_model
+from twin_master.watch.teaching import Outcome, Teaching, both_patches, judged, patched_model
 
 WATCHED = "watched asset"
 STORED_TURNS = 1_000
@@ -276,20 +275,19 @@ class Watch:
         self.twin = again.twin
         self.models.append(replace(outcome.model, patch=self.folder / name))
         model: dict[str, Any] = {
-            "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
-            "before": outcome.before, "after": outcome.after, "alarms": [vars(alarm) for alarm in alarms],
-            "policy_change": outcome.policy_change, **({} if notice is None else {"notice": dict(notice)}),
+            "patch": name, "from_turn": first, "alarms": [vars(alarm) for alarm in alarms], **outcome.record,
+            **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
         self.write(model=model)
         keep_knowledge(self.folder, outcome.model.knowledge)
         gaps = [
-            f"{name.replace('_', ' ')} {value:.4g} before, {outcome.after[name]:.4g} after"
-            for name, value in outcome.before.items()
+            f"{name.replace('_', ' ')} {value:.4g} before, {model['after'][name]:.4g} after"
+            for name, value in model["before"].items()
             if value is not None
         ]
         since = f"The patched model is believed from {self.scenario.mission.step_name} {first} on"
-        self._progress.note(f"{since}: {', '.join(gaps)}. {outcome.policy_change}".rstrip())
+        self._progress.note(f"{since}: {', '.join(gaps)}. {model['policy_change']}".rstrip())
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
@@ -298,11 +296,8 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         result, attributes = self.result(turns, last), {}
-        if self.teaching.adopted:
-            adopted = self.teaching.adopted[-1]
-            attributes = {
-                "model_patch": adopted["patch"], "model_patch_from_step": adopted["from_turn"]
-            }  # fmt: skip
+        for model in self.teaching.adopted[-1:]:
+            attributes = {"model_patch": model["patch"], "model_patch_from_step": model["from_turn"]}
         origin = FlownAndBelieved(WATCHED, self._source.origin.model)
         with self._progress.stage("Storing"):
             stored = store_flight(

@@ -17,7 +17,7 @@ from discrepancy.verdict_folder import write_verdict_folder
 from tests.command_line import refused
 from tests.discrepancy.rigs import ORIGIN, drag_found
 from tests.twin_master.runs import check_same, journal, text_of, written
-from tests.twin_master.watch.watches import decided, of_gauge, patch_of, ran, viewed, watchful
+from tests.twin_master.watch.watches import beliefs_of, decided, of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.mission.replay import replay
@@ -25,8 +25,7 @@ from twin_master.network.inference import known_control
 from twin_master.viewer.messages import Request, Teller
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
-from twin_master.watch.teaching import Teaching
-from twin_master.watch.trial import Outcome, both_patches, patched_model, policy_change
+from twin_master.watch.teaching import Outcome, Teaching, both_patches, patched_model, policy_change
 from twin_master.watch.tutor import TRIED, Tutor, trial_sentence
 
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
@@ -182,16 +181,10 @@ def test_live_turns_do_not_wait_for_the_patched_model(noticing, mission, loose, 
     assert model["turn"] == trial_end + 3
     assert model["model"]["from_turn"] < 20
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
-    twin, first = noticing.models[0].knowledge.twin(), model["model"]["from_turn"]
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
-    knew = noticing.models[1].knowledge.twin()
-    for number, row in enumerate(observed):
-        if number == first:
-            knew.restore_state(twin.save_state())
-            twin = knew
-        found = twin.turn(row, int(mission.control_index[number]))
-    assert journal(noticing.folder)[-1]["filtered"] == found.filtered.tolist()
+    beliefs = beliefs_of(noticing, observed, mission.control_index, model["model"]["from_turn"])
+    assert journal(noticing.folder)[-1]["filtered"] == beliefs[-1]
     again = watchful(noticing, tmp_path / "again")
     twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)]
     assert twins[0].save_state() == twins[1].save_state()
@@ -203,8 +196,6 @@ def test_a_policy_that_changes_is_told(base):
     z1, z2 = states.coordinates.T
     assert policy_change(known, known) == ""
     for gentle, sentence in (
-        (z1 > 0.7, "With it 3g is left at z1 80 % in the place of 60 %."),
-        (z1 >= 0.0, "With it 3g is left at z1 0 % in the place of 60 %."),
         (z1 > 1.0, "With it another control is chosen in 10 of 25 states, first 3g in the place of 2g at "
                    "z1 60 %, z2 0 %."),
         ((z1 > 0.5) & (z2 > 0.1), "With it another control is chosen in 2 of 25 states, first 3g in the "
@@ -212,7 +203,7 @@ def test_a_policy_that_changes_is_told(base):
     ):  # fmt: skip
         plan = replace(known.plan, control_index=np.where(gentle, 1 - sharp, sharp))
         assert policy_change(known, replace(known, plan=plan)) == sentence
-    outcome = Outcome(b"", None, 3.5, {}, {}, sentence)  # type: ignore[arg-type]
+    outcome = Outcome(b"", None, 3.5, {"policy_change": sentence})  # type: ignore[arg-type]
     for kind in TRIED:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
 

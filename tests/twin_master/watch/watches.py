@@ -67,6 +67,17 @@ def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Cou
     return counts
 
 
+def beliefs_of(watch: Watch, observed: np.ndarray, controls: np.ndarray, first: int) -> list[list[float]]:
+    """Return what a twin believes that has the second model of a watch from a turn on."""
+    twin, beliefs = watch.models[0].knowledge.twin(), []
+    for turn, (row, control) in enumerate(zip(observed, controls.tolist(), strict=True)):
+        if turn == first:
+            state, twin = twin.save_state(), watch.models[1].knowledge.twin()
+            twin.restore_state(state)
+        beliefs.append(twin.turn(row, control).filtered.tolist())
+    return beliefs
+
+
 def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
     """Run in a process of its own, killed once the journal has a size; return whether it was killed."""
     journal, child = watch.folder / JOURNAL_NAME, os.fork()
