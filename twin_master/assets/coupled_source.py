@@ -1,10 +1,10 @@
 """Several FMUs as the asset of a mission: joined in the scenario, or read from an SSP file."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fe.wing.design import load_design
 from fmu_asset.companions import COMPANION_NAMES
@@ -19,6 +19,7 @@ from fmu_asset.door.binding import Binding, expand
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
+from reporting.toml_file import Fault
 from twin_master.assets.asset_source import BINDING_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource
 from twin_master.errors import MissionInputError
@@ -58,11 +59,10 @@ class ComponentSection(FileSection):
     def _is_shipped(self, key: str, name: str) -> bool:
         return name in COMPANION_NAMES if key == "fmu" else super()._is_shipped(key, name)
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.fmu is None) == (self.design is None):
-            raise ValueError(f"the component `{self.name}` needs one of `fmu` and `design`")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield other than one source."""
+        both = (self.fmu is None) == (self.design is None)
+        yield both, f"the component `{self.name}` needs one of `fmu` and `design`"
 
 
 class ConnectionSection(Section):
@@ -124,12 +124,12 @@ class CoupledSection(SeveralSection):
         """Return the FMUs together."""
         return CoupledSource(scenario, self)
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield what an FMU has, and names that come twice."""
+        yield from super().faults()
         names = [component.name for component in self.component]
-        if len(set(names)) != len(names):
-            raise ValueError(f"each component needs a name of its own, and the names are {short(names)}")
-        return self
+        told = f"each component needs a name of its own, and the names are {short(names)}"
+        yield len(set(names)) != len(names), told
 
 
 class SeveralSource(FmuSource):

@@ -1,11 +1,13 @@
 """A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
 
-from collections.abc import Iterator, Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from reporting import toml_file
+from reporting.toml_file import Fault as Fault
 from reporting.toml_file import shown
 from twin_master.sentences import said
 
@@ -59,10 +61,6 @@ def _check_percent(key: object, value: object) -> None:
             raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
 
 
-Fault = tuple[object, str]
-"""Whether a table has it, and the sentence on it."""
-
-
 def one_or_each(key: str, value: object, count: int) -> Fault:
     """Return the fault that what may be given for each sensor is given neither once nor `count` times."""
     came = len(value) if isinstance(value, tuple) else count
@@ -77,10 +75,10 @@ def _wrong_key(
     return InitErrorDetails(type=error, loc=(key,), input=came)
 
 
-class Section(BaseModel):
+class Section(toml_file.Section):
     """A table of the file: unknown keys are refused, and a unit in a key's name is honoured."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(strict=False)
     units: ClassVar[Mapping[str, str]] = {}
     """The unit that each key may carry in its name."""
 
@@ -114,20 +112,6 @@ class Section(BaseModel):
                 _check_percent(key, value)
             converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
         return converted
-
-    def faults(self) -> Iterator[Fault]:
-        """Yield for each fault that it may have whether it has it, and the sentence on it.
-
-        A fault is looked for only in a table that has none of those before it.
-        """
-        yield from ()
-
-    @model_validator(mode="after")
-    def _refuse_faults(self) -> Self:
-        for found, sentence in self.faults():
-            if found:
-                raise ValueError(sentence)
-        return self
 
     @classmethod
     def split_unit(cls, key: str) -> tuple[str, str]:
