@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
@@ -220,27 +221,13 @@ def self_calibrate(
                 absent[effect.identifier] = None
         hidden.append(found)
     cases: list[CalibrationCase] = []
-    with ProcessPoolExecutor(
-        max(workers, 1), get_context("spawn"), _begin, (campaign, model, effects)
-    ) as pool:
-        own_work = partial(_investigated, simulator, effects)
-        apart = workers > 1 and count > 1
-        for case in pool.map(_one, hidden, own) if apart else map(own_work, hidden, own):
+    work = partial(_investigated, simulator, effects)
+    with ProcessPoolExecutor(max(workers, 1), get_context("spawn")) as pool:
+        for case in (pool.map if workers > 1 and count > 1 else map)(work, hidden, own):
             cases.append(case)
             if advance is not None:
                 advance()
     return SelfCalibration(tuple(cases), tuple(absent), seed)
-
-
-_worker: list[Callable[..., CalibrationCase]] = []
-
-
-def _begin(campaign: Campaign, model: Model, effects: Sequence[Effect]) -> None:
-    _worker.append(partial(_investigated, Simulator(campaign, model), effects))
-
-
-def _one(hidden: Hidden | None, seed: np.random.SeedSequence) -> CalibrationCase:
-    return _worker[0](hidden, seed)
 
 
 def _investigated(
@@ -295,6 +282,10 @@ def write_self_calibration(path: Path, found: SelfCalibration, origin: Origin) -
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
+
+    def told(share: Share) -> dict[str, Any]:
+        return {**plain(share), "share": plain(share.value)}
+
     rows, columns, counts = found.confusion()
     content = {
         "schema": SCHEMA,
@@ -302,14 +293,10 @@ def write_self_calibration(path: Path, found: SelfCalibration, origin: Origin) -
         "seed": found.seed,
         "not_detectable": list(found.not_detectable),
         "outcomes": {
-            name: {
-                outcome: plain(found.share(outcome, null=null))
-                | {"share": plain(found.share(outcome, null=null).value)}
-                for outcome in outcomes(found, null=null)
-            }
+            name: {outcome: told(found.share(outcome, null=null)) for outcome in outcomes(found, null=null)}
             for name, null in (("with_an_effect", False), ("with_nothing", True))
         },
-        "coverage_90": plain(found.coverage()) | {"share": plain(found.coverage().value)},
+        "coverage_90": told(found.coverage()),
         "confusion": {"hidden": rows, "verdict": columns, "counts": counts.tolist()},
         "cases": [plain(case) for case in found.cases],
     }

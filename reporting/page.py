@@ -8,7 +8,7 @@ page stand in a TOML file of its own, see `Words`.
 import re
 import tomllib
 from base64 import b64encode
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -109,7 +109,8 @@ class Words:
         titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``. `cell` says
         what a column shows of each `row` and its `row_number`, where rows are records and no ready cells; a
         column with `when` is left out where the value of that name is false. `rows` are rows of templates
-        before those that are given, each left out where it has nothing behind its first cell.
+        before those that are given, each left out where it has nothing behind its first cell. `[[page]]`
+        are sections, each a `title` and the `blocks` of `told`; `when` as there.
     **shared
         What every template may name beside its own values, such as functions that print numbers.
     """
@@ -120,7 +121,7 @@ class Words:
 
     def say(self, name: str, /, **values: Any) -> str:
         """Return a sentence of the table ``[said]``."""
-        return filled(self.content["said"][name], **self._shared, **values)
+        return filled(self.content["said"][name], **self._shared | values)
 
     def table(self, name: str, rows: Sequence[Any], /, **values: Any) -> tuple[list[Column], list[Any]]:
         """Return the columns of a table, and the cells of its rows; `more` are further columns."""
@@ -149,11 +150,60 @@ class Words:
     def words(self, kind: str, name: str, /, **values: Any) -> dict[str, str]:
         """Return title and caption of one of the `figures` or `tables`."""
         told = self.content[kind][name]
-        return {part: filled(told[part], **self._shared, **values) for part in ("title", "caption")}
+        return {part: filled(told[part], **self._shared | values) for part in ("title", "caption")}
 
     def figure(self, name: str, figure: Any, /, **values: Any) -> ReportFigure:
         """Return a figure with its words."""
         return ReportFigure(name, figure, **self.words("figures", name, **values))
+
+    def told(self, blocks: Iterable[Mapping[str, Any]], /, **values: Any) -> Iterator[tuple[str, Any]]:
+        """Return what blocks say, each with its kind.
+
+        A `say` or `notice` is a text, left out where it is empty; `of` is an expression of the values, for
+        each of whose items, the `row`, it is said. A `table` is a table of this file with the rows `of`, left
+        out where it has none, and `more` columns. A `figure` is one of the value `figures`, if it is there.
+        `highlights` are pairs of a value and what it is, those with a value. Without its `when` nothing is
+        said.
+        """
+        values = self._shared | values
+        for block in blocks:
+            if not evaluated(block.get("when", "true"), **values):
+                continue
+            rows = evaluated(block["of"], **values) if "of" in block else None
+            if "table" in block:
+                own = values | {"more": evaluated(block.get("more", "[]"), **values)}
+                columns, cells = self.table(block["table"], rows or (), **own)
+                if cells:
+                    yield "table", (block["table"], Table(columns, cells))
+            elif "figure" in block:
+                if block["figure"] in values["figures"]:
+                    yield "figure", block["figure"]
+            elif "highlights" in block:
+                pairs = ((filled(value, **values), what) for value, what in block["highlights"])
+                yield "highlights", [(value, filled(what, **values)) for value, what in pairs if value]
+            else:
+                kind = "notice" if "notice" in block else "say"
+                for row in (None,) if rows is None else rows:
+                    if (text := rendered(block[kind], **values, row=row)).strip():
+                        yield kind, text
+
+    def fill(self, page: "Page", drawings: Mapping[str, bytes], /, **values: Any) -> None:
+        """Add the sections of the file to a page; `drawings` are the `figures` as SVG."""
+        adding: dict[str, Callable[[Any], None]] = {
+            "say": page.add_paragraph, "notice": page.add_notice, "highlights": page.add_highlights,
+        }  # fmt: skip
+        for section in self.content["page"]:
+            if not evaluated(section.get("when", "true"), **values):
+                continue
+            page.add_section(filled(section["title"], **values))
+            for kind, what in self.told(section["blocks"], **values):
+                if kind == "figure":
+                    item = values["figures"][what]
+                    page.add_figure(drawings[what], item.caption, title=item.title)
+                elif kind == "table":
+                    page.add_table(what[1], **self.words("tables", what[0], **values))
+                else:
+                    adding[kind](" ".join(what.split()) if isinstance(what, str) else what)
 
     def add_table(self, page: "Page", name: str, rows: Sequence[Any] = (), /, **values: Any) -> None:
         """Add a table with its words to a page, if it has rows; `more` are further columns."""

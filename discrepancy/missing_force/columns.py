@@ -13,8 +13,8 @@ from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.trial import SeenTrial
-from discrepancy.missing_force.view import Column, Motion, Part, View, combined
+from discrepancy.missing_force.trial import Part, SeenTrial
+from discrepancy.missing_force.view import Column, Motion, View, combined
 from discrepancy.models.interface import Response
 from discrepancy.models.sensing import observe_response
 from fe.compilation import compiled, law_functions

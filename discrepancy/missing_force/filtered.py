@@ -8,11 +8,12 @@ Unknowns that act in proportion follow from what whitened readings and columns s
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.campaign.sampling import IntArray
 
 from . import kalman_kernels as kernels
@@ -52,6 +53,18 @@ class Process:
     def intensity(self) -> float:
         """Spectral density of the white noise that drives the last state."""
         return 2.0 / self.time if self.rough else 4.0 * np.sqrt(3.0) / self.time
+
+
+class Passed(NamedTuple):
+    """A pass of the filter over covariances, see `kalman_kernels`."""
+
+    moves: FloatArray
+    which: IntArray
+    rows: FloatArray
+    used: BoolArray
+    slot: IntArray
+    gains: FloatArray
+    sizes: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,46 +143,41 @@ class Filtered:
         return kernels.discretised(*self.system[:2], lengths)
 
     @cached_property
-    def _passed(
-        self,
-    ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _passed(self) -> tuple[Passed, FloatArray, FloatArray]:
+        """What the other passes take, and predicted and filtered covariances (S, n, n) by slot."""
         lengths, which = self.trial.steps
         moves, noises = self._steps(lengths)
-        _, _, rows, start = self.system
-        return moves, *kernels.covariances(moves, noises, which, rows, self.trial.used, start)
+        rows, start = self.system[2:]
+        used = self.trial.used
+        covers = kernels.covariances(moves, noises, which, rows, used, start)
+        slot, gains, sizes, predicted, filtered = covers
+        return Passed(moves, which, rows, used, slot, gains, sizes), predicted, filtered
 
     @property
     def is_sound(self) -> bool:
         """Whether no variance has been lost to rounding, as under forces far larger than what is read."""
-        return bool(np.all(self._passed[3] > 0.5))
+        return bool(np.all(self._passed[0].sizes > 0.5))
 
     @property
     def log_determinant(self) -> float:
         """Half the sum of the logarithms of the readings' variances given those before [nat]."""
-        _, slot, _, sizes, _, _ = self._passed
-        white = np.sum(self.trial.used * np.log(self.white))
-        return 0.5 * float(np.sum(np.log(sizes[slot]) * self.trial.used)) - float(white)
+        one = self._passed[0]
+        return float(np.sum((0.5 * np.log(one.sizes[one.slot]) - np.log(self.white)) * one.used))
 
     def whitened(self, columns: FloatArray) -> FloatArray:
         """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
-        moves, slot, gains, sizes, _, _ = self._passed
         given = np.moveaxis(columns, 0, -1)
         given = np.ascontiguousarray(given * self.white[:, None] if self.trial.coloured else given)
-        found = kernels.whitened(
-            moves, self.trial.steps[1], self.system[2], self.trial.used, slot, gains, sizes, given
-        )
+        found = kernels.whitened(*self._passed[0], given)
         return np.asarray(found.reshape(-1, found.shape[-1]))
 
     def smoothed(self, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the added state (F, n) and the missing forces (P, F) at the fine stamps, given readings."""
-        moves, slot, gains, sizes, _, filtered = self._passed
-        lengths, which = self.trial.steps
-        rows = self.system[2]
-        seen = np.ascontiguousarray(readings * self.white)
-        means, later = kernels.smoothed(moves, which, rows, self.trial.used, slot, gains, sizes, seen)
+        one, _, filtered = self._passed
+        means, later = kernels.smoothed(*one, np.ascontiguousarray(readings * self.white))
         parts = self.trial.parts
-        fine = self._steps(lengths / parts)
-        found = kernels.between(parts, *fine, which, slot, filtered, means, later)
+        fine = self._steps(self.trial.steps[0] / parts)
+        found = kernels.between(parts, *fine, one.which, one.slot, filtered, means, later)
         sizes = np.array([one.size for _, one in self.processes])
         forces = found[:, self._places].T * sizes[:, None]
         return np.asarray(found[:, : len(self._scale)] * self._scale), np.asarray(forces)
@@ -189,11 +197,9 @@ class Filtered:
 
     def _deviations(self, shown: FloatArray, at: slice) -> FloatArray:
         """Return the smoothed deviation of a row (n,) of the state at last samples."""
-        moves, slot, gains, sizes, predicted, _ = self._passed
-        which, used = self.trial.steps[1][at], self.trial.used[at]
-        rows = self.system[2]
-        found = kernels.variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown)
-        return np.asarray(np.sqrt(found))
+        one, predicted, _ = self._passed
+        last = one._replace(which=one.which[at], used=one.used[at], slot=one.slot[at])
+        return np.asarray(np.sqrt(kernels.variances(*last, predicted, shown)))
 
 
 ROUNDING = 1e-12

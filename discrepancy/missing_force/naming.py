@@ -22,7 +22,7 @@ from .columns import Columns
 from .filtered import Process, Solution
 from .hypotheses import both_signs, log_prior, scaled, sized, stepped, variants
 from .trial import seen_trial
-from .view import SHARES, Column, Motion, Processes, View, combined
+from .view import Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 WIDE = 3.0
@@ -40,8 +40,6 @@ WIDTHS = (10, 4, 4)
 """Effects that are followed after the screen: alone, beside one other, beside two."""
 BEAM = 3
 """Sets to which one more effect is added."""
-BEGIN_TIMES = (1.0, 10.0)
-"""Correlation times over that of the port's motion, from which the most probable one is looked for."""
 ROUNDS = 8
 LONGEST_STEP = 1.5
 SETTLED = 0.05
@@ -169,9 +167,8 @@ class ForceSearch:
             bare = self._view()
             for port, name in enumerate(self.ports):
                 view = self._along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
-                begins = [scaled(self.about((port,)), 1.0, time) for time in BEGIN_TIMES]
-                begins += [self.at[name].processes] if turn else []
-                self.at[name] = seen(view, self.about((port,)), begins, SHARES[:1])
+                first = self.about((port,))
+                self.at[name] = seen(view, first, self.at[name].processes if turn else first)
             if not turn and about is None:
                 self.point = self._point(self.best())
         self.whole = self._together()
@@ -188,8 +185,8 @@ class ForceSearch:
         for item in ranked[1:]:
             begin |= scaled(item.processes, BESIDE, 1.0)
         view = best.view
-        for shares in (SHARES[:1], ()):
-            found = seen(view, self.about(begin), [begin], shares)
+        for near in (False, True):
+            found = seen(view, self.about(begin), begin, near=near)
             view = self._along(view, found.motions)
             begin = dict(found.processes)
         return found
@@ -227,7 +224,7 @@ class ForceSearch:
             for _ in range(2):
                 view = self._along(view, view.smoothed(found.processes)[2])
             begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
-            found = seen(view, self.about(begin), [begin])
+            found = seen(view, self.about(begin), begin)
         return found
 
     def whole_point(self, found: Explained) -> Point:
@@ -359,8 +356,8 @@ class ForceSearch:
             if view is None:
                 break
             if turn == 0 or settled or turn == ROUNDS - 1:
-                some = () if turn else SHARES
-                found = seen(view, self.about(processes), [processes], some, candidate, effect)
+                near = turn > 0
+                found = seen(view, self.about(processes), processes, candidate, effect, near=near)
                 processes = dict(found.processes)
             else:
                 evidence = view.evidence(self.about(processes), processes)
@@ -408,11 +405,12 @@ class ForceSearch:
 def seen(
     view: View,
     about: Processes,
-    begins: Sequence[Processes],
-    shares: Sequence[float] = SHARES,
+    begin: Processes,
     candidate: Candidate = NOTHING,
     effect: FloatArray = NO_VALUES,
+    *,
+    near: bool = False,
 ) -> Explained:
     """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begins, shares)
+    processes, evidence = view.most_probable(about, begin, near=near)
     return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))

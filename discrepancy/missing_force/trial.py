@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -39,15 +38,32 @@ SMALL = 1e-3
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 
 
-class PortMotion(NamedTuple):
-    """What a unit of an unknown does to positions and speeds (2, F, P) of ports, linear about a value of it.
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What an effect does in a trial, for a unit of its unknown.
 
-    Unknowns are numbered: the shared ones, then the trial's own.
+    Attributes
+    ----------
+    readings : (N, C) ndarray
+        Over the noise's deviations.
+    added : (F, n) ndarray or None
+        State that it adds.
+    forces : mapping of int to (F,) ndarray
+        Its force at ports, by their numbers.
     """
 
-    number: int
-    about: float
-    motion: FloatArray
+    readings: FloatArray
+    added: FloatArray | None = None
+    forces: Mapping[int, FloatArray] = field(default_factory=dict)
+
+    def plus(self, other: "Part", factor: float) -> "Part":
+        """Return the sum with another part that is taken `factor` times."""
+        added = [item * part.added for item, part in ((1.0, self), (factor, other)) if part.added is not None]
+        forces = dict(self.forces)
+        for port, force in other.forces.items():
+            forces[port] = forces.get(port, 0.0) + factor * force
+        readings = self.readings + factor * other.readings
+        return Part(readings, sum(added[1:], added[0]) if added else None, forces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +98,12 @@ class SeenTrial:
         Motion of the ports by the model at the fine stamps.
     settled : bool
         Whether it begins at rest under what acts.
-    about : (K,) ndarray
-        Shared unknowns at the point.
+    about : (K + L,) ndarray
+        Shared unknowns and the trial's own at the point.
     gains : sequence of (int, int, float)
         Shared unknowns that are gains: number, channel, and what a unit is over one and the gain.
-    by_unknowns : sequence of PortMotion
-        How the ports move otherwise, without a missing force, as unknowns do.
+    by_unknowns : mapping of int to (2, F, P) ndarray
+        What a unit of unknowns, by their numbers in `about`, does to positions and speeds of ports.
     """
 
     name: str
@@ -107,7 +123,7 @@ class SeenTrial:
     settled: bool
     about: FloatArray = field(default_factory=lambda: np.zeros(0))
     gains: Sequence[tuple[int, int, float]] = ()
-    by_unknowns: Sequence[PortMotion] = ()
+    by_unknowns: Mapping[int, FloatArray] = field(default_factory=dict)
 
     @cached_property
     def steps(self) -> tuple[FloatArray, IntArray]:
@@ -146,8 +162,8 @@ class SeenTrial:
         (F, n).
         """
         motion = np.stack((self.positions, self.speeds))
-        for item in self.by_unknowns:
-            motion += (unknowns[item.number] - item.about) * item.motion
+        for k, moves in self.by_unknowns.items():
+            motion += (unknowns[k] - self.about[k]) * moves
         return motion[0] + added @ self.system.positions.T, motion[1] + added @ self.system.speeds.T
 
     def pushed(self, port: int, force: FloatArray) -> FloatArray:
@@ -158,13 +174,8 @@ class SeenTrial:
             start = np.linalg.lstsq(self.system.generator, -push * force[0], rcond=1e-12)[0]
         return self._moved(start, push[:, None], force[:, None])
 
-    def turned(
-        self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the state (F, n) that a change of the system makes of an added one, and readings (N, C).
-
-        `forces` (F,) by port are those that added it.
-        """
+    def turned(self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]) -> Part:
+        """Return what a change of the system makes of an added state (F, n) and `forces` that added it."""
         pushes = added @ slope.generator.T
         for port, force in forces.items():
             pushes -= np.outer(force, slope.actions[port])
@@ -173,7 +184,7 @@ class SeenTrial:
             start = -np.linalg.lstsq(self.system.generator, pushes[0], rcond=1e-12)[0]
         rows = np.flatnonzero(np.any(pushes, axis=0))
         state = self._moved(start, np.eye(len(start))[:, rows], pushes[:, rows])
-        return state, self.readings(state) + self.over_noise(self._shown(slope, added, forces))
+        return Part(self.readings(state) + self.over_noise(self._shown(slope, added, forces)), state)
 
     def _moved(
         self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
@@ -266,18 +277,15 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
 
     local = point.local[number]
     here = moving(point.shared, local)
-    ways = [(k, point.shared[k], moved(point.shared, k), local) for k in range(len(shared.parameter_mean))]
-    own = range(unknowns.zeros, unknowns.size)
-    ways += [(shared.size + k, local[k], point.shared, moved(local, k)) for k in own]
-    by_unknowns = [
-        PortMotion(k, float(about), (moving(*there) - here) / PARAMETER_STEP) for k, about, *there in ways
-    ]
+    ways = {k: (moved(point.shared, k), local) for k in range(len(shared.parameter_mean))}
+    ways |= {shared.size + k: (point.shared, moved(local, k)) for k in range(unknowns.zeros, unknowns.size)}
+    by_unknowns = {k: (moving(*there) - here) / PARAMETER_STEP for k, there in ways.items()}
     residual, by_shared, by_local = (item / deviation * used for item in (residual, by_shared, by_local))
     return SeenTrial(
         trial.name, trial.time, residual, used,
         deviation, coloured, by_shared, by_local, unknowns.precision, base, slopes, count,
-        here[0], here[1], trial.begins.value == "settled" and trial.kind.value != "ringdown", point.shared,
-        gain_unknowns, by_unknowns,
+        here[0], here[1], trial.begins.value == "settled" and trial.kind.value != "ringdown",
+        np.concatenate((point.shared, local)), gain_unknowns, by_unknowns,
     )  # fmt: skip
 
 

@@ -1,31 +1,31 @@
 """The missing forces of all trials: their processes, their courses, and the motion beside them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from itertools import product
 
 import numpy as np
-from scipy.optimize import minimize
 
 from discrepancy.campaign.records import FloatArray
 
 from .filtered import LEAST_PRECISION, Filtered, Process, Regression, Solution, regression
-from .trial import SeenTrial
+from .trial import Part, SeenTrial
 
 Processes = Mapping[int, Process]
 """Missing forces by the numbers of their ports."""
 
 SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
 """Prior deviations of the logarithms of a process's size and correlation time."""
-SHARES = (1.0, 0.03)
-"""Sizes from which the most probable process is looked for: what is left beside a law is a part of it."""
-MOST_PASSES = 30
-NEAR, LONGEST, AT_TOP, MOST_STEPS = 0.02, 0.7, 1e-4, 8
-"""Of Newton's method: difference of logarithms by which slopes are found, the longest step that is taken,
-that after which the top is reached, and how many are taken."""
+DOUBTS = np.array((SIZE_DOUBT, TIME_DOUBT))
+STARTS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
+"""Logarithms of sizes and times, over some, at the best of which Newton's method begins: what is left beside
+a law is a part of what was missing."""
+NEAR, LONGEST, AT_TOP, MOST_STEPS = 0.02, 1.5, 1e-4, 20
+"""Of Newton's method: difference of logarithms by which slopes are found, the longest step that is taken, the
+shortest, and how many are taken."""
 FARTHEST = 5.0
-"""Prior deviations from which on a process is not looked at."""
+"""Prior deviations within which processes are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,45 +68,6 @@ class Motion:
     def laws(self) -> dict[int, FloatArray]:
         """Forces of the hypothesis (F,) by port."""
         return {port: force - self.left.get(port, 0.0) for port, force in self.forces.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """What an effect does in a trial, for a unit of its unknown.
-
-    Attributes
-    ----------
-    readings : (N, C) ndarray
-        Over the noise's deviations.
-    added : (F, n) ndarray or None
-        State that it adds.
-    forces : mapping of int to (F,) ndarray
-        Its force at ports, by their numbers.
-    """
-
-    readings: FloatArray
-    added: FloatArray | None = None
-    forces: Mapping[int, FloatArray] = field(default_factory=dict)
-
-    def plus(self, other: "Part", factor: float) -> "Part":
-        """Return the sum with another part that is taken `factor` times."""
-        added = [item * part.added for item, part in ((1.0, self), (factor, other)) if part.added is not None]
-        forces = dict(self.forces)
-        for port, force in other.forces.items():
-            forces[port] = forces.get(port, 0.0) + factor * force
-        readings = self.readings + factor * other.readings
-        return Part(readings, sum(added[1:], added[0]) if added else None, forces)
-
-
-class Turned(NamedTuple):
-    """What a unit of a shared unknown makes of the added state: readings (N, C), and state (F, n) if it does.
-
-    It is linear about a value of the unknown.
-    """
-
-    readings: FloatArray
-    about: float
-    state: FloatArray | float = 0.0
 
 
 Column = Sequence[Part]
@@ -158,18 +119,16 @@ class View:
         return np.concatenate((self.shared_precision, self.precision))
 
     @cached_property
-    def turned(self) -> list[dict[int, Turned]]:
-        """What shared unknowns, by their numbers, make of the added state, by trial."""
-        found: list[dict[int, Turned]] = [{} for _ in self.trials]
+    def turned(self) -> list[dict[int, Part]]:
+        """What a unit of shared unknowns, by their numbers, makes of the added state, by trial."""
+        found: list[dict[int, Part]] = [{} for _ in self.trials]
         for trial, motion, of_trial in zip(self.trials, self.motions, found, strict=False):
             for k, slope in enumerate(trial.slopes):
                 if slope is not None:
-                    state, readings = trial.turned(slope, motion.added, motion.forces)
-                    of_trial[k] = Turned(readings, float(trial.about[k]), state)
+                    of_trial[k] = trial.turned(slope, motion.added, motion.forces)
             shown = trial.readings(motion.added, motion.forces)
             for k, channel, scale in trial.gains:
-                alone = scale * np.eye(shown.shape[1])[channel]
-                of_trial[k] = Turned(shown * alone, float(trial.about[k]))
+                of_trial[k] = Part(shown * scale * np.eye(shown.shape[1])[channel])
         return found
 
     @cached_property
@@ -197,8 +156,8 @@ class View:
             left = trial.residual - sum(
                 (item[number].readings for item in known), np.zeros_like(trial.residual)
             )
-            for turned in self.turned[number].values():
-                left = left + turned.about * turned.readings
+            for k, turned in self.turned[number].items():
+                left = left + trial.about[k] * turned.readings
             found.append(left)
         return found
 
@@ -214,67 +173,62 @@ class View:
         """Return evidence and values of all unknowns beside missing forces."""
         return self.products(processes).solve(range(len(self.precisions)), self.precisions)
 
+    @np.errstate(invalid="ignore")
     def most_probable(
-        self, about: Processes, begins: Sequence[Processes], shares: Sequence[float] = SHARES
+        self, about: Processes, begin: Processes, *, near: bool = False
     ) -> tuple[dict[int, Process], float]:
         """Return the processes of the largest evidence times their prior, and its logarithm [nat].
+
+        By Newton's method within `FARTHEST` and `times`. Where a search ends before the top a rounding
+        decides; the top does not depend on it.
 
         Parameters
         ----------
         about : mapping of int to Process
             Medians of the prior.
-        begins : sequence of mapping of int to Process
-            From each of which they are looked for, port after port, and from some shares of their sizes; with
-            no share from what is near alone.
+        begin : mapping of int to Process
+            From which they are looked for: port after port from the best of `STARTS`.
+        near : bool
+            From `begin` itself instead.
         """
-        climbs = []
-        for begin in begins:
-            found, greatest = dict(begin), -np.inf
-            for _ in range(min(len(begin), 2)):
-                for port in begin:
-                    first = np.log((found[port].size, found[port].time))
-                    for share in shares:
-                        best, value = self._climbed(
-                            about, found, port, first + np.array([np.log(share), 0.0])
-                        )
-                        if value > greatest:
-                            found, greatest = best, value
-            climbs.append((greatest, found))
-        return self._settled(about, max(climbs, key=lambda item: item[0])[1])
 
-    @np.errstate(invalid="ignore")
-    def _settled(self, about: Processes, begin: Processes) -> tuple[dict[int, Process], float]:
-        """Return the processes at the top near some, and the logarithm there [nat], by Newton's method.
-
-        Where a climb ends a rounding decides; the top does not depend on it.
-        """
-        first = np.log([(one.size, one.time) for one in begin.values()])
-        unit, logs, far = NEAR * np.eye(first.size), np.zeros(first.size), np.inf
-
-        def at(move: FloatArray) -> dict[int, Process]:
-            items = zip(begin.items(), np.exp(first + move.reshape(first.shape)).tolist(), strict=True)
+        def at(logs: FloatArray) -> dict[int, Process]:
+            items = zip(begin.items(), np.exp(logs).tolist(), strict=True)
             return {port: replace(one, size=size, time=time) for (port, one), (size, time) in items}
 
+        def value(logs: FloatArray) -> float:
+            return self.evidence(about, at(logs))
+
+        median, logs = (np.log([(of[port].size, of[port].time) for port in begin]) for of in (about, begin))
+        low, high = median - FARTHEST * DOUBTS, median + FARTHEST * DOUBTS
+        low[:, 1], high[:, 1] = np.clip((low[:, 1], high[:, 1]), *np.log(self.times))
+        logs = np.clip(logs, low, high)
+        for port in () if near else np.eye(len(logs)):
+            logs = max((np.clip(logs + np.outer(port, start), low, high) for start in STARTS), key=value)
+        top, far, units = value(logs), np.inf, NEAR * np.eye(logs.size).reshape(-1, *logs.shape)
         for _ in range(MOST_STEPS):
-            ahead, back = (
-                np.array([self.evidence(about, at(logs + step)) for step in steps]) for steps in (unit, -unit)
-            )
+            ahead, back = (np.array([value(logs + step) for step in steps]) for steps in (units, -units))
             if far > NEAR:
-                top = self.evidence(about, at(logs))
                 bend = np.diag(ahead + back - 2.0 * top)
-                for i, k in zip(*np.triu_indices(first.size, 1), strict=True):
-                    both = self.evidence(about, at(logs + unit[i] + unit[k]))
+                for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
+                    both = value(logs + units[i] + units[k])
                     bend[i, k] = bend[k, i] = both - ahead[i] - ahead[k] + top
             if not np.isfinite((*bend.flat, *ahead, *back)).all():
                 break
-            values, axes = np.linalg.eigh(bend)  # uphill where it is hollow, too
-            step = axes @ (axes.T @ (0.5 * NEAR * (ahead - back)) / np.maximum(np.abs(values), 1e-300))
-            far = np.abs(step).max()
-            logs = logs + step / max(1.0, far / LONGEST)
-            if far < AT_TOP:
+            up = 0.5 * NEAR * (ahead - back)
+            free = np.flatnonzero(np.where(up > 0.0, np.ravel(logs < high), np.ravel(logs > low)))
+            values, axes = np.linalg.eigh(bend[np.ix_(free, free)])  # uphill where it is hollow, too
+            step = np.zeros(logs.size)
+            step[free] = axes @ (axes.T @ up[free] / np.maximum(np.abs(values), 1e-300))
+            step = step.reshape(logs.shape) / max(1.0, np.abs(step).max() / LONGEST)
+            there, after = logs, -np.inf
+            while after < top and np.abs(step).max() > AT_TOP:
+                there = np.clip(logs + step, low, high)
+                after, step = value(there), 0.5 * step
+            if after < top:
                 break
-        ends = ((item, self.evidence(about, item)) for item in (dict(begin), at(logs)))
-        return max(ends, key=lambda item: item[1])
+            logs, top, far = there, after, np.abs(there - logs).max()
+        return at(logs), top
 
     @cached_property
     def times(self) -> tuple[float, float]:
@@ -285,40 +239,15 @@ class View:
     def evidence(self, about: Processes, processes: Processes) -> float:
         """Return the evidence of processes times their prior, as a logarithm [nat]."""
         away = [
-            (
-                np.log(one.size / about[port].size) / SIZE_DOUBT,
-                np.log(one.time / about[port].time) / TIME_DOUBT,
-            )
+            np.log((one.size / about[port].size, one.time / about[port].time)) / DOUBTS
             for port, one in processes.items()
         ]
-        shortest, longest = self.times
-        outside = any(not shortest <= one.time <= longest for one in processes.values())
-        if outside or np.abs(away).max() > FARTHEST:
-            return -np.inf
         filters = self.filtered(processes)
         if not all(one.is_sound for one in filters):
             return -np.inf
         products = regression(filters, self.residuals, self.columns)
         value = products.solve(range(len(self.precisions)), self.precisions).evidence
         return float(value - 0.5 * np.sum(np.square(away)))
-
-    def _climbed(
-        self, about: Processes, processes: Processes, port: int, first: FloatArray
-    ) -> tuple[dict[int, Process], float]:
-        """Return processes with that of a port at its most probable, from logarithms of size and time."""
-
-        def at(logs: FloatArray) -> dict[int, Process]:
-            size, time = np.exp(logs)
-            return {**processes, port: replace(processes[port], size=float(size), time=float(time))}
-
-        low, high = np.log(self.times)
-        first = np.array([first[0], np.clip(first[1], low, high - 0.7)])
-        simplex = first + np.array([[0.0, 0.0], [0.9, 0.0], [0.0, 0.7]])
-        options = {"xatol": 0.2, "fatol": 1.0, "maxfev": MOST_PASSES, "initial_simplex": simplex}
-        found = minimize(
-            lambda logs: -self.evidence(about, at(logs)), first, method="Nelder-Mead", options=options
-        )
-        return at(found.x), -float(found.fun)
 
     def smoothed(
         self, processes: Processes, given: Solution | None = None
@@ -336,11 +265,10 @@ class View:
             values = np.linalg.solve(own @ own.T + prior, own @ shown)
             left = left - np.tensordot(values, trial.local, 1)
             free, forces = one.smoothed(left)
-            added = free.copy()
-            for k, turned in self.turned[number].items():
-                added = added + (solution.mean[k] - turned.about) * turned.state
             remaining = dict(zip(processes, forces, strict=True))
-            what = Part(left, added, remaining)
+            what = Part(left, free, remaining)
+            for k, turned in self.turned[number].items():
+                what = what.plus(turned, float(solution.mean[k] - trial.about[k]))
             for mean, item in zip(solution.mean[count:], self.effects, strict=True):
                 what = what.plus(item[number], float(mean))
             what = what if self.known is None else what.plus(self.known[number], 1.0)

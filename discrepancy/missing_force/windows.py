@@ -119,7 +119,7 @@ def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
         ]
         about = max(processes, key=lambda item: on_reading.solve(item).evidence)
         if on_reading.solve(about).evidence > best[1].log_evidence:
-            best = 0, seen(on_reading, about, [about])
+            best = 0, seen(on_reading, about, about)
     return best
 
 
@@ -132,7 +132,7 @@ def _reading(trial: SeenTrial, channel: int) -> SeenTrial:
     system = replace(
         trial.system, ports=("reading",), actions=none, positions=none, speeds=none, through=shown
     )
-    return replace(trial, system=system, positions=still, speeds=still, by_unknowns=())
+    return replace(trial, system=system, positions=still, speeds=still, by_unknowns={})
 
 
 def of_series(
@@ -152,7 +152,7 @@ def of_series(
     )  # fmt: skip
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
     about = {0: Process(size, 0.1 * float(np.ptp(time)), rough=True)}
-    found = seen(View([trial], np.zeros(0)), about, [about])
+    found = seen(View([trial], np.zeros(0)), about, about)
     return found, pattern[0]
 
 

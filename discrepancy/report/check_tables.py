@@ -12,26 +12,17 @@ from reporting.words import listing
 
 from .text import WORDS, number, unit_text
 
-HEADINGS = tuple(column.name for column in WORDS.table("decide", ())[0])
 
-
-def rows_of(found: Separability) -> list[tuple[str, ...]]:
-    """Return one row for each effect that can be tested, under `HEADINGS`."""
-    return [_row(found, item) for item in found.detectability if not item.reason]
-
-
-def _row(found: Separability, item: Detectability) -> tuple[str, ...]:
-    name = item.effect.identifier
+def seen_of(item: Detectability) -> tuple[str, str, str]:
+    """Return whether an effect can be seen, from which size on, and its prior median."""
     seen = item.distance >= DETECTED
-    visible, others = "yes" if seen else "larger than usual only", ", ".join(neighbours(found, name))
+    visible = "yes" if seen else "larger than usual only"
     if not item.parameter:
-        size = "at once" if seen else "not at its prior median"
-        return (name, visible, item.place, "", size, "", others)
-    unit = f" {unit_text(item.unit)}".rstrip()
-    size, typical = (f"{number(value, 2)}{unit}" for value in (item.detectable, item.typical))
-    if not isfinite(item.detectable):
-        visible, size = "not visible", "never"
-    return (name, visible, item.place, item.parameter.replace("_", " "), size, typical, others)
+        return visible, "at once" if seen else "not at its prior median", ""
+    size, typical = (
+        f"{number(value, 2)} {unit_text(item.unit)}".rstrip() for value in (item.detectable, item.typical)
+    )
+    return (visible, size, typical) if isfinite(item.detectable) else ("not visible", "never", typical)
 
 
 def neighbours(found: Separability, name: str) -> list[str]:
@@ -41,23 +32,6 @@ def neighbours(found: Separability, name: str) -> list[str]:
     at = found.identifiers.index(name)
     near = np.minimum(found.distance[at], found.distance[:, at]) < CONFUSED
     return [other for place, other in enumerate(found.identifiers) if near[place] and place != at]
-
-
-def confused_lines(found: Separability) -> list[str]:
-    """Return one sentence for each effect that these data cannot tell from others."""
-    pairs = [
-        (item.effect.identifier, neighbours(found, item.effect.identifier)) for item in found.detectability
-    ]
-    return [f"Confused: {name} with {listing(others)}." for name, others in pairs if others]
-
-
-def untested_lines(found: Separability) -> list[str]:
-    """Return one sentence for each reason why effects cannot be tested."""
-    by_reason: dict[str, list[str]] = {}
-    for item in found.detectability:
-        if item.reason:
-            by_reason.setdefault(item.reason, []).append(item.effect.identifier)
-    return [f"Not testable: {listing(names)}. {reason}" for reason, names in by_reason.items()]
 
 
 def group_lines(found: Separability, told: str = "the table says to which") -> list[str]:

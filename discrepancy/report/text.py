@@ -109,12 +109,15 @@ def force_sentence(force: ForceAtPort) -> str:
     own = force.evidence[force.port]
     others = {name: value for name, value in force.evidence.items() if name != force.port}
     nearest = max(others, key=lambda name: others[name], default="")
-    tested = [share for share in (force.fitted, force.held_out) if share is not None and share.tested]
-    kinds = ["fitted" if share is force.fitted else "held-out" for share in tested]
-    shares = [WORDS.say("share", share=one, kind=kind) for one, kind in zip(tested, kinds, strict=True)]
     evidence = {"own": own, "nearest": nearest, "ahead": own - others.get(nearest, own)}
     port = {"what": what, "place": place, "rate": rate}
-    return WORDS.say("force", force=force, tested=tested, shares=shares, **evidence, **port)
+    return WORDS.say("force", force=force, tested=tested_shares(force), **evidence, **port)
+
+
+def tested_shares(force: ForceAtPort | None) -> list[tuple[str, ShareOfForce]]:
+    """Return which trials, and what share of a missing force its law is in them; only where it has one."""
+    shares = {} if force is None else {"fitted": force.fitted, "held-out": force.held_out}
+    return [(kind, share) for kind, share in shares.items() if share is not None and share.tested]
 
 
 def share_text(share: ShareOfForce) -> str:
@@ -208,7 +211,15 @@ def nats(evidence: float) -> str:
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
 
 
-_NUMBERS: tuple[Any, ...] = (number, percent, nats, share_text, formula, p_value_text)
+def parameter_text(item: Estimate) -> str:
+    """Return what a parameter is."""
+    return formula(item.description or item.name.replace("_", " "))
+
+
+_NUMBERS: tuple[Any, ...] = (
+    number, percent, nats, share_text, formula, p_value_text, estimate_text, unit_text, parameter_text,
+    probability_text, isfinite,
+)  # fmt: skip
 WORDS = Words("discrepancy.report", "words.toml", **{function.__name__: function for function in _NUMBERS})
 """Words of the report, of figures and of the summary on the terminal."""
 

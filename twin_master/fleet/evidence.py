@@ -5,6 +5,7 @@ in any order, shard by shard. What the twins decided takes no part, for they dec
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from reporting.arrays import Float, Index, Unsigned
 from twin_master.errors import FleetError
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
-from twin_master.network.twin import build_graphical_model, state_tables
+from twin_master.network.twin import build_graphical_model, factor_tables
 from twin_master.scenario.schema import Scenario
 
 
@@ -60,7 +61,7 @@ def _on_points(
 class Worsening:
     """The K probabilities to worsen of a scenario, and what its transitions make of them.
 
-    An entry of the joint table is a product over the F factors of the state, each linear in one probability.
+    An entry of the joint table is a product over the factors of the state, each linear in its probability.
 
     Attributes
     ----------
@@ -70,10 +71,8 @@ class Worsening:
         What the scenario assumes.
     start, source
         Of the predecessor lists of all states.
-    place : (F, non-zeros)
-        Place of the probability among the K.
-    never, always : (F, non-zeros)
-        What each factor has of an entry where that probability is 0, and where it is 1.
+    factors : for each factor of the state
+        For each entry (non-zeros,) the number of its probability p, and what it is where p is 0, and 1.
     prior : (S,)
         p(D_0).
     """
@@ -82,9 +81,7 @@ class Worsening:
     assumed: Float
     start: Unsigned
     source: Unsigned
-    place: Index
-    never: Float
-    always: Float
+    factors: tuple[tuple[Index, Float, Float], ...]
     prior: Float
 
     @classmethod
@@ -101,38 +98,38 @@ class Worsening:
         given, keys, assumed = scenario.transition.probability, [], []
         for control in scenario.control_names:
             entry = given[control]
-            own = entry if isinstance(entry, dict) else {None: entry}
-            keys += [(control, name) for name in own]
-            assumed += list(own.values())
+            named = entry if isinstance(entry, dict) else {None: entry}
+            keys += [(control, name) for name in named]
+            assumed += list(named.values())
 
-        def worsening(probability: float) -> Scenario:
-            moves = {"probability": dict.fromkeys(scenario.control_names, probability)}
-            return scenario.model_copy(update={"transition": scenario.transition.model_copy(update=moves)})
+        def at(probability: float) -> Scenario:
+            same = {"probability": dict.fromkeys(scenario.control_names, probability)}
+            transition = scenario.transition.model_copy(update=same)
+            return scenario.model_copy(update={"transition": transition})
 
-        model = build_graphical_model(worsening(0.5))
+        model = build_graphical_model(at(0.5))
         _, _, start, source, *_ = predecessor_lists([model.transition.matrix])
         shape, size = model.states.shape, model.states.size
         row = np.repeat(np.arange(len(start) - 1), (start[1:] - start[:-1]).astype(np.int64))
         in_force, to = np.divmod(row, size)
         before, after = np.unravel_index(source.astype(np.int64), shape), np.unravel_index(to, shape)
-        place, never, always = [], [], []
-        for factor, name in enumerate(scenario.state_names):
-            owned = [(chosen, name if (chosen, name) in keys else None) for chosen in scenario.control_names]
-            place.append(np.array([keys.index(key) for key in owned])[in_force])
-            for found, probability in ((never, 0.0), (always, 1.0)):
-                tables = state_tables(worsening(probability))
-                own = np.array([tables[chosen][name] for chosen in scenario.control_names])
-                found.append(own[in_force, before[factor], after[factor]])
+
+        never, always = factor_tables(at(0.0)), factor_tables(at(1.0))
+        factors = []
+        for name, *ends in zip(scenario.state_names, before, after, strict=True):
+            own = [(control, name) if (control, name) in keys else (control, None) for control in never]
+            limits = [
+                np.stack([tables[control][name] for control in never])[in_force, *ends]
+                for tables in (never, always)
+            ]
+            factors.append((np.array([keys.index(key) for key in own])[in_force], *limits))
         names = tuple(control if name is None else f"{control}, {name}" for control, name in keys)
-        parts = np.array(place), np.array(never), np.array(always)
-        return cls(names, np.array(assumed), start, source, *parts, model.prior)
+        return cls(names, np.array(assumed), start, source, tuple(factors), model.prior)
 
     def probability(self, points: Float) -> Float:
-        """Return the entries of the lists (P, non-zeros) for probabilities (P, K)."""
-        result = np.ones((len(points), len(self.source)))
-        for place, never, always in zip(self.place, self.never, self.always, strict=True):
-            result *= never + points[:, place] * (always - never)
-        return result
+        """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""
+        shares = (never + points[:, k] * (always - never) for k, never, always in self.factors)
+        return np.asarray(reduce(np.multiply, shares))
 
 
 def scaled_likelihood(model: GaussianSensorModel, observed: Float, control: Index) -> tuple[Float, Float]:

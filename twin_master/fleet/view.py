@@ -4,12 +4,9 @@ It is made of what the fleet writes anyway, and reads the same with ten assets a
 bands of all, and the fifty that are worst.
 """
 
-import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-
-from tornado.web import Application
 
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError
@@ -18,7 +15,7 @@ from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.report import fleet_page
 from twin_master.fleet.watching import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application, text_of
+from twin_master.viewer.server import serve_page, text_of
 
 WORST = 50
 """Assets in the table."""
@@ -53,9 +50,7 @@ def serve_fleet(
         "/version": (current, "text/plain"),
         "/view.js": (text_of("twin_master.fleet", "view.js"), "text/javascript"),
     }
-    application = Application()
-    application.add_handlers(OWN_NAMES, handlers_of(texts))
-    asyncio.run(serve_application(application, port, ready, wanted))
+    serve_page(texts, port, ready, wanted)
 
 
 def _stamp(folder: Path) -> list[tuple[str, int, int]]:

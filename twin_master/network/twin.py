@@ -38,11 +38,8 @@ DEFAULT_LAG = 50
 """Turns back that a twin smooths and may be revised."""
 
 
-def state_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
-    """Return for each control the transitions (L, L) of each factor of the state, by their names.
-
-    Parameters and errors are those of `build_graphical_model`.
-    """
+def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
+    """Return the transitions (levels, levels) of each factor under each control, with what actions repair."""
     tables: dict[str, dict[str, Float]] = {}
     for control in scenario.control_names:
         if scenario.transition.kind == "independent_tables":
@@ -86,8 +83,9 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
         The factor makes a probability larger than one.
     """
     levels = {factor.name: factor.levels for factor in scenario.state}
-    prior = {factor.name: factor.prior for factor in scenario.state}
-    return GraphicalModel.from_tables(levels, state_tables(scenario, leaving), prior)
+    return GraphicalModel.from_tables(
+        levels, factor_tables(scenario, leaving), {factor.name: factor.prior for factor in scenario.state}
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from pydantic import BaseModel
 
 from reporting.arrays import Float
 from reporting.errors import ReportingError
+from reporting.record_json import plain
 from twin_master.errors import TwinMasterError
 from twin_master.report.structure import design_of, planform_of
 from twin_master.report.view import NORMAL_95, printed_factors, printed_sensors
@@ -86,22 +87,18 @@ class Teller:
 
     def page(self) -> str:
         """Return the page; its script draws the figures from what it is told."""
-        flight, planform, sensors = self._flight, None, self._sensors
-        if (wing := planform_of(design_of(flight.folder), flight.scenario)) is not None:
-            regions = [region.tolist() for region in wing.regions]
-            planform = {"outline": wing.outline.tolist(), "regions": regions, "gauges": wing.gauges.tolist()}
+        flight, sensors, mission = self._flight, self._sensors, self._flight.scenario.mission
+        wing = planform_of(design_of(flight.folder), flight.scenario)
         shown = sensors.scale * flight.knowledge.sensor_model.mean  # without noise
-        lowest, highest = (
-            (-NORMAL_95, NORMAL_95) if self._standardised else (float(shown.min()), float(shown.max()))
-        )
-        mission = flight.scenario.mission
-        record = {
+        lowest, highest = (-NORMAL_95, NORMAL_95) if self._standardised else (shown.min(), shown.max())
+        record = plain({
             "title": mission.title or mission.name, "step_name": mission.step_name,
-            "horizon": mission.prediction_steps, "factors": [asdict(factor) for factor in self._factors],
+            "horizon": mission.prediction_steps, "factors": self._factors,
             "controls": flight.scenario.control_names, "rewards": REWARD_NAMES,
             "sensors": asdict(sensors) | {"unit": sensors.unit, "lowest": lowest, "highest": highest},
-            "planform": planform, "window": WINDOW, "latest": LATEST, "tallest_bar": TALLEST_BAR,
-        }  # fmt: skip
+            "planform": None if wing is None else wing._asdict(), "window": WINDOW, "latest": LATEST,
+            "tallest_bar": TALLEST_BAR,
+        })  # fmt: skip
         # Inside a script element only the beginning of a tag could end it.
         content = json.dumps(record, allow_nan=False).replace("<", "\\u003c")
         template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
@@ -164,7 +161,7 @@ class Teller:
         }
         if not (same and request.shown == turn):
             answer["ahead"] = self._printed(self._flight.predicted(seen[-1]), None)
-        return json.dumps(answer, allow_nan=False)
+        return json.dumps(plain(answer), allow_nan=False)  # what there is not is null
 
     def _picture(self, turn: int) -> dict[str, str] | None:
         """Return the missing force that was known at a turn: where it is drawn, and what the verdict says."""
@@ -182,11 +179,11 @@ class Teller:
                 [notice["sentence"].replace(" DIR", folder) for notice in turn["notices"]] for turn in seen
             ],
             "learnt": [turn.get("learnt", {}) for turn in seen],
-            "truth": _plain(self._scales * flight.truth(seen)),
+            "truth": self._scales * flight.truth(seen),
         }
 
     def _printed(self, belief: Belief, observed: Float | None) -> dict[str, Any]:
-        """Return lists, a row for each turn, in printed units; None stands for what there is not."""
+        """Return arrays, a row for each turn, in printed units; NaN stands for what there is not."""
         scales = self._scales
         levels = np.array([(factor.levels[0], factor.levels[-1]) for factor in self._factors]).T
         states, expected = self._flight.knowledge.model.states, belief.expected
@@ -198,7 +195,7 @@ class Teller:
             observed = None if observed is None else (observed - center) / spread
             center, spread = np.zeros_like(center), np.ones_like(spread)
         scale, sensor_reach = self._sensors.scale, NORMAL_95 * spread
-        record = {
+        return {
             "state": mean,
             "state_lower": np.clip(mean - reach, *levels),
             "state_upper": np.clip(mean + reach, *levels),
@@ -210,13 +207,5 @@ class Teller:
             "sensor_lower": scale * (center - sensor_reach),
             "sensor_upper": scale * (center + sensor_reach),
             "probability": belief.control_probability,
+            **({} if observed is None else {"observed": scale * observed}),
         }
-        if observed is not None:
-            record["observed"] = scale * observed
-        return {name: _plain(values) for name, values in record.items()}
-
-
-def _plain(values: Float) -> list[Any]:
-    plain = values.astype(object)
-    plain[~np.isfinite(values)] = None
-    return list(plain.tolist())

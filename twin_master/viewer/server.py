@@ -2,13 +2,12 @@
 
 import asyncio
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from tornado.httpserver import HTTPServer
-from tornado.ioloop import PeriodicCallback
 from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
@@ -20,9 +19,8 @@ from twin_master.viewer.flight import Flight
 from twin_master.viewer.messages import Request, Teller
 
 ADDRESS = "127.0.0.1"
-POLL_MILLISECONDS = 15.0
-"""How often the run folder is looked at; a look takes some microseconds."""
-_SECONDS_BETWEEN = 0.5
+POLL_SECONDS = 0.015
+"""Between two looks at the run folder; a look takes some microseconds."""
 LONGEST_REQUEST = 4096
 """Bytes."""
 
@@ -76,57 +74,49 @@ class _Answer(RequestHandler):
             raise HTTPError(404) from error
 
 
-def handlers_of(texts: Mapping[str, tuple[Callable[..., str], str]]) -> list[tuple[str, Any, dict[str, Any]]]:
-    """Return what answers requests of paths, and what is in brackets there, by texts of a kind."""
-    return [(path, _Answer, {"answer": text, "kind": kind}) for path, (text, kind) in texts.items()]
-
-
 def text_of(package: str, name: str) -> Callable[[], str]:
     """Return what reads a file of a package."""
     return lambda: resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
-async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
-    teller = Teller(flight)
-    page = teller.page()
+def serve_page(
+    texts: Mapping[str, tuple[Callable[..., str], str]], port: int, ready: Callable[[str], None],
+    wanted: Callable[[], bool], handlers: Sequence[Any] = (), look: Callable[[], None] = lambda: None,
+) -> None:  # fmt: skip
+    """Serve texts on the loopback as long as they are wanted, see `serve`.
 
-    def picture(number: str) -> str:
-        return flight.pictures[int(number)].drawing.read_text(encoding="utf-8")
-
-    texts: dict[str, tuple[Callable[..., str], str]] = {
-        "/": (lambda: page, "text/html"),
-        "/plots.js": (text_of("twin_master.viewer", "plots.js"), "text/javascript"),
-        "/view.js": (text_of("twin_master.viewer", "view.js"), "text/javascript"),
-        "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
-        r"/missing_force_(\d+)\.svg": (picture, "image/svg+xml"),
-    }
+    Parameters
+    ----------
+    texts : mapping
+        What gives the text of a path, told what is in brackets there; and its kind.
+    port, ready, wanted
+        See `serve`.
+    handlers : sequence
+        Further handlers of tornado.
+    look : callable
+        Called every few milliseconds.
+    """
+    answers = [(path, _Answer, {"answer": text, "kind": kind}) for path, (text, kind) in texts.items()]
     application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
-    application.add_handlers(OWN_NAMES, [*handlers_of(texts), ("/turns", _Turns, {"teller": teller})])
-    looking = PeriodicCallback(teller.look, POLL_MILLISECONDS)
-    looking.start()
-    try:
-        await serve_application(application, port, ready, wanted)
-    finally:
-        looking.stop()
+    application.add_handlers(OWN_NAMES, [*answers, *handlers])
 
+    async def serving() -> None:
+        server = HTTPServer(application, max_body_size=LONGEST_REQUEST)
+        try:
+            sockets = bind_sockets(port, ADDRESS)
+        except OSError as error:
+            reason = os.strerror(error.errno or 0)
+            raise ViewError(said("watch.port", port=port, address=ADDRESS, reason=reason)) from error
+        server.add_sockets(sockets)
+        ready(f"http://{ADDRESS}:{sockets[0].getsockname()[1]}/")
+        try:
+            while wanted():
+                look()
+                await asyncio.sleep(POLL_SECONDS)
+        finally:
+            server.stop()
 
-async def serve_application(
-    application: Application, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]
-) -> None:
-    """Serve an application on the loopback as long as it is wanted, see `serve`."""
-    server = HTTPServer(application, max_body_size=LONGEST_REQUEST)
-    try:
-        sockets = bind_sockets(port, ADDRESS)
-    except OSError as error:
-        reason = os.strerror(error.errno or 0)
-        raise ViewError(said("watch.port", port=port, address=ADDRESS, reason=reason)) from error
-    server.add_sockets(sockets)
-    ready(f"http://{ADDRESS}:{sockets[0].getsockname()[1]}/")
-    try:
-        while wanted():
-            await asyncio.sleep(_SECONDS_BETWEEN)
-    finally:
-        server.stop()
+    asyncio.run(serving())
 
 
 def serve(
@@ -152,4 +142,18 @@ def serve(
     ViewError
         The port is taken.
     """
-    asyncio.run(_serve(Flight(folder), port, ready, wanted))
+    flight = Flight(folder)
+    teller = Teller(flight)
+    page = teller.page()
+
+    def picture(number: str) -> str:
+        return flight.pictures[int(number)].drawing.read_text(encoding="utf-8")
+
+    texts: dict[str, tuple[Callable[..., str], str]] = {
+        "/": (lambda: page, "text/html"),
+        "/plots.js": (text_of("twin_master.viewer", "plots.js"), "text/javascript"),
+        "/view.js": (text_of("twin_master.viewer", "view.js"), "text/javascript"),
+        "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
+        r"/missing_force_(\d+)\.svg": (picture, "image/svg+xml"),
+    }
+    serve_page(texts, port, ready, wanted, [("/turns", _Turns, {"teller": teller})], teller.look)

@@ -2,19 +2,17 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
-from reporting.provenance import hash_file, hash_record
+from reporting.provenance import hash_record
 from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
@@ -31,24 +29,16 @@ from twin_master.mission.replay import BelievedModel, journalled_decision, repla
 from twin_master.mission.turns import Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
+from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
-from twin_master.watch.teaching import (
-    LEAST_GAIN,
-    TRIAL_TURNS,
-    Search,
-    Teaching,
-    both_patches,
-    trial_sentence,
-    verdict_of,
-)
-from twin_master.watch.trial import CANNOT, Outcome, judged, patched_model
+from twin_master.watch.teaching import Outcome, Teaching, both_patches, judged, patched_model
 
+WATCHED = "watched asset"
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
 FLUSH_SECONDS = 1.0
@@ -77,8 +67,6 @@ class Watch:
     ----------
     journal, intake, twin
         From `begun` on; another twin where it was taught.
-    taught : bool
-        Whether the twin is taught.
     filtered : (S,) or None
         What was believed after the last turn; None before the first one of this process.
     is_quiet : bool
@@ -90,7 +78,6 @@ class Watch:
     twin: Twin
     filtered: Float | None
     is_quiet: bool
-    taught = False
 
     def __init__(
         self, folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress,
@@ -133,9 +120,9 @@ class Watch:
             self.models.append(patched_model(self.scenario, file, first, self._progress))
 
     def run(
-        self, feed: Feed, decide: Callable[[Mapping[str, Any]], object], *, turns: int | None = None,
-        patched: Patched | None = None, search: Search | None = None,
-        untold: Mapping[str, Any] | None = None,
+        self, feed: Feed, decide: Callable[[Mapping[str, Any]], object],
+        between: Callable[[], None] = lambda: None, *, turns: int | None = None,
+        patched: Patched | None = None, untold: Mapping[str, Any] | None = None,
     ) -> Counts:  # fmt: skip
         """Watch until the feed ends, or SIGINT or SIGTERM ask for it between two turns.
 
@@ -145,12 +132,12 @@ class Watch:
             Of the observations.
         decide : callable
             Told each decision, once its turn is written down.
+        between : callable, optional
+            Called before the first turn and behind each; it may teach the twin.
         turns : int, optional
             Turns in all after which to end.
         patched : Patched, optional
             To believe from a turn on.
-        search : Search, optional
-            Looks for the cause of an alarm, so that the twin is taught.
         untold : dict, optional
             The last decision, to be told again first.
         """
@@ -161,23 +148,13 @@ class Watch:
 
         with self.begun(feed, patched):
             self.intake.turns, self.intake.look = turns, lambda: self.quiet(tell)
-            tutor = Tutor(self, search, wait=feed.replayable) if search else None
             with listening(self.intake.ask):
-                try:
-                    if untold is not None:
-                        tell(untold)
-                    while True:  # with one twin after the other: where it is taught, another one goes on
-                        if tutor is not None:
-                            tutor.act()
-                        for decision in self.decisions():
-                            tell(decision)
-                            if tutor is not None and tutor.due:
-                                break
-                        else:
-                            break
-                finally:
-                    if tutor is not None:
-                        tutor.end()
+                if untold is not None:
+                    tell(untold)
+                between()
+                for decision in self.decisions():
+                    tell(decision)
+                    between()
         return self.intake.counts
 
     @contextmanager
@@ -201,8 +178,13 @@ class Watch:
 
     def decisions(self) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until no more comes."""
-        for turn in operate(self.twin, self.intake):
-            yield self.decision_of(self._kept(turn))
+        twin: Twin | None = None
+        while twin is not self.twin:  # where it was taught meanwhile, another one goes on
+            twin = self.twin
+            for turn in operate(twin, self.intake):
+                yield self.decision_of(self._kept(turn))
+                if twin is not self.twin:
+                    break
 
     def decision_of(self, line: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the operator is told with a line of the journal; nothing where it tells no decision."""
@@ -210,7 +192,7 @@ class Watch:
 
     def _kept(self, turn: Turn) -> dict[str, Any]:
         """Write down a reading and what became of it; return the line."""
-        record, told = self.intake.line(turn, self.twin), self.teaching.untold if self.taught else []
+        record, told = self.intake.line(turn, self.twin), self.teaching.untold
         if self.is_quiet:
             sentence = f"Turn {record['turn']}: observations come again, after {self.silence:.0f} s."
             told = [*told, Notice("heard", sentence).as_record()]
@@ -293,20 +275,19 @@ class Watch:
         self.twin = again.twin
         self.models.append(replace(outcome.model, patch=self.folder / name))
         model: dict[str, Any] = {
-            "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
-            "before": outcome.before, "after": outcome.after, "alarms": [vars(alarm) for alarm in alarms],
-            "policy_change": outcome.policy_change, **({} if notice is None else {"notice": dict(notice)}),
+            "patch": name, "from_turn": first, "alarms": [vars(alarm) for alarm in alarms], **outcome.record,
+            **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
+        keep_knowledge(self.folder, outcome.model.knowledge)  # before viewers read the line
         self.write(model=model)
-        keep_knowledge(self.folder, outcome.model.knowledge)
         gaps = [
-            f"{name.replace('_', ' ')} {value:.4g} before, {outcome.after[name]:.4g} after"
-            for name, value in outcome.before.items()
+            f"{name.replace('_', ' ')} {value:.4g} before, {model['after'][name]:.4g} after"
+            for name, value in model["before"].items()
             if value is not None
         ]
         since = f"The patched model is believed from {self.scenario.mission.step_name} {first} on"
-        self._progress.note(f"{since}: {', '.join(gaps)}. {outcome.policy_change}".rstrip())
+        self._progress.note(f"{since}: {', '.join(gaps)}. {model['policy_change']}".rstrip())
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
@@ -315,11 +296,8 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         result, attributes = self.result(turns, last), {}
-        if self.teaching.adopted:
-            adopted = self.teaching.adopted[-1]
-            attributes = {
-                "model_patch": adopted["patch"], "model_patch_from_step": adopted["from_turn"]
-            }  # fmt: skip
+        for model in self.teaching.adopted[-1:]:
+            attributes = {"model_patch": model["patch"], "model_patch_from_step": model["from_turn"]}
         origin = FlownAndBelieved(WATCHED, self._source.origin.model)
         with self._progress.stage("Storing"):
             stored = store_flight(
@@ -367,79 +345,3 @@ class Watch:
                 title = f"rms residual {when} the patch of {step} {first}"
                 told[f"gap_{when}_patch_{first}"] = title, model[when]["rms_residual"]
         return tuple(Figure(key, title, value) for key, (title, value) in told.items())
-
-
-WATCHED = "watched asset"
-
-
-class Tutor:
-    """Asks, tries and adopts between two turns of a watch.
-
-    Parameters
-    ----------
-    watch : Watch
-        With its turns kept, see `Watch.begun`.
-    search : Search
-        Looks for causes.
-    wait : bool
-        Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
-        beside a process that searches and a thread that tries a patch.
-    """
-
-    def __init__(self, watch: Watch, search: Search, *, wait: bool) -> None:
-        watch.taught = True
-        self._watch, self._search = watch, search
-        self._teaching, self._wait = watch.teaching, wait
-        self.outcome: Future[Outcome] | None = None
-
-    @property
-    def _over(self) -> bool:
-        """Whether a trial has all of its turns."""
-        trial = self._teaching.trial
-        return trial is not None and self._teaching.turn >= trial["turn"] + TRIAL_TURNS
-
-    @property
-    def due(self) -> bool:
-        """Whether something may have to be done before the next turn."""
-        return self._teaching.question is not None or self._over
-
-    def act(self) -> None:
-        """Do what is due."""
-        watch, teaching, step = self._watch, self._teaching, self._watch.scenario.mission.step_name
-        if (question := teaching.question) is not None:
-            found = self._search.answer(question, self._wait, lambda: watch.intake.asked)
-            if found is not None:
-                verdict = verdict_of(watch.folder, question, found, teaching.turn, step)
-                watch.write(verdict=verdict)
-        if (trial := teaching.trial) is None or not self._over:
-            return
-        file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
-        if self.outcome is None:
-            ask = watch.trial(file, trial["from_turn"], compared)
-            self.outcome = Future()
-            working = Thread(target=_work, args=(ask, self.outcome), daemon=True)
-            (working.run if self._wait else working.start)()
-        if not self.outcome.done():
-            return
-        asked, self.outcome, outcome = self.outcome, None, None
-        try:
-            outcome = asked.result()
-            sentence = trial_sentence(trial, outcome, step)
-        except CANNOT as error:
-            sentence = f"The patch cannot be believed by this twin: {error}"
-        notice = Notice("trial", sentence).as_record()
-        if outcome is not None and outcome.gained >= LEAST_GAIN:
-            watch.adopt(outcome, notice)
-        else:
-            watch.write(verdict={**trial, "tried": False, "notice": notice})
-
-    def end(self) -> None:
-        """End what is under way."""
-        self._search.end()
-
-
-def _work(ask: Callable[[], Outcome], told: "Future[Outcome]") -> None:
-    try:
-        told.set_result(ask())
-    except BaseException as error:  # noqa: BLE001 - it is raised where it is asked for
-        told.set_exception(error)

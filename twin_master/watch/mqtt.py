@@ -84,7 +84,7 @@ class Session:
         self._last: Any = None
         self._flying: dict[int, Topic] = {}
         self.behind: dict[Topic, None] = {}
-        self._connected = self._begun = False
+        self._begun = False
         self._failure = self._told = ""
         self._retry, self._pause, self._beat = 0.0, _RETRY_SECONDS[0], 0.0
 
@@ -92,6 +92,10 @@ class Session:
     def room(self) -> bool:
         """Whether a decision can be sent at once."""
         return self._connected and len(self._flying) < _DECISIONS_WAITING
+
+    @property
+    def _connected(self) -> bool:
+        return self._client is not None and self._client.is_connected()
 
     def _connect(self) -> None:
         """Connect with nothing of the connection before: it is in the topices, and at the broker."""
@@ -125,7 +129,6 @@ class Session:
         if reason.is_failure:
             self._failure = said("watch.user", where=self._where, why=reason, variable=PASSWORD_VARIABLE)
             return
-        self._connected = True
         if self._clean:
             return
         if self._kept and not flags.session_present:
@@ -153,10 +156,9 @@ class Session:
         if (topic := self._flying.pop(mid, None)) is not None:
             topic.answered(mid, str(reason) if reason.is_failure else None)
 
-    def _lost(self) -> None:
+    def _lost(self, failure: str) -> None:
         """Let go of a connection, to try again later; the first time it ends the watch."""
-        failure, self._failure, self._client = self._failure, "", None
-        self._connected = False
+        failure, self._failure, self._client = self._failure or failure, "", None
         if not self._begun:
             raise MissionInputError(f"{failure}.")
         if failure != self._told:
@@ -180,20 +182,18 @@ class Session:
             try:
                 self._connect()
             except OSError as error:
-                self._failure = f"no broker answers at {self._broker.host}:{self._broker.port} ({error})"
-                self._lost()
+                self._lost(f"no broker answers at {self._broker.host}:{self._broker.port} ({error})")
                 return
         count, failed = len(self.came), self._client.loop(wait)
         while not failed and len(self.came) > count:  # all that is here already
             count, failed = len(self.came), self._client.loop(0.0)
         if failed or self._failure or self._client.socket() is None:
-            self._failure = self._failure or f"the {self._where} is away ({failed.name})"
-            self._lost()
+            self._lost(f"the {self._where} is away ({failed.name})")
             return
         if self._clean and self._connected:
             # The old session has ended. One that begins so is forgotten by brokers that start again.
             self._client.disconnect()
-            self._client, self._clean, self._connected, self._failure = None, False, False, ""
+            self._client, self._clean, self._failure = None, False, ""
             return
         for topic in [*self.behind]:
             topic.publish()

@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,8 @@ from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of
 from twin_master.watch.folder import STORED_TURNS, Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
-from twin_master.watch.teaching import Search, check_teachable
+from twin_master.watch.teaching import check_teachable
+from twin_master.watch.tutor import Tutor
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -259,36 +260,30 @@ def watch(
     feed = feed_of(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
     if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
         raise MissionInputError(said("watch.replace", path=feed.path))
-    with _opened(loaded, folder, given, progress, resume=resume, replace=replace) as watched:
+    if resume and (replace or given != Overrides()):
+        raise MissionInputError(said("watch.resume"))
+    if resume or loaded is None:
+        opened = resumed_watch(folder, loaded, progress)
+    else:
+        resolved = resolve_scenario(loaded, given)
+        opened = begun_watch(resolved, loaded.file, folder, progress, replace_run=replace)
+        if loaded.remark:
+            progress.note(loaded.remark)
+    with opened as watched:
         try:
             begun(watched)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, known)
             # A kill may have left the last decision untold.
             untold = None if stored(watched.folder) else watched.last_decision()
-            search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
-            with closing(feed):
-                counts = watched.run(feed, decide, turns=turns, patched=patch, search=search, untold=untold)
+            with closing(feed), closing(Tutor(watched, wait=feed.replayable)) as tutor:
+                between = tutor.act if teach else lambda: None
+                counts = watched.run(feed, decide, between, turns=turns, patched=patch, untold=untold)
             watched.store(counts, last=last, report=report)
         except Exception as error:
             error.add_note(said("watch.kept", folder=watched.folder))
             raise
     return watched.folder
-
-
-def _opened(
-    loaded: LoadedScenario | None, folder: Path, given: Overrides, progress: Progress, *, resume: bool,
-    replace: bool,
-) -> AbstractContextManager[Watch]:  # fmt: skip
-    """Return the watch, begun or taken up, and what holds its folder."""
-    if resume and (replace or given != Overrides()):
-        raise MissionInputError(said("watch.resume"))
-    if resume or loaded is None:
-        return resumed_watch(folder, loaded, progress)
-    resolved = resolve_scenario(loaded, given)
-    if loaded.remark:
-        progress.note(loaded.remark)
-    return begun_watch(resolved, loaded.file, folder, progress, replace_run=replace)
 
 
 def _read(
@@ -301,7 +296,7 @@ def _read(
     else:
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.moved(loaded.path.parent)
-    section = scenario.watch.model_copy(
-        update={"allow_unknown": scenario.watch.allow_unknown or allow_unknown}
-    )
-    return folder, scenario.model_copy(update={"watch": section})
+    if allow_unknown:
+        section = scenario.watch.model_copy(update={"allow_unknown": True})
+        scenario = scenario.model_copy(update={"watch": section})
+    return folder, scenario

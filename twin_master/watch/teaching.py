@@ -1,48 +1,165 @@
-"""Teaching: from an alarm to a verdict on what the model lacks, to a trial of its patch, to its adoption.
+"""Teaching: what a journal says that is to be asked and tried, and a patch beside what a watch believes.
 
-What is asked when is a pure function of the journal (`Teaching`), so that a watch that was killed and taken
-up again asks, tries and adopts the same. The search for the cause is a process of its own, of low priority
-beside a live watch: the very command that the alarm names. Its verdict is a line of the journal behind the
-turn in which it came.
+What is asked when is a pure function of the journal, so that a watch that was killed and taken up again asks,
+tries and adopts the same. What comes of a patch follows from a journal up to one of its lines, so that it may
+be worked out beside the watch, which goes on.
 """
 
 import json
 import math
-import os
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any
 
-from reporting.errors import DamagedFileError
-from reporting.json_file import read_json
+import numpy as np
+
+from fe.runtime.errors import FiniteElementError
+from fmu_asset.errors import FmuError
+from reporting.progress import Progress
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.mission.journal import damaged, records_backwards
-from twin_master.network.estimator import Notice
-from twin_master.run_folder import PATCH, TEACHING, VERDICT
+from twin_master.mission.preparation import Knowledge, prepared_alone
+from twin_master.mission.replay import BelievedModel, gap_of, replay
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
 from twin_master.sentences import said
-from twin_master.watch.trial import Outcome
+
+CANNOT = (TwinMasterError, FmuError, FiniteElementError)
+"""Why a twin cannot believe a patch."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What comes of a patch.
+
+    Attributes
+    ----------
+    patch : bytes
+        Content of the patch file, with what was believed already.
+    model : BelievedModel
+        The patched one.
+    gained : float
+        Log evidence of the turns that were compared, with the patch less without [nats].
+    record : dict
+        For the journal: `before` and `after`, the gap of the turns from that of the patch on (`gap_of`), and
+        `policy_change`, how the policy changes, in a sentence; empty where it stays.
+    """
+
+    patch: bytes
+    model: BelievedModel
+    gained: float
+    record: Mapping[str, Any]
+
+
+def patched_model(
+    scenario: Scenario, file: Path, from_turn: int, progress: Progress | None = None
+) -> BelievedModel:
+    """Return the model of a scenario with a patch.
+
+    Raises
+    ------
+    TwinMasterError, FmuError, FiniteElementError
+        The twin cannot believe it.
+    """
+    belief = scenario.belief
+    if not isinstance(belief, DesignBelief):
+        raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
+    scenario = scenario.model_copy(update={"belief": belief.model_copy(update={"patch": str(file)})})
+    source: AssetSource = scenario.belief.source(scenario, None)
+    return BelievedModel(from_turn, prepared_alone(scenario, source, progress), file)
+
+
+def judged(
+    journal: Path, end: int, scenario: Scenario, models: Sequence[BelievedModel], patch: bytes,
+    from_turn: int, compared: tuple[int, int] = (0, 0), progress: Progress | None = None,
+) -> Outcome:  # fmt: skip
+    """Return what comes of a patch.
+
+    Parameters
+    ----------
+    journal : Path
+    end : int
+        Bytes of it that are read.
+    scenario : Scenario
+    models : sequence of BelievedModel
+        What was believed so far.
+    patch : bytes
+        Content of the patch file that would be believed, with what is believed already.
+    from_turn : int
+        From which on.
+    compared : tuple of int
+        The first turn whose evidence is compared, behind that one, and how many.
+    progress : Progress, optional
+
+    Raises
+    ------
+    TwinMasterError, FmuError, FiniteElementError
+        The twin cannot believe it.
+    """
+    with TemporaryDirectory(prefix="uav_twin_") as folder:
+        file = Path(folder) / "patch.json"
+        file.write_bytes(patch)
+        model = patched_model(scenario, file, from_turn, progress)
+    begin, count = compared
+    before, after = (
+        replay(journal, models, scenario.watch.lag, first_turn=from_turn, end=end, question=question)[0]
+        for question in (None, model)
+    )
+    known, last = models[-1].knowledge, model.knowledge
+    evidence = [
+        sum(turn.concluded.log_evidence for turn in found.turns[begin - found.first_turn :][:count])
+        for found in (before, after)
+    ]
+    record = {
+        "before": gap_of(before, from_turn - before.first_turn, known.sensor_model),
+        "after": gap_of(after, from_turn - after.first_turn, last.sensor_model),
+        "policy_change": policy_change(known, last),
+    }
+    return Outcome(patch, model, float(evidence[1] - evidence[0]), record)
+
+
+def both_patches(before: Path | None, found: Path) -> bytes:
+    """Return the patch that the model has and the one that was found beside it, as one file."""
+    if before is None:
+        return found.read_bytes()
+    old, new = (json.loads(file.read_text(encoding="utf-8")) for file in (before, found))
+    effects, channels = old["effects"] + new["effects"], old.get("channels", {}) | new.get("channels", {})
+    text = json.dumps({"schema": new["schema"], "effects": effects, "channels": channels}, indent=1)
+    return (text + "\n").encode()
+
+
+def policy_change(before: Knowledge, after: Knowledge) -> str:
+    """Return in a sentence how the policy of a model differs from that of another; empty where it does not.
+
+    Parameters
+    ----------
+    before, after : Knowledge
+        Of the same scenario.
+    """
+    scenario, states = before.scenario, before.model.states
+    old, new = before.plan.control_index, after.plan.control_index
+    changed = np.flatnonzero(old != new)
+    if not len(changed):
+        return ""
+    where = []
+    for factor, value in zip(scenario.state, states.coordinates[changed[0]], strict=True):
+        scale, unit = printed_state(factor.unit)
+        where.append(f"{factor.name} {scale * value:.4g} {unit}".rstrip())
+    chosen, instead = (scenario.control_names[policy[changed[0]]] for policy in (new, old))
+    return (
+        f"With it another control is chosen in {len(changed)} of {len(old)} states, first {chosen} in the "
+        f"place of {instead} at {', '.join(where)}."
+    )
+
 
 SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
-TRIAL_TURNS = 10
-"""Turns behind a verdict, none of which it has seen, in which model and patched model are compared."""
-LEAST_GAIN = 3.0
-"""Evidence of these turns from which on a patch is adopted [nats]: as much as a name needs in the search."""
-GROUP = "group"
-TRIED = ("named", "named in part", GROUP)
-"""Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
-alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
 CHECKED = 250_000
 """Bytes at the end of a journal that are read at least, so that damage there is found."""
-COURTESY = 10
-"""Niceness of a search beside a live watch: the watch comes first."""
-_LOOK_AGAIN = 0.05
 
 
 def check_teachable(scenario: Scenario) -> None:
@@ -63,17 +180,6 @@ def check_teachable(scenario: Scenario) -> None:
         raise MissionInputError(said("watch.no_wing", what=what))
 
 
-class Question(NamedTuple):
-    """What is asked: which effect the turns `from_turn` to `to_turn` hold that the model lacks."""
-
-    from_turn: int
-    to_turn: int
-
-    def folder(self, watch: Path) -> Path:
-        """Return where the verdict is put."""
-        return watch / TEACHING / f"turns_{self.from_turn}_to_{self.to_turn}"
-
-
 @dataclass
 class Teaching:
     """Where the teaching of a watch stands, after the lines of its journal so far.
@@ -87,8 +193,8 @@ class Teaching:
     ----------
     turn : int
         The last turn.
-    question : Question or None
-        What is to be answered.
+    question : tuple or None
+        The first and the last turn that hold what the model lacks, if its cause is to be looked for.
     trial : dict or None
         The verdict whose patch is on trial.
     untold : list
@@ -99,7 +205,7 @@ class Teaching:
 
     threshold: float
     turn: int = -1
-    question: Question | None = None
+    question: tuple[int, int] | None = None
     trial: dict[str, Any] | None = None
     untold: list[dict[str, Any]] = field(default_factory=list)
     adopted: list[dict[str, Any]] = field(default_factory=list)
@@ -123,8 +229,7 @@ class Teaching:
             if length - begin > CHECKED:
                 break
         if "standing" in last:
-            before = last["standing"]["teaching"]
-            vars(self).update(before, question=before["question"] and Question(*before["question"]))
+            vars(self).update(last["standing"]["teaching"])
             self.take(last)
 
     def take(self, record: Mapping[str, Any]) -> None:
@@ -161,7 +266,7 @@ class Teaching:
             suspicion.get("log_evidence_none", -math.inf), suspicion.get("log_evidence_any_gauge", -math.inf)
         )
         if evidence >= math.log(self.threshold):
-            self.question = Question(max(self._alarm[1], self._since), self.turn)
+            self.question = max(self._alarm[1], self._since), self.turn
 
     def _verdict(self, verdict: dict[str, Any]) -> None:
         self.untold.append(verdict["notice"])
@@ -172,132 +277,3 @@ class Teaching:
         asked, self.question, self.trial = int(verdict["to_turn"]), None, None
         if self._alarm is not None:
             self._ask_at = asked + max(SETTLE_TURNS, asked - self._alarm[0])
-
-
-@dataclass
-class Search:
-    """The search for a cause, as a process.
-
-    Parameters
-    ----------
-    watch : Path
-        Folder of the watch.
-    seed : int
-        Of its draws.
-    command : sequence of str
-        What begins with a search; by default this package's `discrepancy run`.
-    """
-
-    watch: Path
-    seed: int
-    command: Sequence[str] = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
-    _process: "subprocess.Popen[bytes] | None" = field(default=None, init=False)
-
-    def words(self, question: Question) -> list[str]:
-        """Return the options of the command that answers a question."""
-        turns = ["--from-turn", str(question.from_turn), "--to-turn", str(question.to_turn)]
-        out = ["--out", str(question.folder(self.watch)), "--seed", str(self.seed)]
-        return ["--from-run", str(self.watch), *turns, *out]
-
-    def answer(
-        self, question: Question, wait: bool, asked_to_end: Callable[[], bool]
-    ) -> Path | TwinMasterError | None:
-        """Return the folder of the verdict, or the last that a search without one said; None before.
-
-        No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
-        """
-        folder = question.folder(self.watch)
-        log = folder.with_name(folder.name + ".log")
-        log.parent.mkdir(exist_ok=True)
-        while not (folder / VERDICT).is_file():
-            if self._process is None:
-                words = [*self.command, *self.words(question)]
-                with log.open("wb") as file:
-                    self._process = subprocess.Popen(
-                        words, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
-                    )
-                if not wait:
-                    with suppress(ProcessLookupError):
-                        os.setpriority(os.PRIO_PROCESS, self._process.pid, COURTESY)
-            elif (code := self._process.poll()) is not None and not (folder / VERDICT).is_file():
-                self._process = None
-                lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
-                said = (line.strip() for line in reversed(lines) if line.strip())
-                return TwinMasterError(next(said, f"exit code {code}"))
-            if not wait or asked_to_end():
-                return None
-            time.sleep(_LOOK_AGAIN)
-        self.end()
-        return folder
-
-    def end(self) -> None:
-        """End the process, if there is one; a watch that is taken up again begins it anew."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            self._process.wait()
-        self._process = None
-
-
-def verdict_of(
-    watch: Path, question: Question, folder: Path | TwinMasterError, turn: int, step: str
-) -> dict[str, Any]:
-    """Return what the journal keeps of a verdict, and what the operator is told.
-
-    Parameters
-    ----------
-    watch : Path
-        Folder of the watch.
-    question : Question
-    folder : Path or TwinMasterError
-        Where the verdict is, or why there is none.
-    turn : int
-        The last turn before it came.
-    step : str
-        What a turn is called.
-    """
-    asked = {"from_turn": question.from_turn, "to_turn": question.to_turn, "turn": turn}
-    where = f"{step.capitalize()}s {question.from_turn} to {question.to_turn} were searched for the cause"
-    if isinstance(folder, TwinMasterError):
-        sentence = f"{where}, and the search ended without a verdict: {folder}"
-        return {**asked, "tried": False, "kind": "none", "notice": Notice("verdict", sentence).as_record()}
-    try:
-        verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
-        kind, said = str(verdict["kind"]), str(verdict["sentence"])
-    except (DamagedFileError, KeyError, TypeError) as error:
-        return verdict_of(watch, question, TwinMasterError(f"{folder.name}: {error}"), turn, step)
-    tried, patch = kind in TRIED and (folder / PATCH).is_file(), folder / PATCH
-    sentence = f"{where}: {kind}. {said}"
-    if tried:
-        which = "patch of the most probable of these" if kind == GROUP else "patch"
-        sentence += f" The {which} is tried beside the model for {TRIAL_TURNS} {step}s."
-    elif patch.is_file():
-        options = f"--model-patch DIR/{patch.relative_to(watch)} --from-turn {question.from_turn}"
-        sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
-    return {
-        **asked, "tried": tried, "kind": kind, "folder": folder.relative_to(watch).as_posix(),
-        "notice": Notice("verdict", sentence).as_record(),
-    }  # fmt: skip
-
-
-def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str:
-    """Return what the operator is told at the end of a trial."""
-    first = trial["from_turn"]
-    compared = (
-        f"Beside the model for {TRIAL_TURNS} {step}s the patch gained {outcome.gained:.3g} nats of evidence"
-    )
-    if outcome.gained < LEAST_GAIN:
-        return f"{compared}, {LEAST_GAIN:g} are needed, and is not adopted."
-    said = f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
-    if trial["kind"] == GROUP:
-        said += " It is one of a group: which of them is true these data cannot tell."
-    return f"{said} {outcome.policy_change}".rstrip()
-
-
-def both_patches(before: Path | None, found: Path) -> bytes:
-    """Return the patch that the model has and the one that was found beside it, as one file."""
-    if before is None:
-        return found.read_bytes()
-    old, new = (json.loads(file.read_text(encoding="utf-8")) for file in (before, found))
-    effects, channels = old["effects"] + new["effects"], old.get("channels", {}) | new.get("channels", {})
-    text = json.dumps({"schema": new["schema"], "effects": effects, "channels": channels}, indent=1)
-    return (text + "\n").encode()

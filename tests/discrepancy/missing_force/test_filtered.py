@@ -128,12 +128,12 @@ def test_steady_gains_are_those_of_every_step():
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
     filtered = Filtered(trial, [(0, PROCESS)])
-    slots = filtered._passed[1]
+    slots = filtered._passed[0].slot
     assert slots[-1] < 450  # most steps share one
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
     object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
     every = Filtered(jittered, [(0, PROCESS)])
-    assert every._passed[1][-1] == 899
+    assert every._passed[0].slot[-1] == 899
     np.testing.assert_allclose(
         filtered.whitened(trial.residual[None]), every.whitened(trial.residual[None]), atol=1e-7
     )
@@ -241,6 +241,19 @@ def test_a_force_that_turns_is_one_that_does_not_turned():
     for on, same in ((np.arange(40) < 20, True), (~never, False)):
         one, other = (search.total(acting, [on]) for search in both)
         assert (abs(one - other) < 1e-9) is same
+
+
+@pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
+def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(settled):
+    """Of a settled trial, too, whose state before is what the forces that act make of it."""
+    random = np.random.default_rng(3)
+    trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), settled=settled)
+    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT, [np.zeros(40, dtype=bool)])
+    for on, forces in ((False, [REST]), (True, [EVENT, REST])):
+        filters = [Filtered(trial, [(0, one) for one in forces])]
+        one = regression(filters, [trial.residual], [np.zeros((0, 40, 2))])
+        wanted = -0.5 * one.products[0, 0] - one.log_determinant
+        assert search.total(Acting(EVENT, REST), [np.full(40, on)]) == pytest.approx(wanted, abs=1e-7)
 
 
 @pytest.mark.parametrize(

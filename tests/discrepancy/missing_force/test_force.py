@@ -264,7 +264,7 @@ def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, numb
     assert slopes
     for k, slope in slopes.items():
         expected = (shown(k, 1e-3) - shown(k, -1e-3)) / 2e-3
-        _, found = here.turned(slope, added, forces)
+        found = here.turned(slope, added, forces).readings
         np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
 
 

@@ -12,18 +12,16 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.report.check_tables import (
-    confused_lines,
     group_lines,
     needs,
     neighbours,
-    rows_of,
-    untested_lines,
+    seen_of,
 )
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.findings import add_verdict, closing_sentence
-from discrepancy.report.page import add_not_compared, parameter_rows, render_report
+from discrepancy.report.page import parameter_rows, render_report
 from discrepancy.report.residual_figures import size_table
 from discrepancy.report.text import (
+    WORDS,
     headline,
     number,
     percent,
@@ -33,49 +31,34 @@ from discrepancy.report.text import (
     shares_sentence,
 )
 from discrepancy.verdict import ExplainedShare, NotFitted, RemainderEstimate, VerdictKind
-from reporting.page import Page
 from reporting.words import listing
 from tests.discrepancy.rigs import FEW, ORIGIN
-
-
-def page_of(investigation, **verdict):
-    """Return the whole page of an investigation without its figures, its verdict changed."""
-    changed = replace(investigation, verdict=replace(investigation.verdict, **verdict))
-    return read(render_report(ReportInput(changed, ORIGIN), {}, {}))
-
 
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
 
-def read(page):
-    """Return a page as a browser shows it."""
+def page_of(investigation, **verdict):
+    """Return the page of an investigation without its figures, its verdict changed, as a browser shows it."""
+    changed = replace(investigation, verdict=replace(investigation.verdict, **verdict))
+    page = render_report(ReportInput(changed, ORIGIN), {}, {})
     return html.unescape(page).replace("\N{NO-BREAK SPACE}", " ")
-
-
-def section_of(add, content):
-    """Return what is added to a page."""
-    page = Page("a", "b")
-    page.add_section("c")
-    add(page, content)
-    return read(page.render())
 
 
 def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     closed, held = drag.proof.gap_closed, drag.proof.held_out_after
-    said = closing_sentence(drag)
-    assert said.startswith(f"It closes {percent(closed)} % of the gap on held-out trials: χ²/dof is ")
-    assert f"and {number(held.chi_square_per_dof)} after it" in said
-    text = section_of(add_verdict, ReportInput(drag, ORIGIN))  # without intervals, by its parameters
+    said = f"It closes {percent(closed)} % of the gap on held-out trials: χ²/dof is "
+    text = page_of(drag)  # without intervals, by its parameters
     assert text.index(headline(drag.verdict)) < text.index("Its size: ") < text.index(said)
-    assert text.count(f"{percent(closed)} %") == 1
+    assert f"and {number(held.chi_square_per_dof)} after it" in text
+    assert text.count(f"{percent(closed)} % of the gap") == 1
     # no name, no gap to close, no proof
-    group = replace(drag, verdict=replace(drag.verdict, kind=VerdictKind.GROUP))
-    assert closing_sentence(group).startswith("The best hypothesis, which is no name, closes")
-    none = replace(drag, proof=replace(drag.proof, gap_closed=float("nan")))
-    assert closing_sentence(none).startswith("On held-out trials χ²/dof is ")
-    worse = replace(drag, proof=replace(drag.proof, gap_closed=-0.2, held_out_after=None))
-    assert closing_sentence(worse).startswith("On fitted trials χ²/dof is ")
-    assert closing_sentence(replace(drag, proof=None)) == ""
+    assert "The best hypothesis, which is no name, closes" in page_of(drag, kind=VerdictKind.GROUP)
+    for changed, words in (
+        (replace(drag.proof, gap_closed=float("nan")), "On held-out trials χ²/dof is "),
+        (replace(drag.proof, gap_closed=-0.2, held_out_after=None), "On fitted trials χ²/dof is "),
+    ):
+        assert words in page_of(replace(drag, proof=changed))
+    assert "χ²/dof is" not in page_of(replace(drag, proof=None))
 
 
 def test_a_report_opens_with_effect_size_share_and_probability(drag):
@@ -130,8 +113,9 @@ def test_gates_say_what_they_compare(drag):
     assert f"at most {shape.limit:g} nat</td>" in text
     unknown = replace(absolute, passed=None, statistic=float("nan"))
     gates = (unknown, shape, replace(consistency, passed=False, statistic=2e-5))
-    verdict = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates, force=None)
-    text = section_of(add_verdict, ReportInput(replace(drag, verdict=verdict, proof=None), ORIGIN))
+    text = page_of(
+        replace(drag, proof=None), kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates, force=None
+    )
     assert "p of the consistency; a fit has at least 0.001" in text
 
 
@@ -159,14 +143,9 @@ def test_what_explains_most_of_the_gap_is_told_first(drag):
 def test_what_was_not_compared_is_told_by_reason_and_each_confusion_by_name(drag, able):
     left = tuple(NotFitted(name, "No flight trial.") for name in ("washout", "inertia_relief"))
     left += (NotFitted("free_play", "screened out: 0.3 nat at most", 0.3),)
-    text = section_of(add_not_compared, replace(drag.verdict, not_fitted=left))
+    text = page_of(drag, not_fitted=left)
     assert "<td>No flight trial.</td><td>washout and inertia relief</td>" in text
     assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in text
-    assert untested_lines(able) == ["Not testable: washout. The campaign has no flight trial to fit."]
-    lines = confused_lines(able)
-    assert len(lines) == sum(bool(neighbours(able, name)) for name in able.identifiers)
-    for line in lines:
-        assert all(other in line for other in neighbours(able, line.split()[1]))
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -185,10 +164,19 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     assert told.endswith("with noise 2 times smaller or 4 times as many trials.")
 
 
-def test_rows_of_what_can_be_decided(drag, able):
-    rows = {row[0]: row for row in rows_of(able)}
+def test_what_can_be_decided(drag, able):
+    words = {"neighbours": neighbours, "seen_of": seen_of, "able": able}
+    _, cells = WORDS.table("decide", [item for item in able.detectability if not item.reason], **words)
+    rows = {row[0].replace(" ", "_"): row for row in cells}
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
+    told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
+    said = list(WORDS.told(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told))
+    assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
+    confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
+    assert len(confused) == sum(bool(neighbours(able, name)) for name in able.identifiers)
+    for line in confused:
+        assert all(other in line for other in neighbours(able, line.split()[1]))
     for row, name in enumerate(able.identifiers):
         near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSED
         near[row] = False

@@ -25,9 +25,13 @@ from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
 
-def tiny(probability: object, levels: int = 3) -> Scenario:
-    """Return `growing_damage` with few levels."""
-    table = load_scenario("growing_damage").scenario.to_dict()
+def tiny(
+    probability: object, levels: int = 3, name: str = "growing_damage", success: float = 1.0
+) -> Scenario:
+    """Return a shipped scenario with few levels, whose repairs may fail."""
+    table = load_scenario(name).scenario.to_dict()
+    for action in table["action"]:
+        action["success"] = success if action["repairs"] else 1.0
     for state in table["state"]:
         state["levels"] = np.linspace(0.0, 0.4, levels).tolist()
         state["prior"] = [1.0] + [0.0] * (levels - 1)
@@ -61,17 +65,16 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability):
             assert found[twin, row] == pytest.approx(expected.sum(), abs=1e-12)
 
 
-def test_evidence_of_twins_that_are_repaired_is_that_of_all_paths():
-    table = tiny({"2g": 0.07, "3g": 0.2}).to_dict()
-    repair = {"control": "2g", "cost": 1.0, "repairs": ["z1"], "success": 0.7}
-    table["action"] = [{"name": "mend", **repair}, {"name": "renew", **repair, "success": 1.0}]
-    scenario = parse_scenario(table, "repaired")
-    worsening, model = Worsening.of(scenario), build_graphical_model(scenario)
+@pytest.mark.parametrize("success", [1.0, 0.7])
+def test_evidence_of_a_twin_that_is_repaired_is_that_of_all_paths(success):
+    scenario = tiny({"2g": 0.07, "3g": 0.2}, name="inspected_wing", success=success)
+    model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
     generator = np.random.default_rng(6)
-    likelihood, control = generator.random((3, 4, 9)), np.array([[1, 2, 0, 1], [1, 1, 3, 0], [0, 3, 2, 2]])
+    likelihood = generator.random((3, 4, 9))
+    control = generator.permuted(np.tile(np.arange(5), (3, 1)), axis=1)[:, :4]
     found = transition_evidence(worsening, worsening.assumed[None], likelihood, control)[:, 0]
-    for twin in range(3):
-        *_, expected = enumerate_trajectories(model, control[twin], np.log(likelihood[twin]))
+    for twin, own in enumerate(control):
+        *_, expected = enumerate_trajectories(model, own, np.log(likelihood[twin]))
         assert found[twin] == pytest.approx(expected.sum(), abs=1e-12)
 
 

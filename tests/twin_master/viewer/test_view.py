@@ -128,24 +128,14 @@ def test_every_number_is_that_of_the_run(run):
     np.testing.assert_array_equal(flight.truth(flight.seen(0, TURNS)), stored["truth"]["state"].values)
 
 
-def test_turns_are_seen_as_soon_as_their_lines_are_whole(run, begun, lines):
+def test_turns_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_they_are_taken_back(
+    begun, lines
+):
     flight = Flight(begun)
     assert not flight.update()
-    add(begun, *lines[:3], lines[3][:40])
-    assert flight.update()
-    assert flight.turns == 2
-    assert not flight.update()
-    add(begun, lines[3][40:], *lines[4:])
-    assert flight.update()
-    assert flight.turns == TURNS
-    np.testing.assert_array_equal(
-        of_turns(flight, 0, TURNS).probability, of_turns(whole(run), 0, TURNS).probability
-    )
-
-
-def test_turns_that_were_taken_back_are_forgotten(begun, lines):
-    add(begun, *lines[:21])
-    flight = whole(begun)
+    for content, turns in (([*lines[:20], lines[20][:40]], 19), ([lines[20][40:]], 20)):
+        add(begun, *content)
+        assert [flight.update(), flight.turns, flight.update()] == [True, turns, False]
     number = flight.number
     (begun / JOURNAL_NAME).write_bytes(b"".join(lines[:11]))  # as a resumed run does
     flight.update()
@@ -198,6 +188,7 @@ def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown
     content = io.BytesIO()
     np.savez(content, **(arrays | {"predicted": 1.1 * arrays["predicted"]}))
     atomic_write_bytes(begun / KNOWLEDGE_NAME, content.getvalue())
+    add(begun, line_of({"turn": 49, "model": {}}))
     assert flight.update()
     assert flight.number > number
     np.testing.assert_allclose(of_turns(flight, 0, 5).expected.mean, 1.1 * before)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from reporting.progress import SilentProgress
-from tests.twin_master.watch.watches import begun, write_csv
+from tests.twin_master.watch.watches import begun, decided, watchful, write_csv
 from twin_master.mission.loop import fly
 from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
@@ -53,14 +53,33 @@ def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> 
         return watch
 
 
+@pytest.fixture
+def watch(base: Watch, tmp_path: Path) -> Watch:
+    """One like it in a folder of its own."""
+    return begun(base, tmp_path / "watch")
+
+
+@pytest.fixture
+def hasty(watch: Watch) -> Watch:
+    """A watch that notices a silence at once."""
+    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
+    watch.scenario = watch.scenario.model_copy(update={"watch": section})
+    return watch
+
+
+@pytest.fixture
+def noticing(base: Watch, tmp_path: Path) -> Watch:
+    """A watch that gives notice."""
+    return watchful(base, tmp_path / "watch")
+
+
 @pytest.fixture(scope="session")
 def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the watch of the whole mission."""
     folder = tmp_path_factory.mktemp("whole") / "watch"
     watch = begun(base, folder)
-    decisions: list[dict[str, object]] = []
-    counts = watch.run(CsvFeed(recorded, watch.scenario), lambda decision: decisions.append(dict(decision)))
-    watch.store(counts)
+    decisions = decided(watch, CsvFeed(recorded, watch.scenario))
+    watch.store(watch.intake.counts)
     assert [decision["turn"] for decision in decisions] == list(range(50))
     assert all(0.5 <= float(str(decision["probability"])) <= 1.0 for decision in decisions)
     (folder / "decisions.json").write_text(json.dumps(decisions))

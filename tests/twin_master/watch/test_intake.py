@@ -219,13 +219,7 @@ def test_times_stand_for_turns(timed, strains):
 
 def test_units_and_names(knowledge):
     reader = MessageReader(knowledge.scenario)
-    for name, value in (
-        ("strain_3", 8.12e-4),
-        ("strain_3_microstrain", 812.0),
-        ("strain_3 [microstrain]", 812.0),
-        ("strain_3 (percent)", 0.0812),
-        ("strain_3_1", 8.12e-4),
-    ):
+    for name, value in INPUTS.refused("names"):
         found = reader.message({name: value}).observed
         assert found[2] == pytest.approx(8.12e-4, rel=1e-15)
         assert np.isnan(found).sum() == 23
@@ -276,13 +270,9 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n')
     refused = feeds.CsvFeed(path, knowledge.scenario).messages(None)
     assert all(isinstance(fed[0], Refused) for fed in refused)
-    for header, sentence in (
-        ("strain_1,strain_1_1\n", "two columns say the same"),
-        ("turn,step,strain_1\n", "two columns say the same"),
-        ("step,strian_1\n1,2\n", r"gauges.csv: the column `strian_1` is no sensor.*`turn`, `time`"),
-    ):
+    for header, sentence in INPUTS.refused("headers"):
         with pytest.raises(Exception, match=sentence):
-            feed(header)
+            feed(header + "\n")
     allowing = knowledge.scenario.model_copy(update={"watch": WatchSection(allow_unknown=True)})
     ((passed, _),) = feed("step,strian_1,strain_2\n1,2,1e-4\n", allowing).messages(None)
     assert isinstance(passed, Message)

@@ -9,10 +9,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -23,10 +24,11 @@ from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
 from tests.twin_master.watch.watches import (
     begun,
+    beliefs_of,
+    decided,
     killed_at,
     of_gauge,
     ran,
-    soon_quiet,
     viewed,
     wait_until,
     watchful,
@@ -36,13 +38,11 @@ from twin_master.errors import MissionInputError, NotResumableError, RunFolderEr
 from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
 from twin_master.mission.replay import BelievedModel, journalled_decision
 from twin_master.mission.turns import History
-from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines, mappings
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
-from twin_master.watch.message import Message
 from twin_master.watch.opening import flown, resumed_watch
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -102,21 +102,17 @@ def test_a_program_hands_over_messages_and_is_told_decisions(scenario, mission, 
         {"turn": turn, "control": ("2g", "3g")[control], "strain": row}
         for turn, (control, row) in enumerate(zip(mission.control_index[:6], mission.observed, strict=False))
     )
-    decisions: list[dict[str, object]] = []
-    given: dict[str, Any] = {"report": False, "decide": lambda decision: decisions.append(dict(decision))}
-    folder = uav_twin.watch(scenario, messages, tmp_path / "watch", **given)
+    decisions = list[Mapping[str, Any]]()
+    folder = uav_twin.watch(scenario, messages, tmp_path / "watch", report=False, decide=decisions.append)
     assert decisions == told[:6]
     np.testing.assert_array_equal(uav_twin.open_run(folder)["filtered"]["probability"], mission.filtered[:6])
     with pytest.raises(MissionInputError, match="names no recording: give the observations"):
         uav_twin.watch(scenario, folder=tmp_path / "none")
-    with pytest.raises(MissionInputError, match="--teach begins with an alarm"):
-        uav_twin.watch(scenario, [], tmp_path / "none", teach=True)
     assert not (tmp_path / "none").exists()
 
 
-def test_a_kill_at_any_moment_loses_no_turn(base, recorded, whole, tmp_path, monkeypatch):
+def test_a_kill_at_any_moment_loses_no_turn(watch, recorded, whole, monkeypatch):
     monkeypatch.setattr("twin_master.watch.folder.FLUSH_SECONDS", 0.0)  # so that each line may be the last
-    watch = begun(base, tmp_path / "watch")
     feed = CsvFeed(recorded, watch.scenario)
     chance, kills, file = random.Random(3), 0, watch.folder / JOURNAL_NAME
     expected, size = (whole / JOURNAL_NAME).read_bytes(), 0
@@ -136,11 +132,7 @@ def test_a_kill_at_any_moment_loses_no_turn(base, recorded, whole, tmp_path, mon
 @pytest.mark.parametrize(
     ("case", "stops", "counted"),
     [
-        (
-            "gap",
-            (0, 15, 20, None),
-            (10, 1, 0),
-        ),  # what comes behind it is not lost where the watch ends within
+        ("gap", (0, 15, 20, None), (10, 1, 0)),  # nothing behind it is lost where the watch ends within
         ("learning", (5, 19, 31, None), (0, 0, 0)),
         ("wrong controls", (12, 35, None), (0, 0, 0)),
     ],
@@ -180,14 +172,12 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
         assert last["filtered"] == found.filtered.tolist()
 
 
-def test_another_file_is_read_from_its_beginning(base, mission, plain, tmp_path):
+def test_another_file_is_read_from_its_beginning(watch, mission, plain, tmp_path):
     """A logger that begins a file each day; and the first of them once more, which says nothing new."""
     header, *rows = plain.read_text().splitlines()
-    for day, of_day in enumerate(
-        (rows[:30], rows[30:45], rows[30:])
-    ):  # the last is that before, which has grown
+    days = rows[:30], rows[30:45], rows[30:]  # the last is that before, which has grown
+    for day, of_day in enumerate(days):
         (tmp_path / f"{day}.csv").write_text("\n".join([header, "-", *of_day]) + "\n")
-    watch = begun(base, tmp_path / "watch")
     for day in (0, 1, 2):
         counts = ran(watch, CsvFeed(tmp_path / f"{day}.csv", watch.scenario))
     assert (counts.received, counts.missing, counts.duplicates, counts.rejected) == (52, 0, 0, 2)
@@ -217,50 +207,26 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     assert belief_of(second) == belief_of(first)
     late = [*rows[:20], *rows[21:25], rows[20], rows[25].replace(",", ",,", 1), *rows[26:30], rows[25]]
     (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
-    watch, told = watchful(base, tmp_path / "watch"), list[dict[str, object]]()
-    watch.run(CsvFeed(tmp_path / "late.csv", watch.scenario), lambda decision: told.append(dict(decision)))
+    watch = watchful(base, tmp_path / "watch")
+    told = decided(watch, CsvFeed(tmp_path / "late.csv", watch.scenario))
     model = watch.models[0].knowledge.model
     assert [journalled_decision(line, watch.scenario, model) for line in journal(watch.folder)] == told
     assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
 
 
-def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., object]:
-    def turn(*arguments: object) -> object:
-        seen.append(1)
-        return inner(*arguments)
-
-    return turn
-
-
-def test_a_long_watch_goes_on_from_its_snapshot(base, mission, plain, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 16)
-    watch, seen = begun(base, tmp_path / "watch"), list[int]()
-    monkeypatch.setattr(ExactFilter, "turn", counting(seen, ExactFilter.turn))
-    counts = ran(watch, CsvFeed(plain, watch.scenario), 18, 40, None)
-    assert len(seen) == 50 + (17 - 2) + (39 - 18)  # each once, and those behind what is settled
-    watch.store(counts, last=20, report=False)
-    run = uav_twin.open_run(tmp_path / "watch")
-    np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(30, 50))
-    np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[30:])
-    np.testing.assert_array_equal(run["smoothed"]["probability"].values, mission.smoothed[30:])
-
-
-def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path, monkeypatch):
+def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
     monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 8)
     monkeypatch.setattr("twin_master.watch.teaching.CHECKED", 1)
     observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
-    feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), base.scenario)
-    watch, file = begun(base, tmp_path / "watch"), tmp_path / "watch" / JOURNAL_NAME
-    counts, read = [], list[int]()
+    feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), watch.scenario)
+    file, counts = watch.folder / JOURNAL_NAME, []
     for turns in (60, 100, 196):  # as many turns behind the last snapshot
         ran(watch, feed, turns)
-        with monkeypatch.context() as patched:
-            patched.setattr("twin_master.mission.journal.whole_record", counting(read, whole_record))
+        with patch("twin_master.mission.journal.whole_record", wraps=whole_record) as read:
             watch.last_decision()
             ran(watch, feed, turns)
-        counts.append(len(read))
-        read.clear()
+        counts.append(read.call_count)
     assert counts[0] == counts[1] == counts[2] < 60
     lines = file.read_bytes().splitlines(keepends=True)
     file.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"turn": 2}', b'"turn": 1}'), *lines[4:]]))
@@ -278,8 +244,8 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path
         assert file.read_bytes() == b"".join(wrong)
 
 
-def test_the_last_decision_is_read_from_the_journal(base, whole, told, tmp_path):
-    watch, file = begun(base, tmp_path / "watch"), tmp_path / "watch" / JOURNAL_NAME
+def test_the_last_decision_is_read_from_the_journal(watch, whole, told):
+    file = watch.folder / JOURNAL_NAME
     lines = (whole / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
     again = told[-1] | {"told_again": True}
     # What came late is told with the control of the last turn, not with that of its own.
@@ -299,8 +265,8 @@ def test_the_last_decision_is_read_from_the_journal(base, whole, told, tmp_path)
 
 
 @pytest.mark.parametrize("source", ["standard input", "a file that grows"])
-def test_silence_is_told_and_journalled(base, mission, plain, tmp_path, source):
-    watch, told = soon_quiet(begun(base, tmp_path / "watch")), list[dict[str, Any]]()
+def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
+    watch, told = hasty, list[dict[str, Any]]()
     if source == "standard input":
         read, write = os.pipe()
         stream = os.fdopen(read, "rb")
@@ -334,9 +300,8 @@ def test_silence_is_told_and_journalled(base, mission, plain, tmp_path, source):
     model = watch.models[0].knowledge.model
     assert [journalled_decision(line, watch.scenario, model) for line in journal(watch.folder)] == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
-    seen = [
-        [notice["kind"] for notice in turn.get("notices", ())] for turn in viewed(watch).seen(0, 4)
-    ]  # as the page shows it
+    shown = viewed(watch).seen(0, 4)  # as the page shows it
+    seen = [[notice["kind"] for notice in turn.get("notices", ())] for turn in shown]
     assert seen == [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
     assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
 
@@ -381,11 +346,8 @@ def test_a_changed_journal_and_other_folders_are_refused(scenario, whole, tmp_pa
     fed = [list(FolderFeed(folder, scenario.scenario).messages(None)) for folder in (whole, copy)]
     assert "line 11 of journal.jsonl was changed or is damaged" in str(fed[1].pop(9)[0])
     del fed[0][9]
-    for (one, _), (other, _) in zip(*fed, strict=True):
-        assert isinstance(one, Message)
-        assert isinstance(other, Message)
-        np.testing.assert_array_equal(one.observed, other.observed)
-        assert one.turn == other.turn
+    rows = [[(message.turn, *message.observed) for message, _ in own] for own in fed]
+    np.testing.assert_array_equal(*rows)
     with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
         uav_twin.fly(scenario, tmp_path / "run")
 
@@ -416,34 +378,21 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_a_patch_is_believed_from_a_stated_turn_on(base, mission, tmp_path):
+def test_a_patch_is_believed_from_a_stated_turn_on(watch, mission, tmp_path):
     observed = mission.observed.copy()
     observed[20:, 4] *= 0.88
-    path = write_csv(tmp_path / "m.csv", observed, mission.control_index)
-    patch = of_gauge(tmp_path / "patch.json", -0.12)
-    watch = begun(base, tmp_path / "watch")
-    ran(watch, CsvFeed(path, watch.scenario), 40)
+    feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, mission.control_index), watch.scenario)
+    given = of_gauge(tmp_path / "patch.json", -0.12)
+    ran(watch, feed, 40)
     with pytest.raises(MissionInputError, match="--from-turn names one of the 40 turns"):
-        watch.run(CsvFeed(path, watch.scenario), str, patched=(patch, 41))
-    watch = begun(base, tmp_path / "other")
-    shutil.copy(tmp_path / "watch" / JOURNAL_NAME, tmp_path / "other")
-    watch.run(CsvFeed(path, watch.scenario), str, turns=45, patched=(patch, 20))
-    later = begun(base, tmp_path / "later")
-    shutil.copytree(tmp_path / "other", tmp_path / "later", dirs_exist_ok=True)
-    later.models.append(watch.models[1])  # as the journal says
-    later.store(ran(later, CsvFeed(path, later.scenario)), report=False)
-
-    twin, beliefs = base.models[0].knowledge.twin(), []
-    for turn, row in enumerate(observed):
-        if turn == 20:
-            knew = watch.models[1].knowledge.twin()
-            knew.restore_state(twin.save_state())
-            twin = knew
-        beliefs.append(twin.turn(row, int(mission.control_index[turn])).filtered)
-    run = uav_twin.open_run(tmp_path / "later")
+        watch.run(feed, str, patched=(given, 41))
+    watch.run(feed, str, turns=45, patched=(given, 20))
+    watch.store(ran(watch, feed), report=False)
+    run = uav_twin.open_run(watch.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 20)
+    beliefs = beliefs_of(watch, observed, mission.control_index, 20)
     np.testing.assert_array_equal(run["filtered"]["probability"].values, beliefs)
-    figures = figures_of(tmp_path / "later")
+    figures = figures_of(watch.folder)
     assert figures["gap_after_patch_20"] < 0.97 * figures["gap_before_patch_20"]
 
 
@@ -485,7 +434,9 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     assert [decision["turn"] for decision in decisions if decision.get("told_again")] == [29]
     assert [decision for decision in decisions if not decision.get("told_again")] == told
     run = uav_twin.open_run(folder)
-    np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[40:])
+    np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(40, 50))
+    for group in ("filtered", "smoothed"):
+        np.testing.assert_array_equal(run[group]["probability"].values, getattr(mission, group)[40:])
     assert last_line(folder) == last_line(whole)
 
 
@@ -522,13 +473,13 @@ def test_a_slip_of_the_pen_makes_no_folder(scenario, recorded, whole, tmp_path):
     check_same(copy, whole, JOURNAL_NAME)
 
 
-def test_silence_is_told_among_messages_that_are_all_refused(base, tmp_path):
-    watch, told = soon_quiet(begun(base, tmp_path / "watch")), list[dict[str, Any]]()
+def test_silence_is_told_among_messages_that_are_all_refused(hasty):
+    told = list[dict[str, Any]]()
 
     def flood():
         end = time.monotonic() + 60.0
         while not told and time.monotonic() < end:
             yield {"turn": 0, "no_sensor": 1.0}
 
-    watch.run(mappings(watch.scenario, flood()), told.append)
+    hasty.run(mappings(hasty.scenario, flood()), told.append)
     assert [notice["kind"] for notice in told[0]["notices"]] == ["quiet"]

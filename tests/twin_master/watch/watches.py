@@ -53,11 +53,11 @@ def watchful(base: Watch, folder: Path) -> Watch:
     return watch
 
 
-def soon_quiet(watch: Watch) -> Watch:
-    """Return a watch that notices a silence at once."""
-    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
-    watch.scenario = watch.scenario.model_copy(update={"watch": section})
-    return watch
+def decided(watch: Watch, feed: Feed, between: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+    """Run a watch to the end of its feed; return what was decided."""
+    decisions = list[dict[str, Any]]()
+    watch.run(feed, lambda decision: decisions.append(dict(decision)), between)
+    return decisions
 
 
 def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
@@ -65,6 +65,17 @@ def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Cou
     for turns in stops or (None,):
         counts = watch.run(feed, lambda _decision: time.sleep(pause), turns=turns)
     return counts
+
+
+def beliefs_of(watch: Watch, observed: np.ndarray, controls: np.ndarray, first: int) -> list[list[float]]:
+    """Return what a twin believes that has the second model of a watch from a turn on."""
+    twin, beliefs = watch.models[0].knowledge.twin(), []
+    for turn, (row, control) in enumerate(zip(observed, controls.tolist(), strict=True)):
+        if turn == first:
+            state, twin = twin.save_state(), watch.models[1].knowledge.twin()
+            twin.restore_state(state)
+        beliefs.append(twin.turn(row, control).filtered.tolist())
+    return beliefs
 
 
 def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:

@@ -1,0 +1,177 @@
+"""What teaches a watch between two of its turns: it has the cause looked for, tries a patch, and adopts it.
+
+The search for the cause is a process of its own, of low priority beside a live watch: the very command that
+the alarm names. Its verdict is a line of the journal behind the turn in which it came.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from reporting.errors import DamagedFileError
+from reporting.json_file import read_json
+from twin_master.network.estimator import Notice
+from twin_master.run_folder import PATCH, TEACHING, VERDICT
+from twin_master.watch.folder import Watch
+from twin_master.watch.teaching import CANNOT, Outcome
+
+TRIAL_TURNS = 10
+"""Turns behind a verdict, none of which it has seen, in which model and patched model are compared."""
+LEAST_GAIN = 3.0
+"""Evidence of these turns from which on a patch is adopted [nats]: as much as a name needs in the search."""
+GROUP = "group"
+TRIED = ("named", "named in part", GROUP)
+"""Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
+alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
+SEARCH = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
+"""The command that looks for the cause of an alarm."""
+COURTESY = 10
+"""Niceness of a search beside a live watch: the watch comes first."""
+_LOOK_AGAIN = 0.05
+
+
+class Tutor:
+    """Asks, tries and adopts between two turns of a watch.
+
+    Parameters
+    ----------
+    watch : Watch
+    wait : bool
+        Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
+        beside a process that searches and a thread that tries a patch.
+    command : sequence of str
+        What begins with a search.
+
+    Attributes
+    ----------
+    outcome : Future or None
+        What comes of the patch that is tried.
+    """
+
+    def __init__(self, watch: Watch, *, wait: bool, command: Sequence[str] = SEARCH) -> None:
+        self._watch, self._wait, self._command = watch, wait, command
+        self._search: subprocess.Popen[bytes] | None = None
+        self.outcome: Future[Outcome] | None = None
+
+    def act(self) -> None:
+        """Do what is due behind the last turn of the watch, which has begun."""
+        watch, teaching, step = self._watch, self._watch.teaching, self._watch.scenario.mission.step_name
+        if teaching.question is not None:
+            first, last = teaching.question
+            folder = watch.folder / TEACHING / f"turns_{first}_to_{last}"
+            log = folder.with_name(folder.name + ".log")
+            if self._searched(folder, log, ["--from-turn", str(first), "--to-turn", str(last)]):
+                watch.write(verdict={"turn": teaching.turn, **verdict_of(folder, log, first, last, step)})
+        if teaching.trial is not None and teaching.turn >= teaching.trial["turn"] + TRIAL_TURNS:
+            self._judge(teaching.trial, step)
+
+    def _searched(self, folder: Path, log: Path, turns: Sequence[str]) -> bool:
+        """Return whether the search that fills a folder with a verdict has ended; begin it if there is none.
+
+        No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
+        """
+        log.parent.mkdir(exist_ok=True)
+        while not (folder / VERDICT).is_file():
+            if self._search is None:
+                run, seed = str(self._watch.folder), str(self._watch.scenario.mission.seed)
+                words = ["--from-run", run, *turns, "--out", str(folder), "--seed", seed]
+                with log.open("wb") as file:
+                    self._search = subprocess.Popen(
+                        [*self._command, *words],
+                        stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True,
+                    )  # fmt: skip
+                if not self._wait:
+                    with suppress(ProcessLookupError):
+                        os.setpriority(os.PRIO_PROCESS, self._search.pid, COURTESY)
+            elif self._search.poll() is not None:
+                break
+            if not self._wait or self._watch.intake.asked:
+                return False
+            time.sleep(_LOOK_AGAIN)
+        self.close()
+        return True
+
+    def _judge(self, trial: dict[str, Any], step: str) -> None:
+        """Adopt the patch of a trial that has all of its turns, or say why not, once that is known."""
+        watch = self._watch
+        if self.outcome is None:
+            file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
+            worker = ThreadPoolExecutor(1)
+            self.outcome = worker.submit(watch.trial(file, trial["from_turn"], compared))
+            worker.shutdown(wait=self._wait)
+        if not self.outcome.done():
+            return
+        asked, self.outcome, outcome = self.outcome, None, None
+        try:
+            outcome = asked.result()
+            sentence = trial_sentence(trial, outcome, step)
+        except CANNOT as error:
+            sentence = f"The patch cannot be believed by this twin: {error}"
+        notice = Notice("trial", sentence).as_record()
+        if outcome is not None and outcome.gained >= LEAST_GAIN:
+            watch.adopt(outcome, notice)
+        else:
+            watch.write(verdict={**trial, "tried": False, "notice": notice})
+
+    def close(self) -> None:
+        """End the search, if there is one; a watch that is taken up again begins it anew."""
+        if self._search is not None and self._search.poll() is None:
+            self._search.terminate()
+            self._search.wait()
+        self._search = None
+
+
+def verdict_of(folder: Path, log: Path, first: int, last: int, step: str) -> dict[str, Any]:
+    """Return what the journal keeps of a verdict, and what the operator is told.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the verdict is; in the folder of verdicts of the watch.
+    log : Path
+        What the search said, where there is none.
+    first, last : int
+        The turns that were searched.
+    step : str
+        What a turn is called.
+    """
+    try:
+        verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
+        kind, told = str(verdict["kind"]), f": {verdict['kind']}. {verdict['sentence']}"
+    except (DamagedFileError, KeyError, TypeError) as error:
+        lines = [str(error), *log.read_text(encoding="utf-8", errors="replace").split("\n")]
+        *_, said = (line.strip() for line in lines if line.strip())
+        kind, told = "none", f", and the search ended without a verdict: {said}"
+    patch, place = folder / PATCH, f"{TEACHING}/{folder.name}"
+    tried = kind in TRIED and patch.is_file()
+    sentence = f"{step.capitalize()}s {first} to {last} were searched for the cause{told}"
+    if tried:
+        which = "patch of the most probable of these" if kind == GROUP else "patch"
+        sentence += f" The {which} is tried beside the model for {TRIAL_TURNS} {step}s."
+    elif patch.is_file():
+        options = f"--model-patch DIR/{place}/{PATCH} --from-turn {first}"
+        sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
+    return {
+        "from_turn": first, "to_turn": last, "tried": tried, "kind": kind, "folder": place,
+        "notice": Notice("verdict", sentence).as_record(),
+    }  # fmt: skip
+
+
+def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str:
+    """Return what the operator is told at the end of a trial."""
+    first = trial["from_turn"]
+    compared = (
+        f"Beside the model for {TRIAL_TURNS} {step}s the patch gained {outcome.gained:.3g} nats of evidence"
+    )
+    if outcome.gained < LEAST_GAIN:
+        return f"{compared}, {LEAST_GAIN:g} are needed, and is not adopted."
+    said = f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
+    if trial["kind"] == GROUP:
+        said += " It is one of a group: which of them is true these data cannot tell."
+    return f"{said} {outcome.record['policy_change']}".rstrip()
