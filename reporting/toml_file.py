@@ -3,10 +3,12 @@
 import json
 import re
 import tomllib
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from reporting.sentences import said
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
@@ -153,19 +155,32 @@ NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
+Fault = tuple[object, str]
+"""Whether a table has it, and the sentence on it."""
+
+
 class Section(BaseModel):
     """A table of a file: unknown keys are refused, and numbers and words are not turned into each other."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
+    def faults(self) -> Iterator[Fault]:
+        """Yield for each fault that it may have whether it has it, and the sentence on it.
 
-def require(met: object, otherwise: str) -> None:
-    """Refuse a table with a sentence, in validators; raises `ValueError`."""
-    if not met:
-        raise ValueError(otherwise)
+        A fault is looked for only in a table that has none of those before it.
+        """
+        yield from ()
+
+    @model_validator(mode="after")
+    def _refuse_faults(self) -> Self:
+        for found, sentence in self.faults():
+            if found:
+                raise ValueError(sentence)
+        return self
 
 
-_Description = TypeVar("_Description", bound=BaseModel)
+_Description = TypeVar("_Description")
+_reader: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
 
 
 def checked(
@@ -181,7 +196,7 @@ def checked(
 
     Parameters
     ----------
-    description : type of BaseModel
+    description : type of BaseModel or dataclass
         What the file may hold.
     content : object
         What it holds.
@@ -200,7 +215,7 @@ def checked(
         The sentence names `source`, the place, what came and what was expected.
     """
     try:
-        return description.model_validate(content)
+        return cast(_Description, _reader(description).validate_python(content))
     except ValidationError as cause:
         raise error(f"{source}: {_sentence(cause, what, first_index)}.") from None
 

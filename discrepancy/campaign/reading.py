@@ -16,6 +16,7 @@ from discrepancy.campaign.records import (
     Campaign,
     Channel,
     FloatArray,
+    InTables,
     NoiseRecord,
     Quantity,
     RecordedInput,
@@ -35,8 +36,6 @@ from reporting.words import be, counted
 
 CAMPAIGN_FILE = "campaign.toml"
 """Name of the file that describes a campaign, in its folder."""
-SAID = ("name", "kind", "load_place", "run", "held_out", "noise_factor", "file", "hold")
-"""What a trial has as the file says it."""
 TABLE_ERRORS = TableErrors(layout=CampaignFileError, value=CampaignDataError)
 """What a table of a campaign raises."""
 _REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
@@ -196,9 +195,8 @@ def _trial(
     held = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not held
     pushing = (item.values for item in inputs if item.quantity in (Quantity.FORCE, Quantity.TORQUE))
-    given = section.model_dump(include={*SAID})
     return Trial(
-        **given,
+        **section.said,
         channels=tuple(channel.name for channel in chosen),
         values=np.stack(columns, axis=1),
         used=np.stack(used, axis=1),
@@ -210,7 +208,6 @@ def _trial(
         health=health,
         regions=regions,
         health_deviation=health_deviation,
-        release=section.release,
         begins=section.begins or Start.SETTLED,
         begin_assumed=section.begins is None,
         inputs=inputs,
@@ -223,17 +220,11 @@ def _inputs(
     """Return the recorded inputs of a driven or static trial: those whose columns are there."""
     if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):
         return ()
-    return tuple(
-        RecordedInput(
-            item.name, item.quantity, _numbers(table, item, user), item.holds,
-            conversion_of(item.quantity, item.unit).to_si(item.offset_deviation), item.unit,
-        )
-        for item in campaign.input
-        if item.table_column in table.columns
-    )  # fmt: skip
+    there = (item for item in campaign.input if item.table_column in table.columns)
+    return tuple(replace(item, values=_numbers(table, item, user)) for item in there)
 
 
-def _numbers(table: TextTable, item: schema.Column, user: str, *, empty_allowed: bool = False) -> FloatArray:
+def _numbers(table: TextTable, item: InTables, user: str, *, empty_allowed: bool = False) -> FloatArray:
     numbers = table.numbers(item.table_column, user, empty_allowed=empty_allowed)
     return conversion_of(item.quantity, item.unit).to_si(numbers)
 
@@ -311,8 +302,7 @@ def _health(
     section: schema.TrialSection, table: TextTable, user: str
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     """Return damage regions, and their losses and deviations (N, K), from columns, keys, or healthy."""
-    stated = {} if section.health is None else section.health.losses
-    deviations = None if section.health is None else section.health.deviation
+    stated = {name: loss for name, loss in section.health.items() if name != "deviation"}
     columns = [
         name.removeprefix(schema.OF_REGION) for name in table.columns if name.startswith(schema.OF_REGION)
     ]
@@ -325,7 +315,7 @@ def _health(
             raise CampaignFileError(said("campaign.health_twice", trial=section, region=name, table=table))
         for values, key, most, what, usual in (
             (health, column, 1.0, "a fraction from 0 to 1", stated.get(name)),
-            (deviation, f"{column}_deviation", inf, "a standard deviation", deviations),
+            (deviation, f"{column}_deviation", inf, "a standard deviation", section.health.get("deviation")),
         ):
             if key not in table.columns:
                 values[:, index] = usual or 0.0

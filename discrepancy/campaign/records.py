@@ -88,34 +88,6 @@ class Start(StrEnum):
     UNKNOWN = "unknown"  # anything: the initial state is a nuisance
 
 
-@dataclass(frozen=True)
-class RecordedInput:
-    """What one input of a model was in a trial.
-
-    Attributes
-    ----------
-    name : str
-        Input of the model.
-    quantity : Quantity
-        What it is.
-    values : (N,) ndarray
-        At the samples [SI].
-    hold : Hold or None
-        Between them; None: nobody said it, and it is taken as linear.
-    offset_deviation : float
-        Prior standard deviation of a constant that the record lacks in this trial [SI]; zero: none.
-    unit : str
-        In which the file says it is; empty where there is no file.
-    """
-
-    name: str
-    quantity: Quantity
-    values: FloatArray
-    hold: Hold | None = None
-    offset_deviation: float = 0.0
-    unit: str = field(default="", compare=False)
-
-
 class TrialKind(StrEnum):
     """What was done in a trial."""
 
@@ -138,8 +110,8 @@ def _needed(value: str) -> str:
 
 NOT_IN_FILES = BeforeValidator(_refused)
 """Of a key that the tables of samples at rest say, and a file cannot."""
-Unit = Annotated[str, AfterValidator(_needed), Field(max_length=200, validate_default=True)]
-"""Of a column: every one in a file has it."""
+InFiles = Annotated[str, AfterValidator(_needed), Field(max_length=200, validate_default=True)]
+"""What all have that are in files."""
 Deviation = Annotated[
     NotNegative,
     WrapValidator(lambda value, check: inf if value == "free" else check(value)),
@@ -179,15 +151,62 @@ class NoiseRecord:
 
 
 @dataclass(frozen=True)
-class Channel:
-    """One measuring channel; `[[channel]]` of a file, until it is read in its unit.
+class InTables:
+    """What has a column of a campaign's tables.
 
     Attributes
     ----------
     name : str
-        Unique in the campaign; also the column of the CSV files unless the file says otherwise.
+        Unique in the campaign; also the column of the tables unless the file says otherwise.
     quantity : Quantity
-        What it measures.
+        What it is.
+    column, unit : str
+        Of the files; empty where there are none, or the column is called as the name.
+    """
+
+    name: Name
+    quantity: Quantity
+    column: Name = field(default="", compare=False, kw_only=True)
+    unit: InFiles = field(default="", compare=False, kw_only=True)
+
+    __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
+
+    @property
+    def table_column(self) -> str:
+        """Column of the tables."""
+        return self.column or self.name
+
+
+@dataclass(frozen=True)
+class RecordedInput(InTables):
+    """What one input of a model was in a trial; without its values `[[input]]` of a file.
+
+    Attributes
+    ----------
+    name : str
+        Input of the model.
+    values : (N,) ndarray
+        At the samples [SI].
+    hold : Hold or None
+        Between them; None: nobody said it, and it is taken as linear.
+    offset_deviation : float
+        Prior standard deviation of a constant that the record lacks in this trial [SI]; zero: none.
+    reference : bool
+        Of a motion in a file: it is none of the structure, so that it need not be smooth.
+    """
+
+    values: Annotated[FloatArray, NOT_IN_FILES, Field(default=np.empty(0), exclude=True)]
+    hold: Hold | None = None
+    offset_deviation: NotNegative = 0.0
+    reference: Annotated[bool, Field(strict=True)] = field(default=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Channel(InTables):
+    """One measuring channel; `[[channel]]` of a file, until it is read in its unit.
+
+    Attributes
+    ----------
     output : str
         The model's output that it is compared with, such as "strain[17]" or "tip_displacement".
     noise : NoiseRecord or None
@@ -201,27 +220,14 @@ class Channel:
         Place along the span [m], for maps.
     chord : float or None
         Place along the chord [fraction], for maps.
-    column, unit : str
-        Of the files; empty where there are none, or the column is called as the channel.
     """
 
-    name: Name
-    quantity: Quantity
     output: Name
     noise: NoiseRecord | None = None
     gain_deviation: Deviation = 0.0
     offset_deviation: Deviation = 0.0
     station: Number | None = None
     chord: Number | None = None
-    column: Name = field(default="", compare=False)
-    unit: Unit = field(default="", compare=False)
-
-    __pydantic_config__ = IN_FILES
-
-    @property
-    def table_column(self) -> str:
-        """Column of the tables."""
-        return self.column or self.name
 
     def noise_in(self, trial: "Trial") -> float:
         """Return the deviation of its noise in a trial [its unit], 0 where it is not known."""
@@ -232,16 +238,52 @@ USUAL_REGIONS = ("z1", "z2")
 """Damage regions that every trial knows: those of the shipped wing."""
 
 
-@dataclass(frozen=True)
-class Trial:
+@dataclass(frozen=True, kw_only=True)
+class TrialKeys:
+    """What a trial has as its file says it: a name that is unique in the campaign, and what was done.
+
+    Attributes
+    ----------
+    file : str
+        That holds it; empty where there is none.
+    run : str
+        Label of the run (set-up) that the trial belongs to.
+    held_out : bool
+        True: not used to find or fit anything, only for proof.
+    noise_factor : float
+        Standard deviation of the noise in this trial over that of the channels' noise records, as known from
+        the acquisition (averaging, another range) [1].
+    load_place : str or tuple of float
+        Where the force acts: a named place of the model ("tip_load" is the wing's own), or (y [m] from the
+        root, x [fraction of the chord]).
+    release : Release or None
+        Ring-downs only.
+    hold : Hold or None
+        Forced trials: as that of an input, for the force.
+    """
+
+    name: Name
+    kind: TrialKind
+    file: InFiles = field(default="", compare=False)
+    run: str = ""
+    held_out: Annotated[bool, Field(strict=True)] = False
+    noise_factor: Positive = 1.0
+    load_place: Name | tuple[Number, Number] = "tip_load"
+    release: Release | None = None
+    hold: Hold | None = None
+
+    @property
+    def said(self) -> dict[str, Any]:
+        """All of this by name, for another record of the trial."""
+        return {key: getattr(self, key) for key in TrialKeys.__dataclass_fields__}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial(TrialKeys):
     """One trial: known inputs, measured values, labels of its state.
 
     Attributes
     ----------
-    name : str
-        Unique in the campaign.
-    kind : TrialKind
-        What was done.
     channels : tuple of str
         Names of the measured channels.
     values : (N, C) ndarray
@@ -255,26 +297,14 @@ class Trial:
         Applied force [N], upwards positive; zero in ring-downs and flights.
     load_factor : (N,) ndarray
         Load factor [1]; zero except in flight.
-    load_place : str or tuple of float
-        Where the force acts: a named place of the model ("tip_load" is the wing's own), or (y [m] from the
-        root, x [fraction of the chord]).
     temperature : (N,) ndarray
         Temperature less the campaign's reference temperature [K].
     start : float
         Start of the trial since the campaign's start [s].
-    run : str
-        Label of the run (set-up) that the trial belongs to.
     health : (N, K) ndarray
         Known stiffness losses of `regions` (fractions); prior means where `health_deviation` is positive.
     health_deviation : (N, K) ndarray
         Prior standard deviations; zero where they are known.
-    release : Release or None
-        Ring-downs only.
-    held_out : bool
-        True: not used to find or fit anything, only for proof.
-    noise_factor : float
-        Standard deviation of the noise in this trial over that of the channels' noise records, as known from
-        the acquisition (averaging, another range) [1].
     begins : Start
         How a forced or driven trial began.
     begin_assumed : bool
@@ -282,36 +312,23 @@ class Trial:
     inputs : tuple of RecordedInput
         Driven trials: what acted. `force` is then the first force or torque among them, or zero. Static
         trials: what was held in each row beside the force.
-    hold : Hold or None
-        Forced trials: as that of an input, for the force.
-    file : str
-        That holds it; empty where there is none.
     regions : tuple of str
         Names of the damage regions, z1 and z2 first.
     """
 
-    name: str
-    kind: TrialKind
     channels: tuple[str, ...]
     values: FloatArray
     used: BoolArray
     time: FloatArray
     force: FloatArray
     load_factor: FloatArray
-    load_place: str | tuple[float, float]
     temperature: FloatArray
-    start: float
-    run: str
     health: FloatArray
     health_deviation: FloatArray
-    release: Release | None = None
-    held_out: bool = False
-    noise_factor: float = 1.0
+    start: float = 0.0
     begins: Start = Start.SETTLED
     begin_assumed: bool = field(default=False, compare=False)
     inputs: tuple[RecordedInput, ...] = ()
-    hold: Hold | None = None
-    file: str = field(default="", compare=False)
     regions: tuple[str, ...] = USUAL_REGIONS
 
     @classmethod
@@ -322,10 +339,9 @@ class Trial:
         zeros, shape, pair = np.zeros(len(time)), (len(time), len(channels)), np.zeros((len(time), 2))
         usual = {
             "values": np.zeros(shape), "used": np.ones(shape, dtype=bool), "force": zeros,
-            "load_factor": zeros, "load_place": "tip_load", "temperature": zeros, "start": 0.0, "run": "",
-            "health": pair, "health_deviation": pair,
+            "load_factor": zeros, "temperature": zeros, "health": pair, "health_deviation": pair,
         }  # fmt: skip
-        return cls(name, kind, channels, time=time, **{**usual, **given})
+        return cls(name=name, kind=kind, channels=channels, time=time, **{**usual, **given})
 
     def rows(self, rows: BoolArray | IntArray | slice, **changes: Any) -> "Trial":
         """Return the trial with its rows as an index chooses them, and other fields changed."""

@@ -163,12 +163,9 @@ def _channel(channel: Channel, si: bool) -> Channel:
     return replace(channel, unit=_unit(channel, si), column="", noise=noise)
 
 
-def _input(item: RecordedInput) -> schema.InputSection:
-    return schema.InputSection.model_construct(
-        name=item.name, quantity=item.quantity, unit=UNITS[item.quantity].si, hold=item.hold,
-        reference=bool(item.quantity.moving) and item.hold is not Hold.SMOOTH,
-        offset_deviation=item.offset_deviation,
-    )  # fmt: skip
+def _input(item: RecordedInput) -> RecordedInput:
+    reference = bool(item.quantity.moving) and item.hold is not Hold.SMOOTH
+    return replace(item, unit=UNITS[item.quantity].si, column="", reference=reference)
 
 
 def _trial(campaign: Campaign, trial: Trial, file: str) -> schema.TrialSection:
@@ -180,10 +177,8 @@ def _trial(campaign: Campaign, trial: Trial, file: str) -> schema.TrialSection:
     driven = trial.kind is TrialKind.DRIVEN and not trial.begin_assumed
     said = driven or trial.begins is not Start.SETTLED
     in_order = list(trial.channels) == [name for name in campaign.channels if name in trial.channels]
-    return schema.TrialSection.model_construct(
-        name=trial.name, kind=trial.kind, file=file, run=trial.run, held_out=trial.held_out,
-        noise_factor=trial.noise_factor, release=trial.release, left_out=left_out,
+    return schema.TrialSection(
+        **{**trial.said, "file": file}, left_out=left_out,
         start=trial.start if trial.start or not trial.is_dynamic else None,
-        begins=trial.begins if said else None, hold=trial.hold, load_place=trial.load_place,
-        channels=None if in_order else trial.channels,
+        begins=trial.begins if said else None, channels=None if in_order else trial.channels,
     )  # fmt: skip

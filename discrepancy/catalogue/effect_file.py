@@ -42,13 +42,13 @@ Time and events of the campaign (`docs/when.md`)::
     end = "pump_on_until"                               # until then; in trials with these events only
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import CatalogueError
@@ -56,43 +56,27 @@ from discrepancy.sentences import said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive, Window
-from reporting.toml_file import Section, checked, read_toml
+from reporting.toml_file import checked, read_toml
 
-from .entry import Effect, EffectParameter, Number, Setting, ShapeParameter
-from .needs import DYNAMIC, NEEDS, PLACES, USUAL, Entry, Target, first_reason, targets_of
+from .entry import ROW, Effect, EffectKeys, Number, Setting
+from .needs import DYNAMIC, NEEDS, PLACES, USUAL, Asked, Target
 from .scales import SCALES, Here, names_with
 
 Text = Annotated[str, Field(min_length=0)]
+Ask = Callable[[Setting], Asked]
 
 
-_AS_WRITTEN = (
-    "name", "family", "equation", "signature", "reference", "acts_on", "parameters", "shape", "confusable",
-    "spectral",
-)  # fmt: skip
-"""Keys that an effect has as they are written."""
-
-
-class EffectSection(Section):
+@dataclass(frozen=True, kw_only=True)
+class EffectSection(EffectKeys):
     """`[[effect]]`, or the whole of a file with one."""
 
-    model_config = ConfigDict(strict=False, allow_inf_nan=False, str_min_length=1)
+    __pydantic_config__ = ROW
 
-    id: str
-    name: str
-    family: str
-    equation: str
-    signature: str
-    reference: str
-    acts_on: frozenset[TrialKind]
-    parameters: tuple[EffectParameter, ...] = ()
-    shape: tuple[ShapeParameter, ...] = ()
     primitives: tuple[dict[str, Text | Number], ...] = ()
-    confusable: tuple[str, ...] = ()
     places: str | tuple[str, ...] | None = None
     preferred: tuple[str, ...] = ()
     needs: tuple[str, ...] = USUAL
     events: tuple[str, ...] = ()
-    spectral: str = ""
 
 
 def effects_of_file(path: Path) -> tuple[Effect, ...]:
@@ -118,8 +102,6 @@ def _effect(row: object, where: str) -> Effect:
     names = frozenset([*(item.name for item in section.parameters), *(item.name for item in section.shape)])
     moments = frozenset(word for name in section.events for word in (name, f"{name}_until"))
     _check_words(section, names, where)
-    if not section.primitives:
-        raise CatalogueError(f"{where} has no [[primitives]].")
     recipes = tuple(
         _recipe(item, names, moments, f"{where}, primitives {n}")
         for n, item in enumerate(section.primitives, start=1)
@@ -127,17 +109,28 @@ def _effect(row: object, where: str) -> Effect:
     timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
     if timed and (still := [kind for kind in TrialKind if kind in section.acts_on - DYNAMIC]):
         raise CatalogueError(said("effects.no_course", where=timed[0].where, kind=still[0].value))
-    word = section.places if isinstance(section.places, str) else ""
-    kinds = tuple(PRIMITIVES[recipe.kind] for recipe in recipes)
-    needed = frozenset().union(*(recipe.moments for recipe in recipes))
-    entry = Entry(section.id, section.acts_on, word, section.preferred, kinds, needed)
-    return Effect(
-        identifier=section.id,
-        build=partial(_build, recipes, entry),
-        places=partial(_places, section.places, entry),
-        unavailable=partial(first_reason, section.needs, entry),
-        **{key: getattr(section, key) for key in _AS_WRITTEN},
+    asked = partial(
+        Asked,
+        identifier=section.identifier,
+        kinds=section.acts_on,
+        primitives=tuple(PRIMITIVES[recipe.kind] for recipe in recipes),
+        moments=frozenset().union(*(recipe.moments for recipe in recipes)),
+        **{key: getattr(section, key) for key in ("places", "preferred", "needs")},
     )
+    return Effect(
+        build=partial(_build, recipes, asked),
+        places=partial(_places, asked),
+        unavailable=partial(_reason, asked),
+        **{key: getattr(section, key) for key in EffectKeys.__dataclass_fields__},
+    )
+
+
+def _places(ask: Ask, setting: Setting) -> tuple[str, ...]:
+    return ask(setting).found_places()
+
+
+def _reason(ask: Ask, setting: Setting) -> str | None:
+    return ask(setting).reason()
 
 
 def _check_words(section: EffectSection, names: frozenset[str], where: str) -> None:
@@ -156,12 +149,8 @@ def _check_words(section: EffectSection, names: frozenset[str], where: str) -> N
     for name in () if isinstance(places, str) else places or ():
         if name in PLACES:
             raise CatalogueError(said("effects.listed", where=where, name=name))
-
-
-def _places(places: str | tuple[str, ...] | None, entry: Entry, setting: Setting) -> tuple[str, ...]:
-    if isinstance(places, str):
-        return PLACES[places](setting, entry)
-    return ("",) if places is None else places
+    if not section.primitives:
+        raise CatalogueError(f"{where} has no [[primitives]].")
 
 
 # ---------------------------------------------------------------- primitives
@@ -264,11 +253,12 @@ def _recipe(
 
 
 def _build(
-    recipes: tuple[_Recipe, ...], entry: Entry, setting: Setting, values: Mapping[str, float], place: str
+    recipes: tuple[_Recipe, ...], ask: Ask, setting: Setting, values: Mapping[str, float], place: str
 ) -> ModelPatch:
     primitives: list[Primitive] = []
-    for target in targets_of(entry.word, place, setting):
-        here = Here(setting, target, entry.kinds, values)
+    asked = ask(setting)
+    for target in asked.targets(place):
+        here = Here(asked, target, values)
         for recipe in recipes:
             try:
                 primitives += recipe.built(here)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from math import exp, log
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Strict
+from pydantic import ConfigDict, Field, Strict
 from scipy.special import ndtr, ndtri
 
 from discrepancy.campaign.records import Campaign, TrialKind
@@ -16,7 +16,7 @@ from fe.runtime.patch import ModelPatch
 NINETY = 1.6448536269514722
 """Standard normal quantile of 0.95."""
 Number = Annotated[float, Strict()]
-_ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
+ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
 """How a table of an entry is read as one of these records."""
 LEAST_SHRINKAGE = 0.3
 """A step takes no positive value below this share of itself."""
@@ -35,7 +35,7 @@ class Prior:
         See there.
     """
 
-    __pydantic_config__ = _ROW
+    __pydantic_config__ = ROW
 
     shape: Literal["log_normal", "normal", "uniform"]
     low: Number
@@ -89,7 +89,7 @@ class EffectParameter:
         Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the search.
     """
 
-    __pydantic_config__ = _ROW
+    __pydantic_config__ = ROW
 
     name: str
     symbol: str
@@ -114,7 +114,7 @@ class ShapeParameter:
         Within the family.
     """
 
-    __pydantic_config__ = _ROW
+    __pydantic_config__ = ROW
 
     name: str
     symbol: str
@@ -128,29 +128,27 @@ class Setting:
     """Where an effect is to be built: campaign, model, natural scales.
 
     `joint_elements` is how many elements stand for the continuous distribution of a joint that slips;
-    `largest` keeps what `places.largest_reading` found, as patches are built at every step of a fit.
+    `largest` keeps the largest readings that were found, as patches are built at every step of a fit.
     """
 
     campaign: Campaign
     model: Model
     scales: Scales
     joint_elements: int = 24
-    largest: dict[tuple[tuple[str, ...], frozenset[TrialKind]], float] = field(
-        default_factory=dict, init=False, compare=False, repr=False
-    )
+    largest: dict[object, float] = field(default_factory=dict, init=False, compare=False, repr=False)
 
 
 Build = Callable[[Setting, Mapping[str, float], str], ModelPatch]
 
 
-@dataclass(frozen=True)
-class Effect:
-    """A named effect.
+@dataclass(frozen=True, kw_only=True)
+class EffectKeys:
+    """What an effect has as its file says it.
 
     Attributes
     ----------
     identifier : str
-        Lower case with underscores, such as "coulomb_friction"; stable.
+        Lower case with underscores, such as "coulomb_friction"; stable. `id` in files.
     name : str
         The field's standard term.
     family : str
@@ -161,15 +159,8 @@ class Effect:
         Trials that it changes.
     parameters : tuple of EffectParameter
         With priors, dimensionless wherever a scale of the setting can make them so.
-    build : callable
-        (setting, values by name of parameters and shape, place) -> patch. A missing shape value is canonical.
     shape : tuple of ShapeParameter
         Freed by the shape gate.
-    places : callable
-        setting -> the discrete places where it may act (channel names, ports, runs, mains frequencies); ("",)
-        if there is no choice.
-    unavailable : callable
-        setting -> why it cannot be tested here, or None.
     confusable : tuple of str
         Identifiers of effects that some campaigns cannot tell from it.
     spectral : str
@@ -177,20 +168,37 @@ class Effect:
         the residuals' spectrum at the place, a channel. Empty if there is none.
     """
 
-    identifier: str
+    identifier: Annotated[str, Field(alias="id")]
     name: str
     family: str
     equation: str
     signature: str
     reference: str
     acts_on: frozenset[TrialKind]
-    parameters: tuple[EffectParameter, ...]
-    build: Build
+    parameters: tuple[EffectParameter, ...] = ()
     shape: tuple[ShapeParameter, ...] = ()
-    places: Callable[[Setting], tuple[str, ...]] = field(default=lambda setting: ("",))
-    unavailable: Callable[[Setting], str | None] = field(default=lambda setting: None)
     confusable: tuple[str, ...] = ()
     spectral: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect(EffectKeys):
+    """A named effect.
+
+    Attributes
+    ----------
+    build : callable
+        (setting, values by name of parameters and shape, place) -> patch. A missing shape value is canonical.
+    places : callable
+        setting -> the discrete places where it may act (channel names, ports, runs, mains frequencies); ("",)
+        if there is no choice.
+    unavailable : callable
+        setting -> why it cannot be tested here, or None.
+    """
+
+    build: Build
+    places: Callable[[Setting], tuple[str, ...]] = field(default=lambda setting: ("",))
+    unavailable: Callable[[Setting], str | None] = field(default=lambda setting: None)
 
     def canonical_shape(self) -> dict[str, float]:
         """Return the shape values of the named effect."""

@@ -14,16 +14,16 @@ from functools import partial
 from math import inf, pi
 from operator import attrgetter
 
+import numpy as np
 from scipy.special import beta
 
-from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import CatalogueError
 from discrepancy.models.scales import PortScale
 from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
 
 from .entry import Setting
-from .needs import Kinds, Target, channels, largest_reading, trials
+from .needs import Asked, Target
 
 LARGEST_SHARE = 0.9
 """Largest share of a port's stiffness at rest that a force which does not fall with the speed may have."""
@@ -31,12 +31,16 @@ LARGEST_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Here:
-    """Where a law is to be built: setting, what its place stands for, trials that it changes, parameters."""
+    """Where a law is to be built: what is asked, what its place stands for, values of its parameters."""
 
-    setting: Setting
+    asked: Asked
     target: Target
-    kinds: Kinds
     values: Mapping[str, float]
+
+    @property
+    def setting(self) -> Setting:
+        """Campaign and model."""
+        return self.asked.setting
 
     @property
     def port(self) -> PortScale:
@@ -85,17 +89,26 @@ def _largest_displacement(here: Here) -> float:
 
 
 def _largest_reading(here: Here) -> float:
-    names: tuple[str, ...] = (here.target.name,)
-    if here.target.name == EVERY_CHANNEL:
-        recorded = channels(here.setting, here.kinds)
-        names = tuple(item.name for item in recorded if here.target.quantity in ("", item.quantity.value))
-    return largest_reading(here.setting, names, here.kinds)
+    """Return the largest magnitude among the used readings of the place [its unit], 1 if all are zero."""
+    target, kept, key = here.target, here.setting.largest, (here.target, here.asked.kinds)
+    if key not in kept:  # patches are built at every step of a fit
+        every = here.asked.channels_of(lambda item: target.quantity in ("", item.quantity.value))
+        names = every if target.name == EVERY_CHANNEL else (target.name,)
+        read = [
+            np.abs(trial.values[trial.used[:, column], column])
+            for trial in here.asked.trials
+            for column, name in enumerate(trial.channels)
+            if name in names
+        ]
+        largest = float(max((np.max(values) for values in read if values.size), default=0.0))
+        kept[key] = largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    return kept[key]
 
 
 def _largest_release(here: Here) -> float:
     releases = [
         abs(trial.release.displacement)
-        for trial in trials(here.setting, frozenset({TrialKind.RINGDOWN}))
+        for trial in here.setting.campaign.fitted
         if trial.release is not None and here.target.name in trial.channels
     ]
     return max(releases, default=0.0) or 1.0

@@ -1,16 +1,17 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from discrepancy.campaign.records import Quantity
 from discrepancy.models.acting import DEFAULT_PLACE
 from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from discrepancy.sentences import said
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
-from reporting.toml_file import Name, Number, Positive
+from reporting.toml_file import Fault, Name, Number, Positive
 from scenarios import binding_files
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
@@ -113,13 +114,12 @@ class ReleaseOf(Section):
     hold: Name | None = None
     output: Name | None = None
 
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
-        if (self.displacement is None) == (self.hold is None):
-            raise ValueError("give exactly one of displacement (a parameter) and hold (a force input)")
-        if self.hold is not None and self.output is None:
-            raise ValueError("hold needs output, the displacement output of the release point")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield more than one way."""
+        both = (self.displacement is None) == (self.hold is None)
+        yield both, "give exactly one of displacement (a parameter) and hold (a force input)"
+        lacks = self.hold is not None and self.output is None
+        yield lacks, "hold needs output, the displacement output of the release point"
 
 
 Variable = Annotated[Name, Field(default_factory=lambda known: known.get("name", ""))]
@@ -204,17 +204,16 @@ class FmuModelDescription(ModelDescription):
     superposition: bool = True
     isolated: bool = True
 
-    @model_validator(mode="after")
-    def _fits_together(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield what does not fit together."""
         for kind in ("port", "parameter", "output", "input"):
-            self.check_unique(kind, [item.name for item in getattr(self, kind)])
+            yield from self.repeated(kind, [item.name for item in getattr(self, kind)])
         for kind in self.effects:
-            if kind not in CARRIED:
-                why = " (internal forces act at ports)" if kind in PRIMITIVES else ""
-                raise ValueError(said("models.effect", kind=kind, why=why, known=", ".join(CARRIED)))
-        if self.inputs.temperature_reference is not None and self.inputs.temperature is None:
-            raise ValueError("temperature_reference needs the input temperature")
-        return self
+            why = " (internal forces act at ports)" if kind in PRIMITIVES else ""
+            wrong = said("models.effect", kind=kind, why=why, known=", ".join(CARRIED))
+            yield kind not in CARRIED, wrong
+        lacks = self.inputs.temperature_reference is not None and self.inputs.temperature is None
+        yield lacks, "temperature_reference needs the input temperature"
 
     def binding_file(self, folder: Path) -> Path | None:
         """Return the binding file that is named, a shipped one or one seen from a folder."""

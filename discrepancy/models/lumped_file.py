@@ -1,13 +1,13 @@
 """A lumped model as a TOML file: matrices, named vectors, laws, controllers and calibrated parameters."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError
@@ -17,7 +17,7 @@ from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from reporting.toml_file import Name, NotNegative, Number, Positive, require
+from reporting.toml_file import Fault, Name, NotNegative, Number, Positive
 from reporting.words import counted
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
@@ -72,12 +72,11 @@ class Damping(Section):
     alpha: NotNegative | None = None
     beta: NotNegative | None = None
 
-    @model_validator(mode="after")
-    def _one_kind(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield more than one kind."""
         rayleigh = self.alpha is not None or self.beta is not None
         ways = self.ratios is not None, self.matrix is not None, rayleigh
-        require(sum(ways) == 1, "give exactly one of ratios, matrix, or alpha and beta")
-        return self
+        yield sum(ways) != 1, "give exactly one of ratios, matrix, or alpha and beta"
 
 
 class PartSection(NamedSection):
@@ -122,13 +121,12 @@ class OutputSection(NamedSection):
     controller: Name | None = None
     constant: Number = 0.0
 
-    @model_validator(mode="after")
-    def _one_kind(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield more than one kind, and a reaction that is no force."""
         ways = sum(item is not None for item in (self.vector, self.reaction, self.controller))
-        require(ways == 1, f"the output {self.name!r} needs one of a vector, a reaction and a controller")
-        forces = self.reaction is None or self.quantity in (Quantity.FORCE, Quantity.TORQUE)
-        require(forces, f'output {self.name!r} is a reaction: give it quantity = "force" or "torque"')
-        return self
+        yield ways != 1, f"the output {self.name!r} needs one of a vector, a reaction and a controller"
+        forceless = self.reaction is not None and self.quantity not in (Quantity.FORCE, Quantity.TORQUE)
+        yield forceless, f'output {self.name!r} is a reaction: give it quantity = "force" or "torque"'
 
 
 class CouplingSection(Section):
@@ -158,15 +156,14 @@ class LawSection(Section):
     kind: Name
     port: Name
 
-    @model_validator(mode="after")
-    def _is_a_law(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield what is no law."""
         known = [law.kind for law in LAWS]
-        require(self.kind in known, said("models.law", law=self, known=", ".join(known)))
+        yield self.kind not in known, said("models.law", law=self, known=", ".join(known))
         try:
             self.scaled(1.0).check()
         except InvalidPatchError as cause:
-            raise ValueError(f"the law {self.name!r}: {cause}") from cause
-        return self
+            yield True, f"the law {self.name!r}: {cause}"
 
     def scaled(self, factor: float) -> PortForce:
         """Return the law with the numbers that its force is in proportion to times a factor."""
@@ -193,11 +190,10 @@ class ControllerSection(NamedSection):
     integral: Number = 0.0
     derivative_of: Literal["error", "measurement"] = "error"
 
-    @model_validator(mode="after")
-    def _does_something(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield a controller without a gain."""
         gains = self.proportional or self.derivative or self.integral
-        require(gains, f"controller {self.name!r} has no gain: give one of {', '.join(GAINS)}")
-        return self
+        yield not gains, f"controller {self.name!r} has no gain: give one of {', '.join(GAINS)}"
 
 
 class PlaceSection(NamedVector):
@@ -319,32 +315,31 @@ class LumpedDescription(ModelDescription):
             found[kind] = sign * factors.get(kind, 1.0) * whole
         return found
 
-    @model_validator(mode="after")
-    def _fits_together(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield what does not fit together."""
         n, m, ratios = self.size, self.states, self.damping.ratios if self.damping is not None else None
-        require(n or m, "mass is missing (or capacity, of states of first order)")
+        yield not n + m, "mass is missing (or capacity, of states of first order)"
         for kind, wanted, more in (
             ("stiffness", n and not self.free, ", or say `free = true`"),
             ("conductance", m, ""),
         ):
-            there = not wanted or self.given(kind)
-            require(there, f"{kind} is missing: give it, or [[{kind}_part]]{more}")
-        require(self.damping or self.free or not n, "'damping' is missing")
-        acted = self.input or not self.is_plain
-        require(acted, "[[input]] is missing: at least one force must be able to act")
-        self._check_names()
-        self._check_matrices()
+            lacks = wanted and not self.given(kind)
+            yield lacks, f"{kind} is missing: give it, or [[{kind}_part]]{more}"
+        yield n and not (self.damping or self.free), "'damping' is missing"
+        idle = self.is_plain and not self.input
+        yield idle, "[[input]] is missing: at least one force must be able to act"
+        yield from self._wrong_names()
+        yield from self._wrong_matrices()
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for item in getattr(self, kind):
-                self._check_vectors(kind, item)
-        turns = self.root is None or (len(self.root.lever) == n and any(self.root.lever))
-        require(turns, f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
+                yield from self._wrong_vectors(kind, item)
+        still = self.root is not None and (len(self.root.lever) != n or not any(self.root.lever))
+        yield still, f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero"
         came, each = counted(len(ratios or ()), "value"), "damping.ratios needs one value for each mode"
-        require(ratios is None or len(ratios) == n, f"{each}, {n} in all, but {came} came")
-        return self
+        yield ratios is not None and len(ratios) != n, f"{each}, {n} in all, but {came} came"
 
-    def _check_matrices(self) -> None:
-        """Refuse matrices of another size, that are not symmetric, feed energy or leave something loose."""
+    def _wrong_matrices(self) -> Iterator[Fault]:
+        """Yield matrices of another size, that are not symmetric, feed energy or leave something loose."""
         counts = self.size, self.states
         for kind, (_, into, of) in BLOCKS.items():
             given, rows, columns = self.given(kind), counts[into], counts[of]
@@ -352,42 +347,44 @@ class LumpedDescription(ModelDescription):
             for name, matrix in given.items():
                 place = whole if name == kind else f"{kind}_part {name!r}"
                 how = f" (or {counted(rows, 'diagonal value')})" if kind in KINDS else " by rows"
-                fits = [len(row) for row in matrix] == [columns] * rows
-                require(fits, f"{place} must be a {rows} x {columns} matrix{how}")
+                other = [len(row) for row in matrix] != [columns] * rows
+                yield other, f"{place} must be a {rows} x {columns} matrix{how}"
                 full = np.array(matrix)
                 least = -1e-9 * np.abs(full).max()
-                alike = kind not in KINDS[:4] or np.min(-np.abs(full - full.T)) >= least
-                require(alike, f"{place} must be symmetric")
-                loses = kind != "damping" or np.linalg.eigvalsh(full)[0] >= least
-                require(loses, f"{place} must not feed energy: it has a negative eigenvalue")
+                skewed = kind in KINDS[:4] and np.min(-np.abs(full - full.T)) < least
+                yield skewed, f"{place} must be symmetric"
+                feeds = kind == "damping" and np.linalg.eigvalsh(full)[0] < least
+                yield feeds, f"{place} must not feed energy: it has a negative eigenvalue"
             if given and kind in ("mass", "stiffness", "capacity"):
                 values = np.linalg.eigvalsh(np.sum([*given.values()], axis=0))
                 loose, floats = (LOOSE, self.free) if kind == "stiffness" else ("", False)
                 holds = values[0] > 0.0 or (floats and values[0] >= -1e-9 * values[-1])
-                require(holds, f"{kind} (with its parts) must be positive definite{loose}")
+                yield not holds, f"{kind} (with its parts) must be positive definite{loose}"
 
-    def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
-        """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
+    def _wrong_vectors(
+        self, kind: str, item: NamedVector | OutputSection | ControllerSection
+    ) -> Iterator[Fault]:
+        """Yield vectors of another length and zero ones, and what sees both displacements and states."""
         n, m = self.size, self.states
         for key in ("vector", "acts", "station_derivative"):
             row, where = getattr(item, key, None), f"{key} of {kind} {item.name!r}"
             came, has = counted(len(row or ()), "entry", "entries"), counted(n + m, "unknown")
-            require(row is None or len(row) == n + m, f"{where} has {came}, but the model has {has}")
-            require(row is None or any(row) or key == "station_derivative", f"{where} is zero")
+            yield row is not None and len(row) != n + m, f"{where} has {came}, but the model has {has}"
+            yield row is not None and not any(row) and key != "station_derivative", f"{where} is zero"
         row = np.array(item.vector or ())
-        one = kind not in ("port", "controller") or not (any(row[:n]) and any(row[n:]))
-        require(one, f"the {kind} {item.name!r} sees displacements or states, not both")
+        both = kind in ("port", "controller") and any(row[:n]) and any(row[n:])
+        yield both, f"the {kind} {item.name!r} sees displacements or states, not both"
         if isinstance(item, PortSection) and item.acts is not None:
             push, capacity = np.array(item.acts), np.sum([*self.given("capacity").values()], axis=0)
             of_states = not any(row[:n]) and not any(push[:n])
             takes = of_states and row[n:] @ np.linalg.solve(capacity, push[n:]) > 0.0
-            require(takes, said("models.acts", port=item))
+            yield not takes, said("models.acts", port=item)
         if isinstance(item, ControllerSection):
             speed = item.quantity.order + any(row[n:]) > 0 and item.derivative
-            require(item.quantity.order < 2 and not speed, said("models.controller_speed", controller=item))
+            yield item.quantity.order > 1 or speed, said("models.controller_speed", controller=item)
 
-    def _check_names(self) -> None:
-        """Refuse names that are there twice, and those that name nothing."""
+    def _wrong_names(self) -> Iterator[Fault]:
+        """Yield names that are there twice, and those that name nothing."""
         kinds = ("output", "port", "place", "load", "controller", "law", "parameter", "input")
         names = {kind: [item.name for item in getattr(self, kind)] for kind in kinds}
         parts = [part.name for kind in KINDS for part in getattr(self, f"{kind}_part")]
@@ -398,7 +395,7 @@ class LumpedDescription(ModelDescription):
             "place station": [f"{place.station:g}" for place in self.place],
         }
         for kind, given in (names | further).items():
-            self.check_unique(kind, given)
+            yield from self.repeated(kind, given)
         there = self.size, self.states
         terms = [*(kind for kind in KINDS if there[BLOCKS[kind][1]]), *parts]
         gains = [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
@@ -416,4 +413,4 @@ class LumpedDescription(ModelDescription):
             for item in getattr(self, kind):
                 for name in _listed(getattr(item, key)):
                     wrong = f"{kind} {item.name!r} {does} {name!r}, but there are {has}"
-                    require(name is None or name in known, wrong)
+                    yield name is not None and name not in known, wrong

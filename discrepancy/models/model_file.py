@@ -1,22 +1,23 @@
 """What the TOML files of models share: how they are read, their tables and kinds of numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import ConfigDict
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Model
-from reporting.toml_file import Name, NotNegative, Number, checked, read_toml
+from reporting import toml_file
+from reporting.toml_file import Fault, Name, NotNegative, Number, checked, read_toml
 
 
-class Section(BaseModel):
+class Section(toml_file.Section):
     """A table of the file; unknown keys are refused, and its values cannot be changed."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(strict=False)
 
 
 class NamedSection(Section):
@@ -34,11 +35,10 @@ class ParameterSection(NamedSection):
     high: Number
     unit: str = "1"
 
-    @model_validator(mode="after")
-    def _in_range(self) -> Self:
-        if not self.low <= self.mean <= self.high:
-            raise ValueError(f"the mean {self.mean:g} is not between low {self.low:g} and high {self.high:g}")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield a mean out of its range."""
+        where = f"low {self.low:g} and high {self.high:g}"
+        yield not self.low <= self.mean <= self.high, f"the mean {self.mean:g} is not between {where}"
 
 
 class ModelDescription(Section):
@@ -68,11 +68,9 @@ class ModelDescription(Section):
         return cls.parse(read_toml(path, ModelError, what=cls.what.partition(" ")[2]), str(path))
 
     @staticmethod
-    def check_unique(kind: str, names: list[str]) -> None:
-        """Refuse a name that is there twice; raises `ValueError`."""
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"there are two of {kind} {name!r}")
+    def repeated(kind: str, names: list[str]) -> Iterator[Fault]:
+        """Yield the names that are there twice."""
+        yield from ((names.count(name) > 1, f"there are two of {kind} {name!r}") for name in names)
 
 
 class DescribedModel(Model):

@@ -7,7 +7,7 @@ mass in kg and an acceleration in m/s^2 are turned into these units.
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +19,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
 from fe.sentences import said
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import Fault, checked, read_toml
 
 from . import tables
 
@@ -101,11 +101,10 @@ class NamedSet(tables.Part):
     of: Literal["nodes", "cells"]
     box: tuple[tables.Vector, tables.Vector]
 
-    @model_validator(mode="after")
-    def _box_is_a_box(self) -> "NamedSet":
-        if any(high < low for low, high in zip(*self.box, strict=True)):
-            raise ValueError("box must give its lower corner first, then its upper one")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield a box that is none."""
+        turned = any(high < low for low, high in zip(*self.box, strict=True))
+        yield turned, "box must give its lower corner first, then its upper one"
 
 
 class Material(tables.Given):
@@ -130,11 +129,11 @@ class Material(tables.Given):
         ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
     )
 
-    @model_validator(mode="after")
-    def _is_stable(self) -> "Material":
-        if self.axes is not None and np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
-            raise ValueError(said("design.unstable"))
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield what is not given in one way, or not stable."""
+        yield from super().faults()
+        gives = self.axes is not None and np.linalg.eigvalsh(self.compliance)[0] <= 0.0
+        yield gives, said("design.unstable")
 
     @property
     def compliance(self) -> FloatArray:
@@ -167,18 +166,16 @@ class Support(tables.Part):
     springs: Springs | None = None
     rigid_about: tables.Vector | None = None
 
-    @model_validator(mode="after")
-    def _holds_something(self) -> "Support":
+    def faults(self) -> Iterator[Fault]:
+        """Yield what holds nothing, or twice."""
         springs = self.springs or ()
         turns = len(springs) > 3 or any(name not in tables.MOTIONS[:3] for name in self.hold)
-        if self.rigid_about is None and (turns or bool(self.hold) == any(springs)):
-            raise ValueError(said("design.support"))
-        if not self.hold and not any(springs):
-            raise ValueError("a rigid set needs hold, springs or both")
+        loose = self.rigid_about is None and (turns or bool(self.hold) == any(springs))
+        yield loose, said("design.support")
+        yield not self.hold and not any(springs), "a rigid set needs hold, springs or both"
         for name, spring in zip(tables.MOTIONS, springs, strict=False):
-            if spring and name in self.hold:
-                raise ValueError(f"the motion {name} is held, so that no spring can act on it")
-        return self
+            twice = spring and name in self.hold
+            yield twice, f"the motion {name} is held, so that no spring can act on it"
 
 
 class Load(tables.Given, tables.Commanded):
@@ -335,10 +332,11 @@ class MatrixDesign(tables.StructureDesign):
     what = "matrix"
     scaled_table = "part"
 
-    @model_validator(mode="after")
-    def _regions_have_parts(self) -> "MatrixDesign":
-        self._check_ties("part", "damage", "damage", "is of the region", "has no stiffness: no part names it")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield what does not fit together, and regions without parts."""
+        yield from super().faults()
+        empty = "has no stiffness: no part names it"
+        yield from self.wrong_ties("part", "damage", "damage", "is of the region", empty)
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_v
 
 from fe.runtime.state import MOST_REGIONS
 from fe.sentences import said
-from reporting.toml_file import Section
+from reporting.toml_file import Fault, Section
 
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -57,12 +57,12 @@ class Given(Part):
 
     ways: ClassVar[tuple[tuple[str, ...], ...]]
 
-    @model_validator(mode="after")
-    def _given_in_one_way(self) -> "Given":
+    def faults(self) -> Iterator[Fault]:
+        """Yield what is not given in one way."""
+        yield from super().faults()
         given = {key for way in self.ways for key in way if getattr(self, key) is not None}
-        if given not in map(set, self.ways):
-            raise ValueError(f"either {', or '.join(map(' and '.join, self.ways))} is expected")
-        return self
+        ways = ", or ".join(map(" and ".join, self.ways))
+        yield given not in map(set, self.ways), f"either {ways} is expected"
 
 
 class Ranged(Named):
@@ -90,12 +90,11 @@ class Ranged(Named):
             high if self.maximum is None else self.maximum,
         )
 
-    @model_validator(mode="after")
-    def _range_holds_the_nominal_value(self) -> "Ranged":
+    def faults(self) -> Iterator[Fault]:
+        """Yield a range without the nominal value."""
         low, high = self.range
-        if not low <= self.middle <= high:
-            raise ValueError(said("design.range", middle=self.middle, low=low, high=high))
-        return self
+        told = said("design.range", middle=self.middle, low=low, high=high)
+        yield not low <= self.middle <= high, told
 
 
 class Parameter(Ranged):
@@ -115,11 +114,10 @@ class Control(Ranged):
 
     usual = (-10.0, 10.0)
 
-    @model_validator(mode="after")
-    def _is_not_always_zero(self) -> "Control":
-        if not any(self.range):
-            raise ValueError(said("design.always_zero"))
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield a range that it cannot have, and one of zero."""
+        yield from super().faults()
+        yield not any(self.range), said("design.always_zero")
 
 
 class Commanded(Named):
@@ -206,8 +204,8 @@ class StructureDesign(Part):
             raise ValueError("one line of text is expected, without line breaks or other control characters")
         return text
 
-    @model_validator(mode="after")
-    def _names_fit_together(self) -> "StructureDesign":
+    def faults(self) -> Iterator[Fault]:
+        """Yield names that do not fit together."""
         # What a state, a control or an output is called by must be one thing.
         for keys in (
             ("parameter", "damage", "mass", "control"),
@@ -217,23 +215,20 @@ class StructureDesign(Part):
         ):
             first: dict[str, str] = {}
             for place, part in (item for key in keys for item in self.numbered(key)):
-                if (other := first.setdefault(part.name, place)) != place:
-                    raise ValueError(said("design.names", first=other, second=place, name=part.name))
+                other = first.setdefault(part.name, place)
+                yield other != place, said("design.names", first=other, second=place, name=part.name)
         if table := self.scaled_table:
-            self._check_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
-        self._check_ties("load", "control", "control", "is tied to the control", "commands no load")
-        return self
+            yield from self.wrong_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
+        yield from self.wrong_ties("load", "control", "control", "is tied to the control", "commands no load")
 
-    def _check_ties(self, table: str, key: str, other: str, tied: str, untied: str) -> None:
-        """Refuse what is tied to a name of another table that is not there, and names that tie nothing."""
+    def wrong_ties(self, table: str, key: str, other: str, tied: str, untied: str) -> Iterator[Fault]:
+        """Yield what is tied to a name of another table that is not there, and names that tie nothing."""
         known = [part.name for part in getattr(self, other)]
         came = {getattr(part, key): place for place, part in self.numbered(table)}
         for name, place in came.items():
-            if name is not None and name not in known:
-                raise ValueError(f"{place} {tied} {name!r}, but no [[{other}]] has that name")
-        for name in known:
-            if name not in came:
-                raise ValueError(f"the {other} {name!r} {untied}")
+            lost = name is not None and name not in known
+            yield lost, f"{place} {tied} {name!r}, but no [[{other}]] has that name"
+        yield from ((name not in came, f"the {other} {name!r} {untied}") for name in known)
 
     def numbered(self, key: str) -> Iterator[tuple[str, Any]]:
         """Yield the parts of a table, each behind its place in the file, such as `load[1]`."""

@@ -8,16 +8,17 @@ semi-span, chordwise places are fractions of the local chord measured from the l
 import hashlib
 import itertools
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
 from fe.sentences import said
 from fe.structure.tables import Part, StructureDesign
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import Fault, checked, read_toml
 
 from . import parts
 
@@ -65,11 +66,10 @@ class WingDesign(Part):
     tip_load: parts.TipLoad
     mesh: parts.MeshSettings
 
-    @model_validator(mode="after")
-    def _parts_fit_together(self) -> "WingDesign":
-        for check in (_check_webs, _check_ribs, _check_regions, _check_gauges, _check_places):
-            check(self)
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield parts that do not fit together."""
+        for wrong in (_wrong_webs, _wrong_ribs, _wrong_regions, _wrong_gauges, _wrong_places):
+            yield from wrong(self)
 
     @property
     def regions(self) -> tuple[str, ...]:
@@ -125,80 +125,76 @@ class WingDesign(Part):
         return parse_design(content, source="the changed design")
 
 
-def _check_webs(design: WingDesign) -> None:
+def _wrong_webs(design: WingDesign) -> Iterator[Fault]:
     smallest = min(design.planform.root_chord, design.planform.tip_chord)
     for index, (before, after) in enumerate(itertools.pairwise(design.webs), start=1):
         room = (after.chord - before.chord) * smallest - before.thickness - after.thickness
-        if room <= 0.0:
-            raise ValueError(said("wing.webs", index=index, web=after, other=index - 1, before=before))
-    if design.front_chord <= 0.0 or design.rear_chord >= 1.0:
-        raise ValueError("webs[0] and the last web must lie inside the chord, between 0 and 1")
+        told = said("wing.webs", index=index, web=after, other=index - 1, before=before)
+        yield room <= 0.0, told
+    outside = design.front_chord <= 0.0 or design.rear_chord >= 1.0
+    yield outside, "webs[0] and the last web must lie inside the chord, between 0 and 1"
     for web in design.webs:
         half = float(parts.four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)) * smallest
-        if half <= 1.5 * design.skin.thickness:
-            raise ValueError(said("wing.skin", skin=design.skin, web=web, half=half))
+        thick = half <= 1.5 * design.skin.thickness
+        yield thick, said("wing.skin", skin=design.skin, web=web, half=half)
+    last = len(design.webs) - 1
     for index, rod in enumerate(design.rods):
-        if rod.web >= len(design.webs):
-            raise ValueError(said("wing.rods", index=index, rod=rod, last=len(design.webs) - 1))
+        yield rod.web > last, said("wing.rods", index=index, rod=rod, last=last)
 
 
-def _check_ribs(design: WingDesign) -> None:
+def _wrong_ribs(design: WingDesign) -> Iterator[Fault]:
     intervals = sorted((*rib_interval(design, index), index) for index in range(len(design.ribs)))
     for (_, end, first), (start, _, second) in itertools.pairwise(intervals):
-        if start < end:
-            raise ValueError(f"ribs[{first}] and ribs[{second}] overlap at {start:.4g} m from the root")
+        yield start < end, f"ribs[{first}] and ribs[{second}] overlap at {start:.4g} m from the root"
 
 
-def _require_on_box(design: WingDesign, what: str, front: float, rear: float) -> None:
-    if not design.front_chord <= front <= rear <= design.rear_chord:
-        raise ValueError(said("wing.box", what=what, design=design))
+def _off_box(design: WingDesign, what: str, front: float, rear: float) -> Fault:
+    inside = design.front_chord <= front <= rear <= design.rear_chord
+    return not inside, said("wing.box", what=what, design=design)
 
 
-def _check_regions(design: WingDesign) -> None:
+def _wrong_regions(design: WingDesign) -> Iterator[Fault]:
     span = design.planform.semi_span
     for index, defect in enumerate(design.defects):
-        where = f"defects[{index}]"
-        if defect.span_end <= defect.span_start or defect.chord_end <= defect.chord_start:
-            raise ValueError(f"{where} must end behind its start, along the span and along the chord")
-        if defect.span_end > span:
-            raise ValueError(f"{where} ends {defect.span_end:g} m from the root, off the wing of {span:g} m")
-        ends = defect.chord_start, defect.chord_end
-        _require_on_box(design, f"{where}, from chord {ends[0]:g} to {ends[1]:g},", *ends)
+        where, ends = f"defects[{index}]", (defect.chord_start, defect.chord_end)
+        turned = defect.span_end <= defect.span_start or ends[1] <= ends[0]
+        yield turned, f"{where} must end behind its start, along the span and along the chord"
+        far = f"{where} ends {defect.span_end:g} m from the root, off the wing of {span:g} m"
+        yield defect.span_end > span, far
+        yield _off_box(design, f"{where}, from chord {ends[0]:g} to {ends[1]:g},", *ends)
     for (first, one), (second, two) in itertools.combinations(enumerate(design.defects), 2):
-        if min(one.span_end, two.span_end) > max(one.span_start, two.span_start) and min(
-            one.chord_end, two.chord_end
-        ) > max(one.chord_start, two.chord_start):
-            raise ValueError(f"defects[{first}] and defects[{second}] overlap")
-        if design.regions[first] == design.regions[second]:
-            both = {"first": f"defects[{first}]", "second": f"defects[{second}]"}
-            raise ValueError(said("design.names", name=design.regions[first], **both))
+        along = min(one.span_end, two.span_end) > max(one.span_start, two.span_start)
+        across = min(one.chord_end, two.chord_end) > max(one.chord_start, two.chord_start)
+        yield along and across, f"defects[{first}] and defects[{second}] overlap"
+        name, other = design.regions[first], design.regions[second]
+        both = {"first": f"defects[{first}]", "second": f"defects[{second}]"}
+        yield name == other, said("design.names", name=name, **both)
     for index, name in enumerate(design.regions):
-        if name in TAKEN_NAMES:
-            raise ValueError(f"defects[{index}] is named {name!r}, which is taken; give it another name")
+        taken = f"defects[{index}] is named {name!r}, which is taken; give it another name"
+        yield name in TAKEN_NAMES, taken
     for index, added in enumerate(design.added_density):
-        if added.end <= added.start:
-            raise ValueError(f"added_density[{index}] must end behind its start")
+        yield added.end <= added.start, f"added_density[{index}] must end behind its start"
 
 
-def _check_gauges(design: WingDesign) -> None:
+def _wrong_gauges(design: WingDesign) -> Iterator[Fault]:
     span = design.planform.semi_span
     along, across = 0.5 * design.gauges.averaging_spanwise, 0.5 * design.gauges.averaging_chordwise
     for index, (distance, chord) in enumerate(design.gauges.positions):
-        if not along <= distance <= span - along:
-            raise ValueError(said("wing.gauge", index=index, distance=distance, span=span))
+        inside = along <= distance <= span - along
+        yield not inside, said("wing.gauge", index=index, distance=distance, span=span)
         for end in (distance - along, distance + along):
             local = design.planform.chord(end / span)
             middle = chord * design.planform.chord(distance / span)
             where = f"gauges.positions[{index}] at chord {chord:g}, with its averaging length,"
-            _require_on_box(design, where, (middle - across) / local, (middle + across) / local)
+            yield _off_box(design, where, (middle - across) / local, (middle + across) / local)
 
 
-def _check_places(design: WingDesign) -> None:
+def _wrong_places(design: WingDesign) -> Iterator[Fault]:
     places = [(f"point_masses[{i}]", place.chord) for i, place in enumerate(design.point_masses)]
     for where, chord in [*places, ("tip_load", design.tip_load.chord)]:
-        _require_on_box(design, f"{where} at chord {chord:g}", chord, chord)
-    if design.tip_load.distance_from_tip >= design.planform.semi_span:
-        raise ValueError("tip_load.distance_from_tip reaches beyond the root")
+        yield _off_box(design, f"{where} at chord {chord:g}", chord, chord)
+    beyond = design.tip_load.distance_from_tip >= design.planform.semi_span
+    yield beyond, "tip_load.distance_from_tip reaches beyond the root"
 
 
 def rib_interval(design: WingDesign, index: int) -> tuple[float, float]:

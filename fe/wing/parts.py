@@ -5,14 +5,16 @@ The shape of the section is of the symmetric four-digit family of NACA Report 46
 """
 
 import math
+from collections.abc import Iterator
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fe.runtime.arrays import FloatArray
 from fe.structure.tables import Modulus, Part
+from reporting.toml_file import Fault
 
 _SHAPE = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
 
@@ -103,17 +105,16 @@ class Skin(Part):
     bands: tuple[SkinBand, ...] = ()
     stations: tuple[SkinStation, ...] = ()
 
-    @model_validator(mode="after")
-    def _one_course_of_the_modulus(self) -> "Skin":
-        if bool(self.bands) == bool(self.stations):
-            raise ValueError("Young's modulus must be given either in bands or at stations")
+    def faults(self) -> Iterator[Fault]:
+        """Yield other than one course of the modulus."""
+        both = bool(self.bands) == bool(self.stations)
+        yield both, "Young's modulus must be given either in bands or at stations"
         places = [place.station for place in self.stations]
-        if places and (places != sorted({*places}) or (places[0], places[-1]) != (0.0, 1.0)):
-            raise ValueError(f"the stations must rise from 0 to 1, but are {places}")
+        off = places and (places != sorted({*places}) or (places[0], places[-1]) != (0.0, 1.0))
+        yield off, f"the stations must rise from 0 to 1, but are {places}"
         ends = [band.end for band in self.bands]
-        if ends and ([0.0, *ends] != sorted({0.0, *ends}) or ends[-1] != 1.0):
-            raise ValueError(f"the ends of the bands must rise from above 0 to 1, but are {ends}")
-        return self
+        off = ends and ([0.0, *ends] != sorted({0.0, *ends}) or ends[-1] != 1.0)
+        yield off, f"the ends of the bands must rise from above 0 to 1, but are {ends}"
 
     def young_modulus(self, station: FloatArray) -> FloatArray:
         """Young's modulus (...,) [Pa] at fractions of the span (...,)."""

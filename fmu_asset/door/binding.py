@@ -25,16 +25,16 @@ FMU's own units, and `[limits]` says what the FMU's worker may take.
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerLimits
-from reporting.toml_file import Section, checked, read_toml
+from reporting.toml_file import Fault, Section, checked, read_toml
 
 from .units import same_dimension
 
@@ -104,11 +104,11 @@ class Input(Scalar):
     minimum: _Number | None = None
     maximum: _Number | None = None
 
-    @model_validator(mode="after")
-    def _ordered(self) -> "Input":
-        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            raise ValueError(f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield limits that are exchanged."""
+        if self.minimum is not None and self.maximum is not None:
+            told = f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}"
+            yield self.minimum > self.maximum, told
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -146,11 +146,10 @@ class Vector(Section):
         unit = self.unit if isinstance(self.unit, str) else tuple(unit for _, unit in pairs)
         return self.model_copy(update={"variables": tuple(name for name, _ in pairs), "unit": unit})
 
-    @model_validator(mode="after")
-    def _one_or_each(self) -> Self:
-        if len(self.units) != len(self.variables):
-            raise ValueError(said("binding.unit_count", count=len(self.variables), came=len(self.units)))
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield units that are neither one nor as many as variables."""
+        count, came = len(self.variables), len(self.units)
+        yield came != count, said("binding.unit_count", count=count, came=came)
 
 
 class Port(Section):
@@ -165,18 +164,17 @@ class Port(Section):
     displacement: Vector | None = None
     velocity: Vector | None = None
 
-    @model_validator(mode="after")
-    def _complete(self) -> "Port":
-        if self.displacement is None and self.velocity is None:
-            raise ValueError("a port needs a displacement or a velocity beside its force")
+    def faults(self) -> Iterator[Fault]:
+        """Yield a port without motion, and units that it cannot have."""
+        still = self.displacement is None and self.velocity is None
+        yield still, "a port needs a displacement or a velocity beside its force"
         for name, vector in self.quantities.items():
-            if not isinstance(vector.unit, str):
-                raise ValueError(f"{name} must have one unit, and {len(vector.unit)} came")
-            allowed = [same_dimension(vector.unit, unit) for unit in PORT_QUANTITIES[name]]
-            if allowed == [False, False]:
-                wanted = " or ".join(PORT_QUANTITIES[name])
-                raise ValueError(said("binding.port_unit", name=name, vector=vector, wanted=wanted))
-        return self
+            unit, wanted = vector.unit, " or ".join(PORT_QUANTITIES[name])
+            if isinstance(unit, tuple):
+                yield True, f"{name} must have one unit, and {len(unit)} came"
+            else:
+                wrong = [same_dimension(unit, able) for able in PORT_QUANTITIES[name]] == [False, False]
+                yield wrong, said("binding.port_unit", name=name, vector=vector, wanted=wanted)
 
     @property
     def quantities(self) -> dict[str, Vector]:

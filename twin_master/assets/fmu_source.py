@@ -1,12 +1,12 @@
 """An FMU as the asset of a mission: any FMU with a binding, given or packed of a model script."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fmu_asset.archive.fmu_file import packed_design_hash
 from fmu_asset.door.binding import Binding, load_binding
@@ -16,6 +16,7 @@ from fmu_asset.folders import scratch_folder
 from reporting.arrays import Float
 from reporting.progress import Progress
 from reporting.provenance import hash_file
+from reporting.toml_file import Fault
 from twin_master.assets.asset_source import (
     BINDING_COPY,
     FLOWN_DESIGN_HASH,
@@ -83,12 +84,13 @@ class FmuSection(AssetSection):
         """The binding, shipped or not."""
         return self.all_files()[BINDING_COPY]
 
-    @model_validator(mode="after")
-    def _check_seeds(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield parameters that are seeds, too."""
         for name in self.seeds:
-            if name in self.parameters:
-                raise ValueError(f"`{name}` is both in `parameters` and in `seeds`: keep one of them")
-        return self
+            yield (
+                name in self.parameters,
+                f"`{name}` is both in `parameters` and in `seeds`: keep one of them",
+            )
 
 
 class FmuFileSection(FmuSection):
@@ -178,13 +180,8 @@ class FmuAsset(Asset):
             taken.add(plain)
             self._names[name] = plain
         inputs = (*binding.parameter.items(), *binding.control.items())
-        self._units = {name: scalar.unit for name, scalar in inputs}
-        self._units |= {self._names[name]: unit for name, unit in session.recorded_units.items()}
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units of parameters, control inputs and of what is recorded beside the observations."""
-        return self._units
+        recorded = {self._names[name]: unit for name, unit in session.recorded_units.items()}
+        self.units = {name: scalar.unit for name, scalar in inputs} | recorded
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make one communication step."""

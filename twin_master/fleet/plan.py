@@ -1,16 +1,16 @@
 """What a fleet flies: its file, its groups, and the seed of every twin."""
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from reporting.provenance import hash_file
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import Fault, checked, read_toml
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
@@ -67,12 +67,10 @@ class GroupSection(Section):
     true_probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
     """What `truth.probability` is in this group."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield other than one kind of members."""
         kinds = self.count, self.fmus, self.calibrations, self.observations
-        if sum(given is not None for given in kinds) != 1:
-            raise ValueError(said("fleet.members", name=self.name))
-        return self
+        yield sum(given is not None for given in kinds) != 1, said("fleet.members", name=self.name)
 
 
 class FleetSection(Section):
@@ -91,12 +89,11 @@ class FleetFile(Section):
     fleet: FleetSection
     group: Annotated[tuple[GroupSection, ...], Field(min_length=1)]
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield names that come twice."""
         names = [group.name for group in self.group]
-        if len(set(names)) != len(names):
-            raise ValueError(f"each group needs a name of its own, and the names are {', '.join(names)}")
-        return self
+        told = f"each group needs a name of its own, and the names are {', '.join(names)}"
+        yield len(set(names)) != len(names), told
 
 
 @dataclass(frozen=True)

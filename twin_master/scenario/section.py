@@ -1,11 +1,13 @@
 """A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
 
-from collections.abc import Iterator, Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
+from reporting import toml_file
+from reporting.toml_file import Fault as Fault
 from reporting.toml_file import shown
 from twin_master.sentences import said
 
@@ -59,28 +61,16 @@ def _check_percent(key: object, value: object) -> None:
             raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
 
 
-Fault = tuple[object, str]
-"""Whether a table has it, and the sentence on it."""
-
-
 def one_or_each(key: str, value: object, count: int) -> Fault:
     """Return the fault that what may be given for each sensor is given neither once nor `count` times."""
     came = len(value) if isinstance(value, tuple) else count
     return came != count, said("scenario.one_or_each", key=key, count=count, came=came)
 
 
-def _wrong_key(
-    kind: Literal["unknown_key", "missing_key"], key: str, told: str, came: object
-) -> InitErrorDetails:
-    sentence = "unknown key, those known there are {told}" if kind == "unknown_key" else "{told} is missing"
-    error = PydanticCustomError(kind, sentence, {"told": told})
-    return InitErrorDetails(type=error, loc=(key,), input=came)
-
-
-class Section(BaseModel):
+class Section(toml_file.Section):
     """A table of the file: unknown keys are refused, and a unit in a key's name is honoured."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(strict=False)
     units: ClassVar[Mapping[str, str]] = {}
     """The unit that each key may carry in its name."""
 
@@ -94,18 +84,14 @@ class Section(BaseModel):
         }
         given = {str(key): cls.split_unit(str(key)) for key in table}
         bases = {base for base, _ in given.values()}
-        listed = ", ".join(known.values())
-        wrong = [
-            _wrong_key("unknown_key", key, listed, table.get(key))
-            for key, (base, _) in given.items()
-            if base not in known
-        ]
-        required = [name for name in cls.units if cls.model_fields[name].is_required()]
-        wrong += [
-            _wrong_key("missing_key", name, known[name], table) for name in required if name not in bases
-        ]
-        if wrong:
-            raise ValidationError.from_exception_data(cls.__name__, wrong)
+        for key, (base, _) in given.items():
+            if base not in known:
+                told = {"key": key, "told": ", ".join(known.values())}
+                raise PydanticCustomError("unknown_key", "unknown key {key}", told)
+        for name in cls.units:
+            if cls.model_fields[name].is_required() and name not in bases:
+                told = {"key": name, "told": known[name]}
+                raise PydanticCustomError("missing_key", "{told} is missing", told)
         converted: dict[object, object] = {}
         for (key, (base, unit)), value in zip(given.items(), table.values(), strict=True):
             if base in table and unit:
@@ -114,20 +100,6 @@ class Section(BaseModel):
                 _check_percent(key, value)
             converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
         return converted
-
-    def faults(self) -> Iterator[Fault]:
-        """Yield for each fault that it may have whether it has it, and the sentence on it.
-
-        A fault is looked for only in a table that has none of those before it.
-        """
-        yield from ()
-
-    @model_validator(mode="after")
-    def _refuse_faults(self) -> Self:
-        for found, sentence in self.faults():
-            if found:
-                raise ValueError(sentence)
-        return self
 
     @classmethod
     def split_unit(cls, key: str) -> tuple[str, str]:

@@ -156,9 +156,9 @@ class Session:
         if (topic := self._flying.pop(mid, None)) is not None:
             topic.answered(mid, str(reason) if reason.is_failure else None)
 
-    def _lost(self) -> None:
+    def _lost(self, failure: str) -> None:
         """Let go of a connection, to try again later; the first time it ends the watch."""
-        failure, self._failure, self._client = self._failure, "", None
+        failure, self._failure, self._client = self._failure or failure, "", None
         if not self._begun:
             raise MissionInputError(f"{failure}.")
         if failure != self._told:
@@ -182,15 +182,13 @@ class Session:
             try:
                 self._connect()
             except OSError as error:
-                self._failure = f"no broker answers at {self._broker.host}:{self._broker.port} ({error})"
-                self._lost()
+                self._lost(f"no broker answers at {self._broker.host}:{self._broker.port} ({error})")
                 return
         count, failed = len(self.came), self._client.loop(wait)
         while not failed and len(self.came) > count:  # all that is here already
             count, failed = len(self.came), self._client.loop(0.0)
         if failed or self._failure or self._client.socket() is None:
-            self._failure = self._failure or f"the {self._where} is away ({failed.name})"
-            self._lost()
+            self._lost(f"the {self._where} is away ({failed.name})")
             return
         if self._clean and self._connected:
             # The old session has ended. One that begins so is forgotten by brokers that start again.

@@ -296,7 +296,7 @@ def _read(
     else:
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.moved(loaded.path.parent)
-    section = scenario.watch.model_copy(
-        update={"allow_unknown": scenario.watch.allow_unknown or allow_unknown}
-    )
-    return folder, scenario.model_copy(update={"watch": section})
+    if allow_unknown:
+        section = scenario.watch.model_copy(update={"allow_unknown": True})
+        scenario = scenario.model_copy(update={"watch": section})
+    return folder, scenario

@@ -16,7 +16,6 @@ from typing import Any
 
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
-from twin_master.errors import TwinMasterError
 from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.watch.folder import Watch
@@ -62,46 +61,41 @@ class Tutor:
 
     def act(self) -> None:
         """Do what is due behind the last turn of the watch, which has begun."""
-        teaching, step = self._watch.teaching, self._watch.scenario.mission.step_name
+        watch, teaching, step = self._watch, self._watch.teaching, self._watch.scenario.mission.step_name
         if teaching.question is not None:
-            found = self._answer(*teaching.question)
-            if found is not None:
-                verdict = verdict_of(self._watch.folder, teaching.question, found, teaching.turn, step)
-                self._watch.write(verdict=verdict)
+            first, last = teaching.question
+            folder = watch.folder / TEACHING / f"turns_{first}_to_{last}"
+            log = folder.with_name(folder.name + ".log")
+            if self._searched(folder, log, ["--from-turn", str(first), "--to-turn", str(last)]):
+                watch.write(verdict={"turn": teaching.turn, **verdict_of(folder, log, first, last, step)})
         if teaching.trial is not None and teaching.turn >= teaching.trial["turn"] + TRIAL_TURNS:
             self._judge(teaching.trial, step)
 
-    def _answer(self, first: int, last: int) -> Path | TwinMasterError | None:
-        """Return the folder of the verdict, or the last that a search without one said; None before.
+    def _searched(self, folder: Path, log: Path, turns: Sequence[str]) -> bool:
+        """Return whether the search that fills a folder with a verdict has ended; begin it if there is none.
 
         No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
         """
-        watch = self._watch.folder
-        folder = watch / TEACHING / f"turns_{first}_to_{last}"
-        log = folder.with_name(folder.name + ".log")
         log.parent.mkdir(exist_ok=True)
         while not (folder / VERDICT).is_file():
             if self._search is None:
-                turns = ["--from-turn", str(first), "--to-turn", str(last)]
-                out = ["--out", str(folder), "--seed", str(self._watch.scenario.mission.seed)]
+                run, seed = str(self._watch.folder), str(self._watch.scenario.mission.seed)
+                words = ["--from-run", run, *turns, "--out", str(folder), "--seed", seed]
                 with log.open("wb") as file:
                     self._search = subprocess.Popen(
-                        [*self._command, "--from-run", str(watch), *turns, *out],
+                        [*self._command, *words],
                         stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True,
                     )  # fmt: skip
                 if not self._wait:
                     with suppress(ProcessLookupError):
                         os.setpriority(os.PRIO_PROCESS, self._search.pid, COURTESY)
-            elif (code := self._search.poll()) is not None and not (folder / VERDICT).is_file():
-                self._search = None
-                lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
-                said = (line.strip() for line in reversed(lines) if line.strip())
-                return TwinMasterError(next(said, f"exit code {code}"))
+            elif self._search.poll() is not None:
+                break
             if not self._wait or self._watch.intake.asked:
-                return None
+                return False
             time.sleep(_LOOK_AGAIN)
         self.close()
-        return folder
+        return True
 
     def _judge(self, trial: dict[str, Any], step: str) -> None:
         """Adopt the patch of a trial that has all of its turns, or say why not, once that is known."""
@@ -133,44 +127,38 @@ class Tutor:
         self._search = None
 
 
-def verdict_of(
-    watch: Path, question: tuple[int, int], folder: Path | TwinMasterError, turn: int, step: str
-) -> dict[str, Any]:
+def verdict_of(folder: Path, log: Path, first: int, last: int, step: str) -> dict[str, Any]:
     """Return what the journal keeps of a verdict, and what the operator is told.
 
     Parameters
     ----------
-    watch : Path
-        Folder of the watch.
-    question : tuple of int
+    folder : Path
+        Where the verdict is; in the folder of verdicts of the watch.
+    log : Path
+        What the search said, where there is none.
+    first, last : int
         The turns that were searched.
-    folder : Path or TwinMasterError
-        Where the verdict is, or why there is none.
-    turn : int
-        The last turn before it came.
     step : str
         What a turn is called.
     """
-    asked = {"from_turn": question[0], "to_turn": question[1], "turn": turn}
-    where = f"{step.capitalize()}s {question[0]} to {question[1]} were searched for the cause"
-    if isinstance(folder, TwinMasterError):
-        sentence = f"{where}, and the search ended without a verdict: {folder}"
-        return {**asked, "tried": False, "kind": "none", "notice": Notice("verdict", sentence).as_record()}
     try:
         verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
-        kind, said = str(verdict["kind"]), str(verdict["sentence"])
+        kind, told = str(verdict["kind"]), f": {verdict['kind']}. {verdict['sentence']}"
     except (DamagedFileError, KeyError, TypeError) as error:
-        return verdict_of(watch, question, TwinMasterError(f"{folder.name}: {error}"), turn, step)
-    tried, patch = kind in TRIED and (folder / PATCH).is_file(), folder / PATCH
-    sentence = f"{where}: {kind}. {said}"
+        lines = [str(error), *log.read_text(encoding="utf-8", errors="replace").split("\n")]
+        *_, said = (line.strip() for line in lines if line.strip())
+        kind, told = "none", f", and the search ended without a verdict: {said}"
+    patch, place = folder / PATCH, f"{TEACHING}/{folder.name}"
+    tried = kind in TRIED and patch.is_file()
+    sentence = f"{step.capitalize()}s {first} to {last} were searched for the cause{told}"
     if tried:
         which = "patch of the most probable of these" if kind == GROUP else "patch"
         sentence += f" The {which} is tried beside the model for {TRIAL_TURNS} {step}s."
     elif patch.is_file():
-        options = f"--model-patch DIR/{patch.relative_to(watch)} --from-turn {question[0]}"
+        options = f"--model-patch DIR/{place}/{PATCH} --from-turn {first}"
         sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
     return {
-        **asked, "tried": tried, "kind": kind, "folder": folder.relative_to(watch).as_posix(),
+        "from_turn": first, "to_turn": last, "tried": tried, "kind": kind, "folder": place,
         "notice": Notice("verdict", sentence).as_record(),
     }  # fmt: skip
 

@@ -9,10 +9,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -37,7 +38,6 @@ from twin_master.errors import MissionInputError, NotResumableError, RunFolderEr
 from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
 from twin_master.mission.replay import BelievedModel, journalled_decision
 from twin_master.mission.turns import History
-from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines, mappings
@@ -108,8 +108,6 @@ def test_a_program_hands_over_messages_and_is_told_decisions(scenario, mission, 
     np.testing.assert_array_equal(uav_twin.open_run(folder)["filtered"]["probability"], mission.filtered[:6])
     with pytest.raises(MissionInputError, match="names no recording: give the observations"):
         uav_twin.watch(scenario, folder=tmp_path / "none")
-    with pytest.raises(MissionInputError, match="--teach begins with an alarm"):
-        uav_twin.watch(scenario, [], tmp_path / "none", teach=True)
     assert not (tmp_path / "none").exists()
 
 
@@ -216,42 +214,19 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
 
 
-def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., object]:
-    def turn(*arguments: object) -> object:
-        seen.append(1)
-        return inner(*arguments)
-
-    return turn
-
-
-def test_a_long_watch_goes_on_from_its_snapshot(watch, mission, plain, monkeypatch):
-    monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 16)
-    seen = list[int]()
-    monkeypatch.setattr(ExactFilter, "turn", counting(seen, ExactFilter.turn))
-    counts = ran(watch, CsvFeed(plain, watch.scenario), 18, 40, None)
-    assert len(seen) == 50 + (17 - 2) + (39 - 18)  # each once, and those behind what is settled
-    watch.store(counts, last=20, report=False)
-    run = uav_twin.open_run(watch.folder)
-    np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(30, 50))
-    np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[30:])
-    np.testing.assert_array_equal(run["smoothed"]["probability"].values, mission.smoothed[30:])
-
-
 def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
     monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 8)
     monkeypatch.setattr("twin_master.watch.teaching.CHECKED", 1)
     observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
     feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), watch.scenario)
-    file, counts, read = watch.folder / JOURNAL_NAME, [], list[int]()
+    file, counts = watch.folder / JOURNAL_NAME, []
     for turns in (60, 100, 196):  # as many turns behind the last snapshot
         ran(watch, feed, turns)
-        with monkeypatch.context() as patched:
-            patched.setattr("twin_master.mission.journal.whole_record", counting(read, whole_record))
+        with patch("twin_master.mission.journal.whole_record", wraps=whole_record) as read:
             watch.last_decision()
             ran(watch, feed, turns)
-        counts.append(len(read))
-        read.clear()
+        counts.append(read.call_count)
     assert counts[0] == counts[1] == counts[2] < 60
     lines = file.read_bytes().splitlines(keepends=True)
     file.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"turn": 2}', b'"turn": 1}'), *lines[4:]]))
@@ -407,11 +382,11 @@ def test_a_patch_is_believed_from_a_stated_turn_on(watch, mission, tmp_path):
     observed = mission.observed.copy()
     observed[20:, 4] *= 0.88
     feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, mission.control_index), watch.scenario)
-    patch = of_gauge(tmp_path / "patch.json", -0.12)
+    given = of_gauge(tmp_path / "patch.json", -0.12)
     ran(watch, feed, 40)
     with pytest.raises(MissionInputError, match="--from-turn names one of the 40 turns"):
-        watch.run(feed, str, patched=(patch, 41))
-    watch.run(feed, str, turns=45, patched=(patch, 20))
+        watch.run(feed, str, patched=(given, 41))
+    watch.run(feed, str, turns=45, patched=(given, 20))
     watch.store(ran(watch, feed), report=False)
     run = uav_twin.open_run(watch.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 20)
@@ -459,7 +434,9 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     assert [decision["turn"] for decision in decisions if decision.get("told_again")] == [29]
     assert [decision for decision in decisions if not decision.get("told_again")] == told
     run = uav_twin.open_run(folder)
-    np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[40:])
+    np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(40, 50))
+    for group in ("filtered", "smoothed"):
+        np.testing.assert_array_equal(run[group]["probability"].values, getattr(mission, group)[40:])
     assert last_line(folder) == last_line(whole)
 
 
