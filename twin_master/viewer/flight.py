@@ -95,25 +95,12 @@ class Flight:
         self.folder, self._path = folder, folder / JOURNAL_NAME
         self.scenario = kept_scenario(folder)
         self.number = 0
-        self._know()
         self._forget(0)
-
-    def _know(self) -> None:
-        """Read what the twin knows."""
-        self._known_at = self._knowledge_stamp()
-        self.knowledge = kept_knowledge(self.folder, self.scenario)
-        self.number += 1
-
-    def _knowledge_stamp(self) -> tuple[int, int] | None:
-        """Return what tells the file of what the twin knows from another that took its place."""
-        with suppress(FileNotFoundError):
-            found = (self.folder / KNOWLEDGE_NAME).stat()
-            return found.st_ino, found.st_mtime_ns
-        return None
 
     def _forget(self, file: int) -> None:
         """Begin with a file, by its number."""
         self._file, self._end = file, 0
+        self.knowledge = kept_knowledge(self.folder, self.scenario)
         self._places: list[list[int]] = []  # of belief and observation of each turn, in bytes
         self._told: defaultdict[int, list[Record]] = defaultdict(list)  # notices behind it, where none came
         self.pictures: list[Picture] = []
@@ -137,8 +124,6 @@ class Flight:
             The journal was changed.
         """
         number, end = self.number, self._end
-        if self._knowledge_stamp() != self._known_at:  # a patched model was adopted
-            self._know()
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             if self._begun_anew(found := os.fstat(file.fileno())):
                 self._forget(found.st_ino)
@@ -160,6 +145,8 @@ class Flight:
                 raise RunFolderError(said("watch.turn", folder=self.folder, told=told, turns=self.turns))
             self._places[-1][0] = self._places[late][1] = place
         self._told[turn] += [] if "filtered" in record else record.get("notices", [])
+        if "model" in record:  # another one was adopted
+            self.knowledge = kept_knowledge(self.folder, self.scenario)
         verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))
         picture = _picture(turn, self.folder / verdict) if verdict else None
         self.pictures += [picture] if picture else []

@@ -279,8 +279,8 @@ class Watch:
             **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
+        keep_knowledge(self.folder, outcome.model.knowledge)  # before viewers read the line
         self.write(model=model)
-        keep_knowledge(self.folder, outcome.model.knowledge)
         gaps = [
             f"{name.replace('_', ' ')} {value:.4g} before, {model['after'][name]:.4g} after"
             for name, value in model["before"].items()

@@ -188,6 +188,7 @@ def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown
     content = io.BytesIO()
     np.savez(content, **(arrays | {"predicted": 1.1 * arrays["predicted"]}))
     atomic_write_bytes(begun / KNOWLEDGE_NAME, content.getvalue())
+    add(begun, line_of({"turn": 49, "model": {}}))
     assert flight.update()
     assert flight.number > number
     np.testing.assert_allclose(of_turns(flight, 0, 5).expected.mean, 1.1 * before)
