@@ -17,6 +17,7 @@ from discrepancy.sentences import SENTENCES, said
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState
+from fmu_asset.errors import PatchFileError
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.structure_fmu import pack_wing
 from reporting.errors import FileNotWrittenError
@@ -210,6 +211,15 @@ def pack_patched(
     options |= {"activate": activate, "replace": replace, "progress": progress}
     pack_wing(choice.design, path, patch=effects, **options)
     return [f"effect.{effect.id}.active" for effect in effects.effects]
+
+
+def packed_beside(choice: ModelChoice, patch_file: Path, path: Path) -> str:
+    """Pack the FMU of a wing with the patch of a verdict, its effects off; return what to say of it."""
+    try:
+        switches = pack_patched(choice, files.read_patch(patch_file).upon(choice.built_in), path)
+    except PatchFileError as cause:
+        return f"There is no patched FMU: {cause}"
+    return f"{path.name} carries it, off until {', '.join(switches)} is set to 1."
 
 
 def _again(command: str, model: Path) -> str:

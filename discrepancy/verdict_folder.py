@@ -23,7 +23,7 @@ FMU_NAME = "patched.fmu"
 FIGURES = "figures"
 
 
-def check_folder(folder: Path, *, replace_it: bool) -> None:
+def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
     """Look at the place before the work begins; a verdict that a killed process had moved aside comes back.
 
     Raises
@@ -66,9 +66,9 @@ def write_verdict_folder(
     Raises
     ------
     FileNotWrittenError
-        As `check_folder`, or if the disk is full or the place not writable; the folder is as it was.
+        As `check_verdict_folder`, or if the disk is full or the place not writable; the folder is as it was.
     """
-    check_folder(folder, replace_it=replace_it)
+    check_verdict_folder(folder, replace_it=replace_it)
     with whole_folder(folder) as fresh:
         _write(fresh, content, report=report)
     return folder / REPORT_NAME if report else folder

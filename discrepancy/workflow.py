@@ -45,7 +45,7 @@ from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, reporter
 from reporting.words import be, brief, listing
 
 DRAWS = 400
@@ -139,7 +139,7 @@ def investigate(
         If the campaign cannot be compared with the model at all.
     """
     campaign, model = _given(campaign, model)
-    shown, seconds = progress or SilentProgress(), {}
+    shown, seconds = reporter(progress), {}
 
     @contextmanager
     def stage(description: str, key: str) -> Iterator[Tell]:

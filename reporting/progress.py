@@ -10,7 +10,7 @@ Library code takes a `Progress` and never asks what it is::
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # rich takes a while to import, and most code only names what it reports to
@@ -46,7 +46,17 @@ SilentProgress = Progress
 
 
 narrator: Callable[[], Progress] = SilentProgress
-"""Gives what `tell` tells: nothing but while a command runs."""
+"""Where work reports that was handed no `Progress`: nowhere but while a command runs."""
+
+
+def reporter(progress: Progress | None = None) -> Progress:
+    """Return the progress that was handed on, else that of the command that runs, else a silent one."""
+    return progress or narrator()
+
+
+def stage(description: str, total: int | None = None, unit: str = "") -> AbstractContextManager[Stage]:
+    """Open a stretch of work of the command that runs, see `Progress.stage`."""
+    return narrator().stage(description, total, unit)
 
 
 def tell(message: str) -> None:

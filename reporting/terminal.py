@@ -13,7 +13,7 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_origin
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,44 +35,43 @@ SHARED = {
     "no_report": "Draw no report and no figures.",
 }
 """What is said of the options of the commands that answer a question, and that draw a report."""
-_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 @functools.cache
-def told_by(package: str) -> Callable[[str], Callable[[_Function], _Function]]:
-    """Return what makes a function a command, by what `commands.toml` of a package tells of its parameters.
+def commands_of(package: str) -> dict[str, dict[str, Any]]:
+    """Return the tables of `commands.toml` of a package, by the words that call a command."""
+    return tomllib.loads(files(package).joinpath("commands.toml").read_text(encoding="utf-8"))
+
+
+def told(words: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function as a command, by what `commands.toml` of its package tells of its parameters.
 
     Parameters before `*` are arguments, the others options. A text is the help; a table holds what else Typer
     takes (`metavar`, `min`, `show_default`, ...), and as `flags` the name of an option that has another one
     than its parameter. What stands in `[shared]` holds for all commands that do not say otherwise.
     """
-    tables = tomllib.loads(files(package).joinpath("commands.toml").read_text(encoding="utf-8"))
+    tables = commands_of(function.__module__.partition(".")[0])
+    known = SHARED | tables["shared"] | tables.get(words, {})
 
-    def told(words: str) -> Callable[[_Function], _Function]:
-        known = SHARED | tables["shared"] | tables.get(words, {})
+    def described(parameter: inspect.Parameter) -> inspect.Parameter:
+        if parameter.name not in known:
+            return parameter
+        told = known[parameter.name]
+        given: dict[str, Any] = {"help": told} if isinstance(told, str) else dict(told)
+        if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
+            made = typer.Argument(**{"show_default": False} | given)
+        else:
+            made = typer.Option(given.pop("flags", "--" + parameter.name.replace("_", "-")), **given)
+        return parameter.replace(annotation=Annotated[parameter.annotation, made])
 
-        def described(parameter: inspect.Parameter) -> inspect.Parameter:
-            plain = parameter.annotation
-            if parameter.name not in known or get_origin(plain) is Annotated:
-                return parameter
-            told = known[parameter.name]
-            given = {"help": told} if isinstance(told, str) else dict(told)
-            if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
-                made = typer.Argument(**{"show_default": False} | given)
-            else:
-                flags = given.pop("flags", "--" + parameter.name.replace("_", "-"))
-                made = typer.Option(flags, **given)
-            return parameter.replace(annotation=Annotated[plain, made])
+    @functools.wraps(function)
+    def command(*arguments: Any, **options: Any) -> Any:
+        return function(*arguments, **options)
 
-        def command(function: _Function) -> _Function:
-            signature = inspect.signature(function)
-            parameters = [described(parameter) for parameter in signature.parameters.values()]
-            vars(function)["__signature__"] = signature.replace(parameters=parameters)
-            return function
-
-        return command
-
-    return told
+    signature = inspect.signature(function)
+    parameters = [described(parameter) for parameter in signature.parameters.values()]
+    vars(command)["__signature__"] = signature.replace(parameters=parameters)
+    return command
 
 
 @dataclass
@@ -185,7 +184,7 @@ def _extend(command: Any, options: Sequence[Any]) -> None:
 def _interruptible(call: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(call)
     def guarded(*arguments: Any, **options: Any) -> Any:
-        before, reporting.progress.narrator = reporting.progress.narrator, progress
+        before, reporting.progress.narrator = reporting.progress.narrator, functools.cache(progress)
         try:
             return call(*arguments, **options)
         except KeyboardInterrupt:

@@ -25,6 +25,7 @@ from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 from tests.kept import FE, ROOT, kept, packed, remove_old
+from tests.refusals import Inputs
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
@@ -341,44 +342,8 @@ def foreign_fmu(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return Workshop(tmp_path_factory.mktemp("foreign"))
 
 
-BEAM = """
-name = "beam"
-mesh = "beam.vtu"
-length_unit = "mm"
-set = [
-    { name = "root", of = "nodes", box = [[0, 0, 0], [0, 20, 10]] },
-    { name = "end", of = "nodes", box = [[100, 0, 0], [100, 20, 10]] },
-    { name = "inner", of = "cells", box = [[0, 0, 0], [25, 20, 10]] },
-    { name = "outer", of = "cells", box = [[50, 0, 0], [75, 20, 10]] },
-]
-parameter = [{ name = "e" }]
-control = [
-    { name = "load_factor", minimum = -4, maximum = 6 },
-    { name = "push", unit = "N", nominal = 50 },
-]
-support = [{ set = "root", hold = ["x", "y", "z"] }]
-load = [
-    { name = "weight", control = "load_factor", acceleration = [0, 0, -9.81] },
-    { name = "pushed", control = "push", set = "end", force = [0, 0, 1] },
-]
-damage = [{ name = "z1", set = "inner" }, { name = "z2", set = "outer" }]
-mass = [{ name = "pump", point = [80, 10, 10], mass = 0.05, free = true }]
-gauge = [
-    { name = "g1", point = [20, 10, 10], direction = [1, 0, 0] },
-    { name = "g2", point = [60, 10, 10], direction = [1, 0, 0], length = 5 },
-    { name = "g3", point = [60, 4, 10], direction = [1, 1, 0] },
-]
-displacement = [{ name = "tip", point = [100, 10, 5], direction = [0, 0, 1] }]
-acceleration = [{ name = "shake", point = [100, 10, 5], direction = [0, 0, 1] }]
-damping = { alpha = 5.0, beta = 2e-5 }
-
-[[material]]
-name = "alloy"
-density = 2700
-young_modulus = 7e10
-poisson_ratio = 0.33
-scaled_by = "e"
-"""
+INPUTS = Inputs(__file__)
+BEAM = INPUTS.text("beam.toml")
 
 
 @pytest.fixture(scope="session")

@@ -13,13 +13,10 @@ from twin_master.fleet.command import engine_of, fly_and_show
 from twin_master.sentences import said
 from twin_master.viewer.command import shown
 
-told = terminal.told_by("twin_master")
-
 if TYPE_CHECKING:
     from twin_master.store.writing import RunOutcome
 
 
-@told("run")
 def run(
     scenario: str | None = None,
     *,
@@ -197,5 +194,5 @@ def _is_ours(error: Exception) -> bool:
 def main() -> None:
     """Run `python -m twin_master`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    application.command()(run)
+    application.command()(terminal.told("run", run))
     guarded(lambda: terminal.with_common_options(application)(prog_name="python -m twin_master"))

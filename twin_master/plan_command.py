@@ -10,8 +10,6 @@ from reporting import terminal
 from twin_master.errors import MissionInputError
 from twin_master.sentences import said
 
-told = terminal.told_by("twin_master")
-
 if TYPE_CHECKING:
     import numpy as np
     from matplotlib.figure import Figure
@@ -25,7 +23,6 @@ if TYPE_CHECKING:
     Float = NDArray[np.float64]
 
 
-@told("plan")
 def plan(
     scenario: str,
     *,
@@ -157,7 +154,6 @@ def _show(record: Mapping[str, Any], rows: "list[ComparedPolicy]") -> None:
         terminal.say(f"{value['of']} is worth {value['mean']:.3g} ± {value['half_width']:.2g} (95 %).")
 
 
-@told("design")
 def design(
     scenario: str,
     *,

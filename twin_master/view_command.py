@@ -5,12 +5,7 @@ from pathlib import Path
 
 import typer
 
-from reporting import terminal
 
-told = terminal.told_by("twin_master")
-
-
-@told("view")
 def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
     """Show a flight in the browser, turn by turn or while it goes on, or a whole fleet."""
     from twin_master.fleet.view import is_fleet, serve_fleet

@@ -15,14 +15,11 @@ import typer
 from reporting import terminal
 from twin_master.viewer.command import shown
 
-told = terminal.told_by("twin_master")
-
 if TYPE_CHECKING:
     from twin_master.scenario.schema import Scenario
     from twin_master.watch.folder import Watch
 
 
-@told("watch")
 def watch(
     scenario: str | None = None,
     *,

@@ -1,21 +1,23 @@
-"""`uav-twin calibrate`, all three steps of a wing in order, and `calibrate campaign`: any model."""
+"""`uav-twin calibrate`, all three steps of a wing in order, and `ringdown`, `simulate` and `campaign`."""
 
+import csv
+import io
+import json as json_text
+from contextlib import nullcontext
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import typer
 
+from fe.runtime.state import DigitalState
 from reporting import terminal
-from uav_twin.calibrate_laboratory import calibrate_ringdown, calibrate_simulate
-from uav_twin.options import refuse_before, show, told
+from reporting.files import atomic_write_text, refuse_filled
+from uav_twin import parts
+from uav_twin.discrepancy_run import one_thread
+from uav_twin.options import show
 
-if TYPE_CHECKING:
-    from calibration.result.record import Calibration
 
-
-@told("calibrate campaign")
 def calibrate_campaign(
     campaign: Path,
     *,
@@ -28,27 +30,18 @@ def calibrate_campaign(
     no_report: bool = False,
 ) -> None:
     """Posterior of the parameters of any model, an FMU or a structure too, from a campaign."""
-    from calibration.result.file import check_folder
-    from calibration.result.folder import write_calibration_folder
-    from calibration.result.record import check_name
-    from discrepancy.campaign.reading import read_campaign
-    from discrepancy.model_choice import choose_model
-    from discrepancy.parameters.calibration import calibrate_parameters
-    from uav_twin.discrepancy_run import one_thread
-
     one_thread()
-    data = read_campaign(campaign)
-    name = check_name(data.name if asset is None else asset)
+    data = parts.read_campaign(campaign)
+    name = parts.check_name(data.name if asset is None else asset)
     if out is not None:
-        check_folder(out, name, wing=False)
-    progress = terminal.progress()
-    choice = choose_model(model, progress)
-    result = calibrate_parameters(data, choice, asset=name, samples=samples, seed=seed, progress=progress)
-    written = None if out is None else write_calibration_folder(result, out, progress, report=not no_report)
+        parts.check_folder(out, name, wing=False)
+    chosen = parts.choose_model(model)
+    result = parts.calibrate_parameters(data, chosen, asset=name, samples=samples, seed=seed)
+    written = None if out is None else parts.write_calibration_folder(result, out, report=not no_report)
     conclude(result, written, json=json, report=not no_report)
 
 
-def conclude(result: "Calibration", written: Path | None, *, json: bool, report: bool) -> None:
+def conclude(result: "parts.Calibration", written: Path | None, *, json: bool, report: bool) -> None:
     """Say what a calibration found, and where it was written."""
     if json:
         terminal.print_json({"calibration": None if written is None else str(written)} | _record(result))
@@ -57,25 +50,17 @@ def conclude(result: "Calibration", written: Path | None, *, json: bool, report:
 
     headline, correlations = text.headline(result), text.correlation_lines(result)
     show("calibration", words=text.WORDS, result=result, headline=headline, correlations=correlations)
-    if written is None:
-        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
-        return
-    terminal.say(f"Calibration: {written}")
-    if report:
-        from calibration.result.folder import REPORT_NAME
-
-        terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
+    show("calibration", written=written, report=report and written and written.with_name(parts.REPORT_NAME))
 
 
-def _record(result: "Calibration") -> dict[str, Any]:
+def _record(result: "parts.Calibration") -> dict[str, Any]:
     """Return the calibration as plain data."""
-    from reporting.record_json import plain
 
     def posterior(name: str) -> dict[str, Any]:
         return {
             "posterior_mean": result.mean(name),
             "posterior_deviation": result.standard_deviation(name),
-            "interval_90": list(result.interval(name)),
+            "interval_90": result.interval(name),
         }
 
     return {
@@ -90,30 +75,21 @@ def _record(result: "Calibration") -> dict[str, Any]:
             for prior in result.priors
         ],
         "quantities": [asdict(figure) | posterior(figure.name) for figure in result.quantities],
-        "correlation": result.correlation.tolist(),
+        "correlation": result.correlation,
         "information_nat": result.information,
-        "readings": plain(result.readings),
-        "channels": plain(result.channels),
-        "findings": list(result.findings),
+        "readings": result.readings,
+        "channels": result.channels,
+        "findings": result.findings,
     }
 
 
-class ProcedureName(StrEnum):
-    """Whose samples are kept."""
-
-    joint = "joint"
-    paper = "paper"
-
-
-@told("calibrate")
 def calibrate_wing(
-    context: typer.Context,
     *,
     data: Path | None = None,
     out: Path | None = None,
     seed: int = 0,
     asset: str | None = None,
-    procedure: ProcedureName = ProcedureName.joint,
+    procedure: Literal["joint", "paper"] = "joint",
     design: Path | None = None,
     measured: bool | None = None,
     fitted: bool = False,
@@ -125,41 +101,121 @@ def calibrate_wing(
     A lab folder may hold one step alone; the sub-commands fit ring-downs, make a lab folder of a virtual
     wing, and calibrate any model from a campaign.
     """
-    if context.invoked_subcommand is not None:
-        refuse_before(context)
-        return
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
-    from calibration.dynamics.trials import Frequencies
-    from calibration.paper.table_1 import WORDS
-    from calibration.result.file import check_folder
-    from calibration.wing.calibrate import calibrate, write_wing_folder
-    from calibration.wing.lab_data import Targets, published_data, read_lab_folder
-    from fe.wing.design import load_design
-
-    drawn = load_design(design)
+    drawn = parts.load_design(design)
     name = drawn.name if asset is None else asset
     if out is not None:
-        check_folder(out, name, wing=True)
-    targets: Targets | None = None if measured is None else "measured" if measured else "published"
-    frequencies = Frequencies.FITTED if fitted else Frequencies.PEAKS
-    lab = published_data() if data is None else read_lab_folder(data, targets, frequencies)
+        parts.check_folder(out, name, wing=True)
+    targets: Literal["measured", "published"] = "measured" if measured else "published"
+    frequencies = parts.Frequencies.FITTED if fitted else parts.Frequencies.PEAKS
+    if data is None:
+        lab = parts.published_data()
+    else:
+        lab = parts.read_lab_folder(data, None if measured is None else targets, frequencies)
     if not json:
         for origin in lab.origins:
             terminal.say(f"Step {origin.step}: {origin.text}.")
-    progress = terminal.progress()
-    calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
+    calibration = parts.calibrate(lab, drawn, asset=name, procedure=procedure, seed=seed)
     if not json:
+        from calibration.paper.table_1 import WORDS
+
         columns, rows = WORDS.table("table_1", calibration.table_1)
         terminal.print_table([column.name for column in columns], rows)
-    written = None if out is None else write_wing_folder(calibration, out, progress, report=not no_report)
+    written = None if out is None else parts.write_wing_folder(calibration, out, report=not no_report)
     conclude(calibration.result, written, json=json, report=not no_report)
 
 
-calibrate_app = typer.Typer(no_args_is_help=False)
-calibrate_app.callback(invoke_without_command=True)(calibrate_wing)
-calibrate_app.command("ringdown")(calibrate_ringdown)
-calibrate_app.command("simulate")(calibrate_simulate)
-calibrate_app.command("campaign")(calibrate_campaign)
+def calibrate_ringdown(
+    *,
+    data: Path,
+    out: Path | None = None,
+    fitted: bool = False,
+    extremes: bool = False,
+    start: float | None = None,
+) -> None:
+    """Natural frequencies and damping ratios of two modes from ring-down records."""
+    procedure = parts.Frequencies.FITTED if fitted else parts.Frequencies.PEAKS
+    start = parts.FIRST_PEAK if start is None else start
+    trials = parts.fit_trials(parts.read_records(data), procedure, start=start)
+    if extremes:
+        trials = parts.refine_by_extremes(trials)
+    frequencies, ratios = parts.PUBLISHED_FREQUENCIES, parts.PUBLISHED_DAMPING_RATIOS
+    rows = [
+        row
+        for mode in (0, 1)
+        for row in (
+            (
+                f"mode {mode + 1}, natural frequency",
+                "Hz",
+                *trials.average("frequency", mode),
+                frequencies[mode],
+            ),
+            (f"mode {mode + 1}, damping ratio", "1", *trials.average("damping_ratio", mode), ratios[mode]),
+        )
+    ]
+    headings = ("figure", "unit", "found", "between trials", "standard error", "paper")
+    printed, written = (
+        [(what, unit, *(format(value, digits) for value in values)) for what, unit, *values in rows]
+        for digits in (".5g", ".10g")
+    )
+    terminal.print_table(headings, printed)
+    if out is not None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows((headings, *written))
+        atomic_write_text(out / "ringdown.csv", text.getvalue())
+        parts.save_figure(parts.ring_down_figure(trials), out / "figures", "ringdown")
+
+
+TRUTH_FILE = "truth.json"
+
+
+def calibrate_simulate(
+    *,
+    out: Path,
+    e: float = 1.0073,
+    servo_mass: float = 0.169,
+    pitot_mass: float = 0.134,
+    alpha: float = 1.03,
+    beta: float = 0.000766,
+    seed: int = 0,
+    fmu: Path | None = None,
+    design: Path | None = None,
+    sampling_rate: float = 2000.0,
+    noise: float = 0.0001,
+    quantisation: float | None = None,
+    frequency_error: tuple[float, float] = (0.0, 0.0),
+) -> None:
+    """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it."""
+    if fmu is not None and frequency_error != (0.0, 0.0):
+        raise typer.BadParameter("--frequency-error needs the reduced model; an FMU has its own frequencies.")
+    if fmu is not None and design is not None:
+        raise typer.BadParameter("--fmu and --design exclude each other: the FMU holds its wing.")
+    refuse_filled(out)
+    drawn = parts.load_design(design)
+    state: dict[str, Any] = dict(zip(parts.STATE, (e, servo_mass, pitot_mass, alpha, beta), strict=True))
+    truth = DigitalState(drawn.geometry, **state)
+    if fmu is not None:
+        opened: Any = parts.FmuTestBench(fmu, truth)
+    else:
+        opened = nullcontext(parts.VirtualWing(parts.reduced_model(drawn), truth, frequency_error))
+    with opened as bench:
+        recorder: Any = {"sampling_rate": sampling_rate, "noise": noise, "quantisation": quantisation}
+        designed = None if design is None else drawn.geometry
+        parts.write_lab_folder(
+            out,
+            load_test=parts.measure_load_test(bench, seed),
+            records=parts.measure_ring_down(bench, seed, **recorder),
+            lengths=parts.measure_lengths(truth.geometry, seed, designed=designed),
+            total_mass=parts.weigh(truth, seed),
+        )
+    known = asdict(drawn.geometry) | {
+        **state,
+        "frequency_error": list(frequency_error),
+        "seed": seed,
+        "bench": "reduced model" if fmu is None else fmu.name,
+    }
+    atomic_write_text(out / TRUTH_FILE, json_text.dumps(known, indent=2) + "\n")
+    terminal.say(f"Laboratory folder: {out}; its truth: {out / TRUTH_FILE}")

@@ -1,32 +1,16 @@
-"""The command line `uav-twin`."""
+"""The command line `uav-twin`: the commands of `commands.toml`, and how it ends."""
 
-from typing import Annotated
+import inspect
+from collections.abc import Callable
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
 
 from discrepancy.errors import DiscrepancyError
 from reporting import terminal
 from twin_master.command import guarded
-from twin_master.command import run as run_command
-from twin_master.fleet.command import compare, fleet_app
-from twin_master.plan_command import design as design_command
-from twin_master.plan_command import plan as plan_command
-from twin_master.view_command import view as view_command
-from twin_master.watch_command import watch as watch_command
-from uav_twin.calibrate_commands import calibrate_app
-from uav_twin.discrepancy import discrepancy_app
-from uav_twin.fmu import fmu_app
-from uav_twin.library import library_app
-from uav_twin.scenarios import list_scenarios, scenario_app
-from uav_twin.ssp import ssp_app
-from uav_twin.structure import structure_app
-from uav_twin.wing import wing_app
-
-app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="A digital twin of a structure that loses stiffness: a wing, a mesh of yours, or any FMU.",
-)
+from uav_twin.sentences import said
 
 
 def _version(asked: bool) -> None:
@@ -37,8 +21,31 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
-def uav_twin(
+def _application() -> typer.Typer:
+    """Return the command line that `commands.toml` lists."""
+    whole = typer.Typer(
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        help="A digital twin of a structure that loses stiffness: a wing, a mesh of yours, or any FMU.",
+    )
+    whole.callback()(_uav_twin)
+    groups = {"": whole}
+    for words, table in terminal.commands_of("uav_twin").items():
+        if "group" in table:
+            groups[words] = typer.Typer(no_args_is_help="function" not in table, help=table["group"])
+            whole.add_typer(groups[words], name=words)
+        if "function" in table:
+            module, _, name = table["function"].partition(":")
+            function = terminal.told(words, getattr(import_module(module), name))
+            group, _, last = words.rpartition(" ")
+            if words in groups:
+                groups[words].callback(invoke_without_command=True)(_alone(function))
+            else:
+                groups[group].command(last)(function)
+    return whole
+
+
+def _uav_twin(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
@@ -46,24 +53,24 @@ def uav_twin(
     """Take what belongs to no command."""
 
 
-app.command("run")(run_command)
-app.command("plan")(plan_command)
-app.command("design")(design_command)
-app.command("view")(view_command)
-app.command("watch")(watch_command)
-app.command("compare")(compare)
-app.command("scenarios")(list_scenarios)
-app.add_typer(scenario_app, name="scenario", help="Check a scenario before it is flown.")
-app.add_typer(wing_app, name="wing", help="Say what a wing weighs and how it vibrates; verify its model.")
-app.add_typer(
-    calibrate_app, name="calibrate", help="Tailor the model to one wing: all steps in order, or one of them."
-)
-app.add_typer(discrepancy_app, name="discrepancy")
-app.add_typer(fleet_app, name="fleet")
-app.add_typer(fmu_app, name="fmu")
-app.add_typer(library_app, name="library")
-app.add_typer(ssp_app, name="ssp")
-app.add_typer(structure_app, name="structure")
+def _alone(function: Callable[..., None]) -> Callable[..., None]:
+    """Return the command of a group's own name; its options do not stand before a command of the group."""
+
+    def alone(context: typer.Context, **given: Any) -> None:
+        if context.invoked_subcommand is None:
+            function(**given)
+            return
+        sources = map(context.get_parameter_source, context.params)
+        if any(source is not None and source.name == "COMMANDLINE" for source in sources):
+            raise typer.BadParameter(said("options.before", context=context))
+
+    alone.__doc__ = function.__doc__
+    own, signature = inspect.signature(alone).parameters["context"], inspect.signature(function)
+    vars(alone)["__signature__"] = signature.replace(parameters=[own, *signature.parameters.values()])
+    return alone
+
+
+app = _application()
 
 
 def main() -> None:

@@ -1,43 +1,28 @@
-"""`uav-twin discrepancy effects` and `example`: the catalogue, and a campaign to try."""
+"""`uav-twin discrepancy effects`, `example`, `convert` and `apply`: the catalogue at work."""
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from discrepancy.errors import CatalogueError
 from reporting import terminal
 from reporting.files import refuse_filled
 from reporting.words import counted
-from uav_twin.options import told
+from uav_twin import parts
+from uav_twin.options import show as print_record
 from uav_twin.sentences import said
 
-if TYPE_CHECKING:
-    from discrepancy.campaign.records import Campaign
-    from discrepancy.catalogue.entry import Effect
-    from discrepancy.models.interface import Model
-    from discrepancy.sources.examples import ExamplePlan
-    from fe.runtime.patch import ModelPatch
 
-
-@told("discrepancy effects")
 def effects(*, show: str | None = None, add: list[Path] | None = None) -> None:
     """List the effects that can be named."""
-    from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
-    from discrepancy.report.text import formula
-
-    catalogue = load_catalogue(add or ())
-    if show is not None:
-        _show(effect_by_identifier(show, catalogue))
-        return
-    rows = [(effect.identifier, effect.name, effect.family, formula(effect.equation)) for effect in catalogue]
-    terminal.print_table(("id", "name", "family", "equation"), rows)
-    terminal.say(f"{counted(len(catalogue), 'effect')}; --show ID tells everything about one.")
+    catalogue = parts.load_catalogue(add or ())
+    if show is None:
+        print_record("effects", effects=catalogue, formula=parts.formula)
+    else:
+        _show(parts.effect_by_identifier(show, catalogue))
 
 
-def _show(effect: "Effect") -> None:
+def _show(effect: "parts.Effect") -> None:
     from rich.table import Table
-
-    from discrepancy.report.text import formula, unit_text
 
     facts = Table(box=None, show_header=False)
     facts.add_column(no_wrap=True)
@@ -46,70 +31,46 @@ def _show(effect: "Effect") -> None:
         ("id", effect.identifier),
         ("name", effect.name),
         ("family", effect.family),
-        ("equation", formula(effect.equation)),
-        ("signature", formula(effect.signature)),
+        ("equation", parts.formula(effect.equation)),
+        ("signature", parts.formula(effect.signature)),
         ("acts on", ", ".join(sorted(kind.value for kind in effect.acts_on))),
         ("confusable with", ", ".join(effect.confusable) or "nothing in general"),
         ("reference", effect.reference),
     ):
         facts.add_row(name, value)
     terminal.console().print(facts)
-    rows = []
-    for item in effect.parameters:
-        prior = f"{item.prior.low:g} to {item.prior.high:g}, {item.prior.shape.replace('_', '-')}"
-        rows.append((item.name, item.symbol, prior, unit_text(item.unit), item.description))
-    for shape in effect.shape:
-        freed = f"{shape.canonical:g}; freed: {shape.prior.low:g} to {shape.prior.high:g}"
-        rows.append((shape.name, shape.symbol, freed, "", shape.description))
-    headings = ("parameter", "symbol", "prior (90 %)", "unit", "meaning")
-    terminal.print_table(headings, rows)
+    print_record("effect", effect=effect, unit_text=parts.unit_text)
 
 
-@told("discrepancy example")
 def example(
     kind: str, out: Path, *, model: str | None = None, seed: int = 0, effect: list[str] | None = None
 ) -> None:
     """Write a simulated campaign, with an effect hidden in it if asked for."""
-    from discrepancy.model_choice import choose_model
-    from discrepancy.sources.examples import plan_of, write_example
-    from fe.runtime.patch import ModelPatch
-
     refuse_filled(out, "folder")
-    choice = choose_model(model, terminal.progress())
-    plan = plan_of(choice.model)
-    patch = ModelPatch()
+    chosen = parts.choose_model(model).model
+    plan, patch = parts.plan_of(chosen), parts.ModelPatch()
     if effect:
-        bare = _bare(choice.model, kind, seed, plan)
+        bare = parts.example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # said by itself
         for text in effect:
-            patch = patch + _hidden(text, choice.model, bare)
-    campaign = write_example(choice.model, out, kind, seed, plan, patch)  # type: ignore[arg-type]
+            patch = patch + _hidden(text, chosen, bare)
+    campaign = parts.write_example(chosen, out, kind, seed, plan, patch)  # type: ignore[arg-type]
     hidden = ", ".join(effect) if effect else "nothing"
-    named = "" if model is None else f" --model {shlex.quote(model)}"
-    terminal.say(
-        f"Wrote {out}: {counted(len(campaign.trials), 'trial')}, "
-        f"{counted(len(campaign.channels), 'channel')}; hidden: {hidden}."
-    )
-    terminal.say(f"Next: uav-twin discrepancy check {shlex.quote(str(out))}{named}")
-    terminal.say(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
+    print_record("example", out=out, campaign=campaign, hidden=hidden, given=words_of(out, model))
 
 
-def _bare(model: "Model", kind: str, seed: int, plan: "ExamplePlan") -> "Campaign":
-    from discrepancy.sources.examples import example_campaign
+def words_of(campaign: Path, model: str | None) -> str:
+    """Return a campaign and its model as a further command takes them."""
+    return shlex.join([str(campaign), *([] if model is None else ["--model", model])])
 
-    return example_campaign(model, kind, seed, plan)  # type: ignore[arg-type]
 
-
-def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
+def _hidden(text: str, model: "parts.Model", campaign: "parts.Campaign") -> "parts.ModelPatch":
     """Return the patch of ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,..; raises `CatalogueError`."""
-    from discrepancy.catalogue.entry import Setting
-    from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
-
     head, named, numbers = text.partition(":")
     if not named:
         head, _, numbers = text.partition("=")
     identifier, at, place = head.partition("@")
-    found = effect_by_identifier(identifier, load_catalogue())
-    setting = Setting(campaign, model, model.scales(campaign))
+    found = parts.effect_by_identifier(identifier, parts.load_catalogue())
+    setting = parts.Setting(campaign, model, model.scales(campaign))
     reason = found.unavailable(setting)
     if reason is not None:
         raise CatalogueError(f"{identifier} cannot be hidden in this example: {reason}")
@@ -126,13 +87,13 @@ def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
     return found.patch(setting, values, place if at else places[0])
 
 
-def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> dict[str, float]:
-    """Return the values that `parts` give, "VALUE" in the order of `names` or "NAME=VALUE"."""
-    if len(parts) > len(names):
-        both = {"has": counted(len(names), "parameter"), "came": counted(len(parts), "value")}
+def _values(text: str, identifier: str, given: list[str], names: list[str]) -> dict[str, float]:
+    """Return the values that are given, "VALUE" in the order of `names` or "NAME=VALUE"."""
+    if len(given) > len(names):
+        both = {"has": counted(len(names), "parameter"), "came": counted(len(given), "value")}
         raise CatalogueError(said("effects.count", identifier=identifier, names=names, **both))
     values = {}
-    for position, part in enumerate(parts):
+    for position, part in enumerate(given):
         name, equals, number = part.rpartition("=")
         if equals and name not in names:
             raise CatalogueError(f"{identifier} has no parameter {name!r}; it has {', '.join(names)}.")
@@ -144,17 +105,18 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
     return values
 
 
-@told("discrepancy convert")
 def convert(out: Path, *, data: Path, rig: str = "real_wing") -> None:
     """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""
-    from discrepancy.campaign.reading import read_campaign
-    from discrepancy.sources.measured_rigs import THE_WING, write_rig_campaign, write_wing_campaign
+    modelled = rig != parts.THE_WING
+    if modelled:
+        campaign = parts.read_campaign(parts.write_rig_campaign(rig, data, out))
+    else:
+        campaign = parts.write_wing_campaign(data, out)
+    print_record("convert", campaign=campaign, out=out, modelled=modelled)
 
-    if rig != THE_WING:
-        made = read_campaign(write_rig_campaign(rig, data, out))
-        terminal.say(
-            f"{made.name}: {counted(len(made.trials), 'trial')} in {out}, its model in {out / 'model.toml'}"
-        )
-        return
-    campaign = write_wing_campaign(data, out)
-    terminal.say(f"{campaign.name}: {counted(len(campaign.trials), 'trial')} in {out}")
+
+def apply(
+    verdict: Path, *, out: Path | None = None, member: str | None = None, replace: bool = False
+) -> None:
+    """Write the model with the effect that was found and the parameters beside it."""
+    print_record("apply", done=parts.apply_verdict(verdict, out, member=member, replace=replace))

@@ -2,57 +2,41 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import typer
+from typing import Any
 
 from reporting import terminal
-from uav_twin.options import show, told
-
-if TYPE_CHECKING:
-    from discrepancy.campaign.records import Campaign
-    from discrepancy.checks.fault import DataFault
-    from discrepancy.judgement.separability import Separability
+from reporting.progress import stage
+from uav_twin import parts
+from uav_twin.options import refused, show
 
 
-@told("discrepancy check")
 def check(
     campaign: Path, *, model: str | None = None, effects: list[Path] | None = None, json: bool = False
 ) -> None:
     """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""
-    from discrepancy.campaign.reading import read_campaign
-    from discrepancy.catalogue.entry import Setting
-    from discrepancy.catalogue.library import load_catalogue
-    from discrepancy.judgement.separability import separability
-    from discrepancy.model_choice import choose_model
-    from discrepancy.report.check_tables import group_lines, needs, neighbours, seen_of
-    from discrepancy.report.text import WORDS
-    from discrepancy.workflow import checked
-
-    data = read_campaign(campaign)
-    catalogue = load_catalogue(effects or ())
-    progress = terminal.progress()
-    choice = choose_model(model, progress)
-    data, faults = checked(data, choice.model)
+    data, catalogue = parts.read_campaign(campaign), parts.load_catalogue(effects or ())
+    chosen = parts.choose_model(model).model
+    data, faults = parts.checked(data, chosen)
     able = None
     if not any(fault.fatal for fault in faults):
-        with progress.stage("What this campaign can decide"):
-            able = separability(
-                data, choice.model, Setting(data, choice.model, choice.model.scales(data)), catalogue
-            )
+        with stage("What this campaign can decide"):
+            setting = parts.Setting(data, chosen, chosen.scales(data))
+            able = parts.separability(data, chosen, setting, catalogue)
     if json:
-        terminal.print_json(_record(data, choice.model.name, faults, able))
+        terminal.print_json(_record(data, chosen.name, faults, able))
     else:
-        of_able = {item.__name__: item for item in (seen_of, neighbours, group_lines, needs)}
-        given = {"data": data, "model": choice.model, "faults": faults, "catalogue": catalogue}
-        show("check", words=WORDS, able=able, **given, **of_able)
+        from discrepancy.report.text import WORDS
+
+        of_able = (parts.seen_of, parts.neighbours, parts.group_lines, parts.needs)
+        given: dict[str, Any] = {item.__name__: item for item in of_able}
+        given |= {"data": data, "model": chosen, "faults": faults, "catalogue": catalogue}
+        show("check", words=WORDS, able=able, **given)
     if able is None:
-        typer.secho("Mend the faults first: conclusions from these data would be wrong.", fg="red", err=True)
-        raise typer.Exit(1)
+        raise refused("Mend the faults first: conclusions from these data would be wrong.")
 
 
 def _record(
-    data: "Campaign", model: str, faults: "Sequence[DataFault]", able: "Separability | None"
+    data: "parts.Campaign", model: str, faults: "Sequence[parts.DataFault]", able: "parts.Separability | None"
 ) -> dict[str, Any]:
     """Return faults and what the campaign can decide as plain data; a size that is never seen is null."""
     return {

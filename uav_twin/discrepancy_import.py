@@ -1,24 +1,19 @@
 """`uav-twin discrepancy import`: a laboratory's files become a campaign."""
 
 import re
-import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 
 from discrepancy.errors import CampaignFileError
 from reporting import terminal
 from reporting.files import refuse_filled
-from reporting.words import counted
-from uav_twin.options import told
-
-if TYPE_CHECKING:
-    from discrepancy.campaign.importing import Understanding
+from uav_twin import parts
+from uav_twin.discrepancy_catalogue import words_of
+from uav_twin.options import show
 
 
-@told("discrepancy import")
 def import_files(
     files: list[Path],
     *,
@@ -34,25 +29,19 @@ def import_files(
     model: str | None = None,
 ) -> None:
     """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say."""
-    from discrepancy.campaign.importing import OF_COLUMNS, OF_FILES, Understanding
-    from discrepancy.campaign.sheet import read_sheet
-    from discrepancy.campaign.writing import write_campaign
-
     folder = out or Path(files[0].stem)
     refuse_filled(folder)
     given = (column, unit, quantity, kind, release, load_place, decimal)
     answers = {
         option: {about: value for about, _, value in (item.rpartition("=") for item in said or ())}
-        for option, said in zip((*OF_COLUMNS, *OF_FILES), given, strict=True)
+        for option, said in zip((*parts.OF_COLUMNS, *parts.OF_FILES), given, strict=True)
     }
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
-    found = Understanding([*map(read_sheet, files)], answers)
+    found = parts.Understanding([*map(parts.read_sheet, files)], answers)
     if model is not None:
-        from discrepancy.model_choice import choose_model
-
-        output_quantity = choose_model(model, terminal.progress()).model.output_quantity
-        found = Understanding(found.sheets, answers, output_quantity)
+        known = parts.choose_model(model).model.output_quantity
+        found = parts.Understanding(found.sheets, answers, known)
     _show(found)
     asked = sys.stdin.isatty() and sys.stdout.isatty()
     if asked and found.questions:
@@ -63,15 +52,11 @@ def import_files(
     if asked and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
         raise typer.Exit(1)
-    write_campaign(campaign, folder, si=True)
-    size = f"{counted(len(campaign.trials), 'trial')}, {counted(len(campaign.channels), 'channel')}"
-    terminal.say(f"Wrote {folder}: {size}.")
-    terminal.say(f"Say in {folder / 'campaign.toml'} how well gains and zeros are known; now they are exact.")
-    named = "" if model is None else f" --model {shlex.quote(model)}"
-    terminal.say(f"Next: uav-twin discrepancy check {shlex.quote(str(folder))}{named}")
+    parts.write_campaign(campaign, folder, si=True)
+    show("import", folder=folder, campaign=campaign, given=words_of(folder, model))
 
 
-def _asked(found: "Understanding") -> "Understanding":
+def _asked(found: "parts.Understanding") -> "parts.Understanding":
     """Return what is understood with one answer more; one that does not fit is told, and changes nothing."""
     (option, expected), (about, *_) = next(iter(found.questions.items()))
     said = typer.prompt(f"{about}, {option} ({expected})" if about else f"{option} ({expected})")
@@ -82,11 +67,7 @@ def _asked(found: "Understanding") -> "Understanding":
         return found
 
 
-def _show(found: "Understanding") -> None:
-    for sheet in found.sheets:
-        mark = {".": "points", ",": "commas"}.get(found.decimals[sheet.name], "?")
-        kind = found.kinds[sheet.name] or "?"
-        terminal.say(f"{sheet.name}: {kind}; {sheet.remark}; decimal {mark}")
+def _show(found: "parts.Understanding") -> None:
     rows = []
     for item in found.columns:
         cells = item.sheet.columns[item.sheet.heads.index(item.head)]
@@ -95,5 +76,4 @@ def _show(found: "Understanding") -> None:
         value = f"{float(si):.6g} {item.si}" if si else ""
         known = (item.unit or "?", item.role or "?", item.quantity or "")
         rows.append((item.sheet.name, item.head, *known, cells[told], value))
-    headings = ("file", "column", "unit", "is", "quantity", "a cell", "in SI")
-    terminal.print_table(headings, rows)
+    show("understood", found=found, rows=rows)

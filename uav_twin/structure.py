@@ -6,7 +6,7 @@ from dataclasses import asdict
 from math import inf, nan
 from os.path import relpath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import typer
 
@@ -14,24 +14,15 @@ from fe.runtime.errors import DesignFileError
 from reporting import terminal
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text, refuse_existing, refuse_filled
-from reporting.toml_file import read_toml
+from reporting.progress import stage
 from scenarios import structure_files
-from uav_twin.options import say_packed, show, told
+from uav_twin import parts
+from uav_twin.options import answer, show
 from uav_twin.sentences import said
-from uav_twin.wing import Check, end_with, print_checks
-
-if TYPE_CHECKING:
-    from fe.runtime.reduced import ReducedModel
-    from fe.structure.affine import AffineStructure
-    from fe.structure.operators import Structure
+from uav_twin.wing import end_with
 
 RESPONSE_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-6
 """Largest differences to CalculiX, each relative to the largest of its kind."""
-
-structure_app = typer.Typer(
-    no_args_is_help=True,
-    help="Look at a structure from a mesh or matrices, verify it against CalculiX, reduce it, pack it.",
-)
 
 
 def located(file: Path) -> Path:
@@ -41,9 +32,7 @@ def located(file: Path) -> Path:
 
 def names_structure(design: Path) -> bool:
     """Return whether a design is that of a structure, and not of a wing."""
-    from fe.structure.design import is_structure
-
-    return is_structure(read_toml(located(design), DesignFileError, what="wing design"))
+    return parts.is_structure(parts.read_toml(located(design), DesignFileError, what="wing design"))
 
 
 def in_bytes(gibibytes: float | None) -> float | None:
@@ -51,73 +40,39 @@ def in_bytes(gibibytes: float | None) -> float | None:
     return None if gibibytes is None else 2.0**30 * gibibytes
 
 
-def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
+def assembled(
+    file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False
+) -> "parts.Structure":
     """Return the full model of a mesh."""
-    from fe.structure.operators import load_and_assemble
+    with stage("Reading the mesh and assembling"):
+        limit = in_bytes(memory_limit)
+        return parts.load_and_assemble(located(file), limit, mass_as_stiffness=mass_as_stiffness)
 
-    with terminal.progress().stage("Reading the mesh and assembling"):
-        return load_and_assemble(located(file), in_bytes(memory_limit), mass_as_stiffness=mass_as_stiffness)
 
-
-def assembled_of_any(file: Path, memory_limit: float | None) -> "AffineStructure":
+def assembled_of_any(file: Path, memory_limit: float | None) -> "parts.AffineStructure":
     """Return the full model of a mesh or of matrices."""
-    from fe.structure.operators import assemble_structure
-
-    with terminal.progress().stage("Reading and assembling"):
-        return assemble_structure(located(file), in_bytes(memory_limit))
+    with stage("Reading and assembling"):
+        return parts.assemble_structure(located(file), in_bytes(memory_limit))
 
 
-def reduced(file: Path, memory_limit: float | None) -> "ReducedModel":
-    """Return the reduced model, from the cache where it is there."""
-    from fe.reduction.model_cache import reduced_structure
-
-    return reduced_structure(located(file), progress=terminal.progress(), memory_limit=in_bytes(memory_limit))
-
-
-@structure_app.command("info")
-@told("structure info")
 def info(file: Path, *, modes: int = 6, memory_limit: float | None = None, json: bool = False) -> None:
     """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""
     structure = assembled_of_any(file, memory_limit)
-    with terminal.progress().stage("Solving the loads and the modes"):
+    with stage("Solving the loads and the modes"):
         record = structure_record(structure, modes)
-    if json:
-        terminal.print_json(record)
-        return
-    show("structure info", record=record)
-    for load in record["loads"]:
-        outputs = [
-            (what, name, f"{scale * value:.6g}", unit)
-            for what, key, scale, unit in (
-                ("gauge", "strain", 1e6, "microstrain"),
-                ("displacement", "output", 1e3, "mm"),
-            )
-            for name, value in load[key].items()
-        ]
-        show("load of a structure", **load, outputs=outputs)
+    answer("structure info", record, json=json)
+    for load in () if json else record["loads"]:
+        outputs = [("gauge", name, 1e6 * value, "microstrain") for name, value in load["strain"].items()]
+        outputs += [("displacement", name, 1e3 * value, "mm") for name, value in load["output"].items()]
+        show("load of a structure", load=load, outputs=outputs)
 
 
-def structure_record(structure: "AffineStructure", modes: int) -> dict[str, Any]:
+def structure_record(structure: "parts.AffineStructure", modes: int) -> dict[str, Any]:
     """Return what is known of a structure without damage, at nominal values, by name.
 
     Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
     """
-    from fe.structure.affine import natural_frequencies, static_responses
-    from fe.structure.operators import Structure
-
     design, heavy = structure.design, structure.mass().diagonal().any()
-    frequencies = natural_frequencies(structure, modes)[0].tolist() if heavy else []
-    loads = [
-        {
-            "name": name,
-            "control": structure.loads[name],
-            "value": 1.0 if structure.loads[name] is None else structure.controls[str(structure.loads[name])],
-            "largest_displacement": found.largest,
-            "strain": dict(zip(structure.gauges, map(float, found.strain), strict=True)),
-            "output": dict(zip(structure.displacements, map(float, found.output), strict=True)),
-        }
-        for name, found in static_responses(structure).items()
-    ]
     return {
         "name": design.name,
         "design_hash": structure.design_hash,
@@ -125,18 +80,25 @@ def structure_record(structure: "AffineStructure", modes: int) -> dict[str, Any]
         "length_unit": design.length_unit,
         "remarks": [],
         "parts": [],
-        **(_of_mesh(structure) if isinstance(structure, Structure) else {"matrices": [*design.files]}),
-        "frequencies": frequencies,
-        "loads": loads,
+        **(_of_mesh(structure) if isinstance(structure, parts.Structure) else {"matrices": [*design.files]}),
+        "frequencies": parts.natural_frequencies(structure, modes)[0].tolist() if heavy else [],
+        "loads": [
+            {
+                "name": name,
+                "control": (control := structure.loads[name]),
+                "value": 1.0 if control is None else structure.controls[control],
+                "largest_displacement": found.largest,
+                "strain": dict(zip(structure.gauges, map(float, found.strain), strict=True)),
+                "output": dict(zip(structure.displacements, map(float, found.output), strict=True)),
+            }
+            for name, found in parts.static_responses(structure).items()
+        ],
     }
 
 
-def _of_mesh(structure: "Structure") -> dict[str, Any]:
-    from fe.structure.mesh_file import memory_estimate
-    from fe.structure.operators import weighed
-
+def _of_mesh(structure: "parts.Structure") -> dict[str, Any]:
     mesh = structure.mesh
-    mass, centre = weighed(structure)
+    mass, centre = parts.weighed(structure)
     return {
         "mesh": structure.design.mesh,
         "remarks": list(mesh.remarks),
@@ -144,49 +106,46 @@ def _of_mesh(structure: "Structure") -> dict[str, Any]:
         "linear_elements": not mesh.kind.edges,
         "elements": len(mesh.cells),
         "nodes": len(mesh.points),
-        "loose_nodes": [int(number) for number in mesh.loose],
+        "loose_nodes": mesh.loose.tolist(),
         "held": mesh.unknowns - structure.unknowns,
-        "memory": memory_estimate(mesh),
+        "memory": parts.memory_estimate(mesh),
         "mass": mass,
-        "centre_of_gravity": [float(value) / mesh.unit for value in centre],
-        "lower": [float(value) / mesh.unit for value in mesh.points.min(axis=0)],
-        "upper": [float(value) / mesh.unit for value in mesh.points.max(axis=0)],
-        "parts": list(_parts(structure)),
+        "centre_of_gravity": (centre / mesh.unit).tolist(),
+        "lower": (mesh.points.min(axis=0) / mesh.unit).tolist(),
+        "upper": (mesh.points.max(axis=0) / mesh.unit).tolist(),
+        "parts": [
+            dict(zip(("what", "name", "set", "count", "of", "note"), row, strict=True))
+            for row in _parts(structure)
+        ],
     }
 
 
-def _parts(structure: "Structure") -> Iterator[dict[str, Any]]:
+def _parts(structure: "parts.Structure") -> Iterator[tuple[str, str, str | None, int, str, str]]:
+    """Yield what each part is, its name, its set, how much of what it holds, and a note."""
     design, mesh = structure.design, structure.mesh
-
-    def part(what: str, name: str, chosen: str, count: int, of: str, note: str = "") -> dict[str, Any]:
-        return {"what": what, "name": name, "set": chosen, "count": count, "of": of, "note": note}
-
     for number, material in enumerate(design.material):
         count = int((structure.material_of == number).sum())
         note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
-        yield part("material", material.name, material.set, count, "elements", note)
+        yield "material", material.name, material.set, count, "elements", note
     for number, damage in enumerate(design.damage):
         count = int((structure.region_of == number).sum())
-        yield part("damage region", damage.name, damage.set, count, "elements")
+        yield "damage region", damage.name, damage.set, count, "elements", ""
     for number, support in enumerate(design.support, start=1):
         count = len(mesh.nodes_of(support.set, f"support[{number}]"))
-        notes = [f"holds {', '.join(support.hold)}"] * bool(support.hold) + ["springs"] * bool(
-            support.springs
-        )
-        note = ", ".join(["rigid"] * (support.rigid_about is not None) + notes)
-        yield part("support", str(number), support.set, count, "nodes", note)
+        notes = ["rigid"] * (support.rigid_about is not None)
+        notes += [f"holds {', '.join(support.hold)}"] * bool(support.hold)
+        notes += ["springs"] * bool(support.springs)
+        yield "support", str(number), support.set, count, "nodes", ", ".join(notes)
     for load in design.load:
         if load.set is not None:
             nodes = mesh.nodes_of(load.set, load.name)
             faces = len(mesh.faces_between(load.set, nodes))
-            yield part("load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes")
+            yield "load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes", ""
     for gauge, distance in zip(design.gauge, structure.gauges_moved.tolist(), strict=True):
         moved = f"put onto the surface, {distance / mesh.unit:.3g} {mesh.unit_name} away"
-        yield part("gauge", gauge.name, "", 1, "place", moved if distance > 1e-6 * mesh.size else "")
+        yield "gauge", gauge.name, "", 1, "place", moved if distance > 1e-6 * mesh.size else ""
 
 
-@structure_app.command("verify")
-@told("structure verify")
 def verify(
     file: Path,
     *,
@@ -196,42 +155,29 @@ def verify(
     json: bool = False,
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
-    from fe.verification.calculix_comparison import agreement, required_calculix, structure_deck
-
-    required_calculix()
+    parts.required_calculix()
     refuse_filled(out)
     structure = assembled(file, memory_limit, mass_as_stiffness=True)
-    with (
-        tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch,
-        terminal.progress().stage("CalculiX on the same mesh"),
-    ):
-        found = agreement(structure_deck(structure), out or Path(scratch), modes)
+    with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch, stage("CalculiX on the same mesh"):
+        found = parts.agreement(parts.structure_deck(structure), out or Path(scratch), modes)
     checks = [
-        Check(f"load {load}", what, value, RESPONSE_LIMIT)
+        parts.Check(f"load {load}", what, value, RESPONSE_LIMIT)
         for load, differences in found.loads.items()
         for what, value in differences.items()
     ]
-    checks.append(Check(f"{len(found.ours)} modes", "frequencies", found.modal, FREQUENCY_LIMIT))
-    if json:
-        terminal.print_json(
-            {
-                "checks": [
-                    {"of": check.group, "what": check.name, "difference": check.value, "limit": check.limit}
-                    for check in checks
-                ],
-                "frequencies": {key: getattr(found, key).tolist() for key in ("ours", "calculix")},
-                "passed": all(check.passed for check in checks),
-            }
-        )
-    else:
-        print_checks(checks)
-        if out is not None:
-            terminal.say(f"Wrote the decks and results of CalculiX to {out}")
+    checks.append(parts.Check(f"{len(found.ours)} modes", "frequencies", found.modal, FREQUENCY_LIMIT))
+    keys = {"of": "group", "what": "name", "difference": "value", "limit": "limit"}
+    record = {
+        "checks": [{key: getattr(check, own) for key, own in keys.items()} for check in checks],
+        "frequencies": {key: getattr(found, key).tolist() for key in ("ours", "calculix")},
+        "passed": all(check.passed for check in checks),
+    }
+    answer("checks", record, json=json, checks=checks)
+    if out is not None and not json:
+        terminal.say(f"Wrote the decks and results of CalculiX to {out}")
     end_with(checks)
 
 
-@structure_app.command("field")
-@told("structure field")
 def field(
     file: Path,
     *,
@@ -241,8 +187,6 @@ def field(
     memory_limit: float | None = None,
 ) -> None:
     """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
-    from fe.structure.operators import write_structure_vtu
-
     refuse_existing(out, replace=replace)
     structure = assembled(file, memory_limit)
     values: dict[str, float] = {}
@@ -258,22 +202,18 @@ def field(
             known = [f"{own} from {low:g} to {high:g}" for own, (low, high) in ranges]
             raise typer.BadParameter(said("structure.at", text=text, known=known), param_hint="--at")
         values[name] = value
-    with terminal.progress().stage("Solving and writing the field"):
-        write_structure_vtu(out, structure, values)
+    with stage("Solving and writing the field"):
+        parts.write_structure_vtu(out, structure, values)
     terminal.say(f"{out}: {len(structure.mesh.cells):,} cells, displacement, strain, material, region, loss")
 
 
-@structure_app.command("reduce")
-@told("structure reduce")
 def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, json: bool = False) -> None:
     """Make the reduced model of a structure, keep it in the cache, and measure its errors."""
-    from fe.reduction.reduced_basis import measured_errors
-
-    model, errors = reduced(file, memory_limit), None
+    model, errors = parts.reduced_structure(located(file), memory_limit=in_bytes(memory_limit)), None
     if states:
         structure = assembled_of_any(file, memory_limit)
-        with terminal.progress().stage("Comparing it with the full model"):
-            errors = measured_errors(structure, model, states)
+        with stage("Comparing it with the full model"):
+            errors = parts.measured_errors(structure, model, states)
     record = {
         "name": model.name,
         "design_hash": model.design_hash,
@@ -282,23 +222,16 @@ def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, js
         "ranges": {name: list(ends) for name, ends in model.validity.items()},
         "errors": None if errors is None else asdict(errors),
     }
-    if json:
-        terminal.print_json(record)
-    else:
-        show("structure reduce", model=model, record=record, ranges=list(_ranges(model)))
+    answer("structure reduce", record, json=json, model=model, kinds=_kinds(model))
 
 
-def _ranges(model: "ReducedModel") -> Iterator[tuple[str, ...]]:
+def _kinds(model: "parts.ReducedModel") -> dict[str, str]:
+    """Return what each of the names is that a reduced model holds for."""
     kinds = dict.fromkeys(model.parameters, "parameter") | dict.fromkeys(model.regions, "stiffness loss")
-    kinds |= dict.fromkeys(model.masses, "mass [kg]")
-    units = model.control_units
-    kinds |= {name: f"control [{unit}]" for name, unit in zip(model.controls, units, strict=True)}
-    for (name, (low, high)), nominal in zip(model.validity.items(), model.nominal, strict=True):
-        yield kinds[name], name, f"{low:g}", f"{nominal:g}", f"{high:g}"
+    controls = zip(model.controls, model.control_units, strict=True)
+    return kinds | dict.fromkeys(model.masses, "mass [kg]") | {n: f"control [{unit}]" for n, unit in controls}
 
 
-@structure_app.command("fmu")
-@told("structure fmu")
 def fmu(
     file: Path,
     *,
@@ -311,35 +244,27 @@ def fmu(
     memory_limit: float | None = None,
 ) -> None:
     """Pack the reduced model of a structure as an FMU; equal input gives equal bytes."""
-    from fe.structure.design import load_structure
-    from fmu_asset.packing.contents import checked_target
-    from fmu_asset.packing.structure_fmu import build_fmu, check_form
-    from fmu_asset.structures.binding import structure_binding_text
-    from fmu_asset.structures.rig import rig_text
-
     version: Literal[2, 3] = 3 if fmi == 3 else 2
-    check_form(kind, version)
+    parts.check_form(kind, version)
     if version == 3 and (binding is not None or rig is not None):
         raise typer.BadParameter("--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding.")
     source = located(file)
-    target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
+    target = parts.checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
     taken = {source.resolve(): "the structure file", target.resolve(): "the FMU"}
-    design, others = load_structure(source), list[tuple[Path, str, str]]()
     for option, path in (("--binding", binding), ("--rig", rig)):
-        if path is None:
-            continue
-        if path.resolve() in taken:
-            raise FileNotWrittenError(f"{path} is {taken[path.resolve()]}: choose another {option}.")
-        taken[path.resolve()] = f"the file of {option}"
-        refuse_existing(path, replace=replace, option=option)
-        if option == "--rig":
-            use = f"the model of `uav-twin calibrate campaign` and `discrepancy run CAMPAIGN --model {path}`"
-            others.append((path, rig_text(design, relpath(target, path.parent)), use))
-        else:
-            others.append((path, structure_binding_text(design), "its binding"))
-    model = reduced(file, memory_limit)
-    info = build_fmu(model, target, kind=kind, fmi=version, replace=replace)
-    say_packed(info)
+        if path is not None:
+            if path.resolve() in taken:
+                raise FileNotWrittenError(f"{path} is {taken[path.resolve()]}: choose another {option}.")
+            taken[path.resolve()] = f"the file of {option}"
+            refuse_existing(path, replace=replace, option=option)
+    design, others = parts.load_structure(source), list[tuple[Path, str, str]]()
+    if binding is not None:
+        others.append((binding, parts.structure_binding_text(design), "its binding"))
+    if rig is not None:
+        use = f"the model of `uav-twin calibrate campaign` and `discrepancy run CAMPAIGN --model {rig}`"
+        others.append((rig, parts.rig_text(design, relpath(target, rig.parent)), use))
+    model = parts.reduced_structure(source, memory_limit=in_bytes(memory_limit))
+    show("packed", info=parts.build_fmu(model, target, kind=kind, fmi=version, replace=replace))
     for path, text, what in others:
         atomic_write_text(path, text)
         terminal.say(f"{path}: {what}")

@@ -16,7 +16,7 @@ from calibration.result.text import (
 from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.page import Page, ReportFigure
-from reporting.progress import Progress
+from reporting.progress import stage
 from reporting.words import plus_minus
 
 FIGURES, REPORT_NAME = "figures", "report.html"
@@ -57,9 +57,7 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
                 (fresh / file).replace(folder / file)
 
 
-def write_calibration_folder(
-    result: Calibration, folder: Path, progress: Progress, *, report: bool = True
-) -> Path:
+def write_calibration_folder(result: Calibration, folder: Path, *, report: bool = True) -> Path:
     """Write page, figures and `calibration.nc`, or without a report the latter alone; return its path.
 
     Raises
@@ -69,7 +67,7 @@ def write_calibration_folder(
     """
     with calibration_folder(result, folder) as fresh:
         if report:
-            with progress.stage("Drawing the report"):
+            with stage("Drawing the report"):
                 end_page(begun_page(result, fresh), result, fresh)
     return folder / FILE_NAME
 

@@ -47,7 +47,7 @@ from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting.figures import LEVELS, panels, publication_style
 from reporting.page import Page, Words
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, reporter, stage
 from reporting.provenance import collect_provenance
 from reporting.words import brief, plus_minus
 
@@ -142,7 +142,7 @@ def calibrate(
     FiniteElementError
         If the tailored wing cannot be built.
     """
-    progress = progress or SilentProgress()
+    progress = reporter(progress)
     if not isinstance(lab, LabData):
         lab = published_data() if lab is None else read_lab_folder(Path(lab))
     drawn = design or load_design()
@@ -253,9 +253,7 @@ LOAD_FACTOR = 3.0
 TABLE_NAME = "table_1.csv"
 
 
-def write_wing_folder(
-    calibration: WingCalibration, folder: Path, progress: Progress, *, report: bool = True
-) -> Path:
+def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: bool = True) -> Path:
     """Write page, figures, table, the wing for ParaView, and last `calibration.nc`; return its path.
 
     Without a report, table and `calibration.nc` alone.
@@ -266,7 +264,7 @@ def write_wing_folder(
         If a file cannot be written; the folder is then as it was.
     """
     result = calibration.result
-    fields = wing_fields(result.design, progress=progress) if report else None
+    fields = wing_fields(result.design) if report else None
     with calibration_folder(result, folder) as fresh:
         write_table_1(calibration.table_1, fresh / TABLE_NAME)
         if fields is not None:
@@ -274,7 +272,7 @@ def write_wing_folder(
             vector = fields.model.vector(state.values, state.stiffness_loss, load_factor=LOAD_FACTOR)
             write_wing_vtu(fresh / WING_FIELDS, fields, vector)
             write_modes_vtu(fresh / MODE_FIELDS, fields, vector)
-            with progress.stage("Drawing the report"):
+            with stage("Drawing the report"):
                 page = begun_page(result, fresh)
                 _add_sections(page, calibration, fields, fresh)
                 end_page(page, result, fresh)

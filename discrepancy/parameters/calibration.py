@@ -22,7 +22,7 @@ from discrepancy.parameters.posterior import ParameterPosterior, parameter_poste
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, reporter
 from reporting.provenance import collect_provenance
 from reporting.words import counted, small
 
@@ -66,7 +66,7 @@ def calibrate_parameters(
     CalibrationRecordError
         If the name of the asset cannot be printed.
     """
-    progress = SilentProgress() if progress is None else progress
+    progress = reporter(progress)
     model = choice.model
     priors = stated_priors(campaign, choice)  # before the model is asked, which may refuse what is outside
     with progress.stage("Checking the data"):

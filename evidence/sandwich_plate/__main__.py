@@ -17,11 +17,13 @@ from evidence.sandwich_plate.plate_known_answers import (
     square_plate_deflection,
     square_plate_frequency,
 )
+from fe.verification.wing_checks import QUICK_REFINEMENTS, Check
 from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import guarded
-from uav_twin.wing import QUICK_REFINEMENTS, Check, end_with, print_checks
+from uav_twin.options import show
+from uav_twin.wing import end_with
 
 
 def compare(
@@ -34,7 +36,7 @@ def compare(
     wing = load_design(design)
     mesh = wing.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else wing
     checks = list(plate_checks(assemble(mesh), limited=not quick))
-    print_checks(checks)
+    show("checks", checks=checks)
     end_with(checks)
 
 

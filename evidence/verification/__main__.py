@@ -17,11 +17,13 @@ from evidence.verification.calculix_examples import DECKS, NAMES, published_diff
 from evidence.verification.ring_down import ring_down_agreement
 from fe.runtime.state import DigitalState
 from fe.verification.calculix_comparison import calculix_program
+from fe.verification.wing_checks import Check
 from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import guarded
-from uav_twin.wing import Check, end_with, print_checks
+from uav_twin.options import show
+from uav_twin.wing import end_with
 
 # R. H. MacNeal and R. L. Harder (1985), table 3, HEX20: in plane and out of plane.
 MACNEAL_HARDER = {"regular": (0.970, 0.961), "trapezoid": (0.886, 0.920), "parallelogram": (0.967, 0.941)}
@@ -37,7 +39,7 @@ def check(
         coarse = assemble(load_design(design).changed(mesh={"refinement": 0.25}))
         with tempfile.TemporaryDirectory(prefix="uav-twin-") as folder:
             checks += ring_down_checks(coarse, Path(folder), 0.25 if quick else 5.0)
-    print_checks(checks)
+    show("checks", checks=checks)
     end_with(checks)
 
 

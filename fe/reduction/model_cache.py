@@ -18,7 +18,7 @@ from fe.structure.operators import assemble_structure
 from fe.wing.design import WingDesign, load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting.files import atomic_write_bytes
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, reporter
 from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
@@ -106,7 +106,7 @@ def build_fields(
 
 
 def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators:
-    with (progress or SilentProgress()).stage("Meshing and assembling the wing"):
+    with reporter(progress).stage("Meshing and assembling the wing"):
         return assemble(design)
 
 
@@ -149,7 +149,7 @@ def reduced_structure(
     def build() -> ReducedModel:
         from .reduced_basis import reduce_structure
 
-        with (progress or SilentProgress()).stage("Reading the mesh and assembling"):
+        with reporter(progress).stage("Reading the mesh and assembling"):
             structure = assemble_structure(file, memory_limit)
         return reduce_structure(structure, progress=progress).model
 

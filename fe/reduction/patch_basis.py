@@ -20,7 +20,7 @@ from fe.runtime.patched_wing import PatchedState, PatchedWing
 from fe.structure.affine import natural_frequencies
 from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, reporter
 
 LARGEST_LOSS, COMPLIANCE_SHARE, LARGEST_MASS = 0.7, 0.4, 0.25
 """How far changes may go: loss of stiffness in a box along the span, root compliance as a share of the tip's,
@@ -54,7 +54,7 @@ def reduce_patches(operators: AffineOperators, progress: Progress | None = None)
     SolutionError
         If the full model cannot be solved.
     """
-    progress = progress or SilentProgress()
+    progress = reporter(progress)
     with progress.stage("Solving the wing for changes"):
         full = assemble_patch_operators(operators)
         healthy, damaged = _responses(full, 0.0), _responses(full, DAMAGED_ANCHOR)

@@ -20,7 +20,7 @@ from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
 from fe.sentences import said
 from fe.structure.affine import AffineStructure, natural_frequencies, static_response
-from reporting.progress import Progress, SilentProgress, Stage
+from reporting.progress import Progress, Stage, reporter
 
 from .certified_basis import TOGETHER, StaticReduction, fewest_directions
 from .settings import StructureSettings
@@ -189,7 +189,7 @@ def reduce_structure(
     SolutionError
         If the full model cannot be solved.
     """
-    settings, progress = settings or StructureSettings.of(structure.design), progress or SilentProgress()
+    settings, progress = settings or StructureSettings.of(structure.design), reporter(progress)
     terms = ReductionTerms(replace(structure, ranges=structure.ranges | settings.ranges))
     _check(terms)
     with progress.stage("Factorising the structure"):

@@ -1,7 +1,9 @@
 """Checks of a wing's model: what its rigid motions call forth, sums that must agree, convergence."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +12,17 @@ from fe.elements.cells import gradients
 from fe.elements.kinds import gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
+from fe.runtime.state import DigitalState
 from fe.structure.affine import static_response
 from fe.structure.mesh import rigid_motions
+from fe.verification.calculix_comparison import agreement, calculix_program, wing_deck
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, assemble
 from fe.wing.responses import eigenmodes
+from reporting.progress import stage
+
+DAMAGED = (0.4, 0.6)
+REFINEMENTS, QUICK_REFINEMENTS = (0.5, 1.0, 2.0), (0.25, 0.5, 1.0)
 
 
 def _rigid_motions(operators: AffineOperators) -> FloatArray:
@@ -97,3 +105,119 @@ def observed_order(ratio: float, values: Sequence[float]) -> float:
     first, second = values[-2] - values[-3], values[-1] - values[-2]
     order = math.log(first / second) / math.log(ratio) if first * second > 0.0 else math.nan
     return order if 0.05 < order < 12.0 else math.nan
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the verification: what, what came, and the limit that it must keep, if it has one.
+
+    Attributes
+    ----------
+    group, name : str
+        What is checked.
+    value : float
+        What came.
+    limit : float, optional
+        Largest allowed value; None for a figure that is only reported.
+    note : str
+        What stands beside the figure.
+    """
+
+    group: str
+    name: str
+    value: float
+    limit: float | None = None
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the limit is kept."""
+        return self.limit is None or self.value <= self.limit
+
+
+def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[Check]:
+    """Return every check of a design; those against CalculiX where it is installed.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    jobs : Path
+        Where CalculiX works.
+    quick : bool
+        Coarser meshes.
+    """
+    checks: list[Check] = []
+
+    def run(title: str, found: Iterable[Check]) -> None:
+        with stage(title) as shown:
+            for check in found:
+                checks.append(check)
+                shown.advance(detail=check.name)
+
+    with stage("Meshing the wing"):
+        mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
+    run("Balances of the wing", balance_checks(mesh))
+    refinements = QUICK_REFINEMENTS if quick else REFINEMENTS
+    run("Convergence of the mesh", convergence_checks(design, refinements, limited=not quick))
+    if calculix_program() is not None:
+        run("CalculiX on the same mesh", calculix_checks(mesh, jobs))
+    return checks
+
+
+def balance_checks(operators: AffineOperators) -> Iterator[Check]:
+    """Yield the sums that must agree for the wing at the load factor of its lift."""
+    yield Check("wing", "force of a rigid motion", rigid_body_residual(operators), 1e-12)
+    balance = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
+    for name, (found, expected, unit) in balance.items():
+        limit = 1e-10 if name == "mass" else 1e-5
+        yield Check("wing", name, abs(found / expected - 1.0), limit, f"({found:.5g} {unit})")
+
+
+def convergence_checks(
+    design: WingDesign, refinements: tuple[float, ...], *, limited: bool = True
+) -> Iterator[Check]:
+    """Yield the change between the two finest meshes and the observed order of every result.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    refinements : tuple of float
+        At least three, from coarse to fine, with equal ratios.
+    limited : bool
+        Hold the changes to their bars, which are made for `REFINEMENTS`.
+    """
+    columns = mesh_convergence(design, refinements)
+    middle, fine = refinements[-2:]
+    group = f"mesh x{middle:g} to x{fine:g}"
+
+    def order(values: list[float]) -> str:
+        found = observed_order(fine / middle, values)
+        return "not monotone" if math.isnan(found) else f"order {found:.2f}"
+
+    limit = 0.01 if limited else None
+    for name, unit in (("tip stiffness", "N/m"), ("first bending", "Hz"), ("second bending", "Hz")):
+        values = columns[name].tolist()
+        note = f"({values[-1]:.5g} {unit}, {order(values)})"
+        yield Check(group, name, abs(values[-1] / values[-2] - 1.0), limit, note)
+    strain = columns["strain"]
+    change = np.abs(strain[-1] / strain[-2] - 1.0)
+    yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), limit)
+    for gauge, value in enumerate(change, start=1):
+        own = strain[:, gauge - 1].tolist()
+        note = f"({1e6 * own[-1]:.0f} microstrain, {order(own)})"
+        yield Check(group, f"gauge {gauge}", float(value), None, note)
+    yield Check(group, "unknowns of the finest mesh", int(columns["unknowns"][-1]))
+
+
+def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
+    """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
+    damaged = tuple(DAMAGED[number % 2] for number in range(len(operators.regions)))
+    for health, loss in (("healthy", ()), ("damaged", damaged)):
+        group = f"CalculiX, {health}"
+        found = agreement(wing_deck(operators, DigitalState(stiffness_loss=loss)), jobs / health)
+        for load, differences in found.loads.items():
+            for what, value in differences.items():
+                yield Check(group, f"{load}: {what}", value, 1e-5)
+        yield Check(group, f"frequencies 1 to {len(found.ours)}", found.modal, 1e-5)

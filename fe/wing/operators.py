@@ -216,6 +216,12 @@ def cell_density(mesh: WingMesh) -> FloatArray:
     return density
 
 
+def structural_mass(design: WingDesign) -> float:
+    """Return the mass of the structure without its point masses, from the volumes of the cells [kg]."""
+    mesh = build_mesh(design)
+    return float(mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh)).sum())
+
+
 def root_support(mesh: WingMesh) -> Supports:
     """Hold the wing: the root section moves as a rigid rib on springs.
 

@@ -13,7 +13,7 @@ from fmu_asset.door.experiment import whole_binding
 from fmu_asset.door.units import contradictions, meaning_of
 from fmu_asset.errors import BindingError, FmuError, visible
 from fmu_asset.packing.structure_fmu import recorded_content_hash
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, reporter
 
 from .flight import Flights, Told, Verdict
 
@@ -110,7 +110,7 @@ def check_fmu(
     else:
         origin = f"{used.name} fits" if given else "Drafted; give --binding to check your own"
         found.append(("binding", "ok", f"{origin}."))
-        found += flights.checks(cycles, progress or SilentProgress())
+        found += flights.checks(cycles, reporter(progress))
     # Names of an FMU may hold control characters.
     findings = tuple(Finding(check, verdict, visible(text)) for check, verdict, text in found)
     return FmuCheck(description.path, findings)

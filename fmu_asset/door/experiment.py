@@ -19,7 +19,6 @@ from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.sentences import said
 from reporting.files import atomic_write_bytes, atomic_write_text
-from reporting.progress import Progress
 from reporting.table_file import TableErrors, read_table
 
 from .binding import INPUT_ROLES, Binding, Header, Input, Parameter, Vector
@@ -298,7 +297,7 @@ def _steps_to(start: float, end: float | None, size: float | None) -> tuple[int,
     return steps, size
 
 
-def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) -> ObservationHistory:
+def fly_histories(asset: FmiAsset, given: InputHistories) -> ObservationHistory:
     """Simulate an asset under the histories of a file.
 
     Each row holds over the step that begins at its time. Under linear interpolation lines lead from row to
@@ -312,18 +311,18 @@ def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) ->
         As `FmiAsset.simulate`.
     """
     if asset.binding.binding.interpolation == "zero-order":
-        return asset.simulate(**given.roles, steps=given.steps, progress=progress)
+        return asset.simulate(**given.roles, steps=given.steps, progress=None)
     if given.steps < 2:
         raise FmuInputError(said("inputs.one_row"))
     first = {role: {name: v[0] for name, v in table.items()} for role, table in given.roles.items()}
     rest = {role: {name: v[1:] for name, v in table.items()} for role, table in given.roles.items()}
     asset.reset(**first)
-    return _from_here(asset, given.steps - 1, progress, rest)
+    return _from_here(asset, given.steps - 1, rest)
 
 
-def _from_here(asset: FmiAsset, steps: int, progress: Progress, roles: Roles) -> ObservationHistory:
+def _from_here(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
     """Return this moment and what comes out of the steps after it."""
-    first, then = asset.observe(), asset.simulate(**roles, steps=steps, progress=progress)
+    first, then = asset.observe(), asset.simulate(**roles, steps=steps, progress=None)
     return ObservationHistory(
         np.concatenate(([first.time], then.time)),
         np.vstack((first.values, then.values)),
@@ -332,7 +331,7 @@ def _from_here(asset: FmiAsset, steps: int, progress: Progress, roles: Roles) ->
     )
 
 
-def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:
+def fly(asset: FmiAsset, experiment: Experiment) -> ObservationHistory:
     """Start an asset, and return its start and what came out of the steps after it.
 
     Parameters
@@ -341,8 +340,6 @@ def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> Observat
         The asset.
     experiment : Experiment
         Steps, parameters and inputs, which hold already in the initialisation.
-    progress : Progress
-        Where progress is shown.
 
     Returns
     -------
@@ -355,4 +352,4 @@ def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> Observat
         As `FmiAsset.simulate`.
     """
     asset.reset(experiment.parameters, **experiment.inputs)
-    return _from_here(asset, experiment.steps, progress, {})
+    return _from_here(asset, experiment.steps, {})

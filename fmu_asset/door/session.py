@@ -7,7 +7,7 @@ import numpy as np
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError
 from fmu_asset.instances.plan import Floats, Instance
 from fmu_asset.sentences import said
-from reporting.progress import Progress, SilentProgress, Stage
+from reporting.progress import Progress, Stage, reporter
 
 from .exchange import Histories, Values, plain_values
 from .layout import Observation, ObservationHistory
@@ -189,7 +189,7 @@ class FmiAsset(OpenedFmu):
             rows[0, -self._lines :] = np.array(self._request[moving])
             rows[1:, -self._lines :] = rows[:-1, moving]
         replies = np.full((len(rows), len(self._reply)), np.nan)
-        with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
+        with reporter(progress).stage("Simulating", total=len(rows), unit="steps") as stage:
             begin = self.step_index
             length = max(1, _BLOCK_BYTES // max(rows[0].nbytes, replies[0].nbytes))
             for first in range(0, len(rows), length):

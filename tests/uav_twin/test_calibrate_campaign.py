@@ -10,32 +10,11 @@ import pytest
 
 from calibration.result.file import load_calibration, save_calibration
 from tests.command_line import refused, said
+from tests.refusals import Inputs
 
-MODEL = """format = 1
-name = "spring"
-mass = 2.0
-stiffness = 1000.0
-damping.ratios = [0.01]
-input = [{ name = "end", vector = 1.0 }]
-output = [{ name = "sag", vector = 1.0 }]
-[[parameter]]
-name = "factor"
-terms = "stiffness"
-mean = 1.0
-deviation = 0.2
-low = 0.5
-high = 1.5
-"""
-CAMPAIGN = """format = 1
-name = "spring test"
-trial = [{ name = "up", kind = "static", file = "up.csv" }]
-[[channel]]
-name = "tip"
-quantity = "displacement"
-unit = "mm"
-output = "sag"
-noise = { standard_deviation = 0.5 }
-"""
+INPUTS = Inputs(__file__)
+MODEL = INPUTS.text("spring.toml")
+CAMPAIGN = INPUTS.text("spring_campaign.toml")
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.contents import build_script_fmu
 from scenarios import asset_scripts, binding_files
 from tests.command_line import refused, said
+from tests.refusals import Inputs
 from tests.twin_master.runs import loaded_from, table_of
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
@@ -25,30 +26,10 @@ OUTPUTS = (
     ("flow", "flow", "l/min"), ("torque", "torque", "N m"), ("temperature", "temperature", "degC"),
     ("filter_pressure", "pressure", "bar"),
 )  # fmt: skip
-MODEL = """format = 1
-kind = "fmu"
-name = "gear pump"
-fmu = "gear_pump.fmu"
-binding = "gear_pump"
-isolated = false
-static = { step = 28800.0 }
-input = [{ name = "speed", quantity = "angular_velocity" }, { name = "pressure", quantity = "pressure" }]
-"""
-PARAMETER = """[[parameter]]
-name = "viscosity_factor"
-mean = 1.0
-deviation = 0.03
-low = 0.85
-high = 1.15
-"""
-CAMPAIGN = """format = 1
-name = "bench"
-trial = [{ name = "points", kind = "static", file = "points.csv" }]
-input = [
-    { name = "speed", quantity = "angular_velocity", unit = "rpm" },
-    { name = "pressure", quantity = "pressure", unit = "bar", column = "load" },
-]
-"""
+INPUTS = Inputs(__file__)
+MODEL = INPUTS.text("pump.toml")
+PARAMETER = INPUTS.text("pump_parameter.toml")
+CAMPAIGN = INPUTS.text("pump_campaign.toml")
 
 
 @pytest.fixture(scope="module")

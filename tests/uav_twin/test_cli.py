@@ -9,6 +9,8 @@ from importlib.metadata import version
 import pytest
 
 from benchmarks import command_page
+from fe.verification import wing_checks
+from fe.verification.wing_checks import Check
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from reporting import terminal
@@ -18,8 +20,7 @@ from tests.twin_master.runs import text_of, written
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario_check import check_scenario
-from uav_twin import cli, wing
-from uav_twin.wing import Check
+from uav_twin import cli
 
 
 @pytest.fixture
@@ -183,7 +184,7 @@ def test_a_fault_is_one_sentence(old, new, sentence, tmp_path):
 def test_checks_of_a_wing_are_listed_and_kept(monkeypatch, tmp_path):
     nan, out = float("nan"), tmp_path / "out"
     checks = [Check("patch test", "strain", 1e-15, 1e-12), Check("mesh", "order", nan)]
-    monkeypatch.setattr(wing, "all_checks", lambda *_, **__: checks)
+    monkeypatch.setattr(wing_checks, "all_checks", lambda *_, **__: checks)
     text = said("wing", "verify", "--out", out)
     assert "patch test" in text
     assert "kept" in text
@@ -200,12 +201,12 @@ def test_checks_of_a_wing_are_listed_and_kept(monkeypatch, tmp_path):
 
 def test_every_check_of_a_coarse_wing_is_kept_and_convergence_names_every_gauge():
     design = load_design().changed(mesh={"refinement": 0.25})
-    checks = list(wing.balance_checks(assemble(design)))
+    checks = list(wing_checks.balance_checks(assemble(design)))
     assert [check.name for check in checks[1:]] == ["mass", "reaction", "root moment", "energy and work"]
     assert all(check.limit is not None for check in checks)
     assert [check.name for check in checks if not check.passed] == []
     # Three coarse meshes: the names and the kind of figures, not their size.
-    checks = list(wing.convergence_checks(design, (0.25, 0.3, 0.36), limited=False))
+    checks = list(wing_checks.convergence_checks(design, (0.25, 0.3, 0.36), limited=False))
     names = [check.name for check in checks]
     assert names[:3] == ["tip stiffness", "first bending", "second bending"]
     assert [name for name in names if name.startswith("gauge ")] == [f"gauge {n}" for n in range(1, 25)]

@@ -14,18 +14,12 @@ from fmu_asset.door.binding import load_binding, parse_binding
 from fmu_asset.door.experiment import default_experiment, fly, read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
-from reporting.progress import SilentProgress
 from tests.command_line import refused, said
 from tests.refusals import Inputs
 
-HISTORIES = Inputs(__file__).table("histories.toml")["refused"]
-ROOM = """
-binding = { name = "room", step_size = 60.0, start_time = 120.0 }
-control.power = { variable = "heater.u[1].P", unit = "kW" }
-load.outside = { variable = "ambient.T", unit = "degC", minimum = -40.0 }
-observation.room = { variables = ["room.T", "room.sensor.T"], unit = "degC" }
-record.variables = ["der(room.T)"]
-"""
+INPUTS = Inputs(__file__)
+HISTORIES = INPUTS.table("histories.toml")["refused"]
+ROOM = INPUTS.text("room.toml")
 
 
 @pytest.fixture
@@ -100,11 +94,7 @@ def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path, where):
     assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
 
 
-SIZED = """
-binding = { name = "sized", step_size = 1.0, structural_parameters = { n = 3 } }
-control.u = { variable = "u", unit = "1" }
-observation.y = { variables = "y", unit = "1" }
-"""
+SIZED = INPUTS.text("sized.toml")
 
 
 def test_an_array_may_be_empty(foreign_fmu, tmp_path):
@@ -180,7 +170,7 @@ def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu):
     planned = default_experiment(read_fmu(fmu))
     assert (planned.binding.binding.start_time, planned.binding.step_size, planned.steps) == (2.0, 0.25, 4)
     with FmiAsset(fmu, planned.binding, isolated=False) as asset:
-        history = fly(asset, planned, SilentProgress())
+        history = fly(asset, planned)
     assert history.time.tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
     assert history.values[0].tolist() == [1.0, 0.0, 0.0]
 

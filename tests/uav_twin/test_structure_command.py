@@ -8,42 +8,11 @@ import pytest
 
 from fe.verification.calculix_comparison import calculix_program
 from tests.command_line import command, refused, said
+from tests.refusals import Inputs
 
-DECK = """*NODE
-1, 0, 0, 0
-2, 100, 0, 0
-3, 100, 10, 0
-4, 0, 10, 0
-5, 0, 0, 10
-6, 100, 0, 10
-7, 100, 10, 10
-8, 0, 10, 10
-9, 7, 7, 7
-*ELEMENT, TYPE=C3D8, ELSET=BAR
-1, 1, 2, 3, 4, 5, 6, 7, 8
-*NSET, NSET=ROOT
-1, 4, 5, 8
-*SURFACE, NAME=END
-BAR, S4
-*INITIAL CONDITIONS, TYPE=STRESS
-"""
-STRUCTURE = """
-name = "bar"
-mesh = "bar.inp"
-length_unit = "mm"
-parameter = [{ name = "e" }]
-support = [{ set = "ROOT", hold = ["x", "y", "z"] }]
-load = [{ name = "pull", set = "END", force = [2000, 0, 0] }]
-gauge = [{ name = "top", point = [50, 5, 10], direction = [1, 0, 0] }]
-displacement = [{ name = "end", point = [100, 5, 5], direction = [1, 0, 0] }]
-[[material]]
-name = "steel"
-set = "BAR"
-density = 7800
-young_modulus = 2e11
-poisson_ratio = 0.0
-scaled_by = "e"
-"""
+INPUTS = Inputs(__file__)
+DECK = INPUTS.text("bar.inp")
+STRUCTURE = INPUTS.text("bar.toml")
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from fe.reduction.reduced_basis import measured_errors
 from reporting.toml_file import parse_toml
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from tests.command_line import refused, said
+from tests.refusals import Inputs
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.workflow import fly as new_run
 from uav_twin import assemble_structure, reduced_structure
@@ -47,54 +48,9 @@ alpha = 2.0
 beta = 1e-5
 """
 )
-MISSION = """
-format = 2
-state = [{ name = "z1", title = "loss", levels_percent = [0, 20, 40, 60, 80], prior = [1, 0, 0, 0, 0] }]
-control = [{ name = "soft", values = { push = 400.0 } }, { name = "hard", values = { push = 900.0 } }]
-transition = { kind = "independent_worsening", probability = { soft = 0.05, hard = 0.1 } }
-planner = { gamma = 0.8 }
-asset = { kind = "structure", structure = "structure.toml", parameters = { e = 1.03 } }
-belief = { kind = "structure", structure = "structure.toml" }
-calibration = { parameter = "e", source = "normal", mean = 1.0, standard_deviation = 0.02, draws = 20 }
-[mission]
-name = "skin"
-steps = 8
-prediction_steps = 2
-first_control = "hard"
-seed = 3
-step_name = "shift"
-[observation]
-role = "strain"
-count = 2
-titles = ["patch", "skin"]
-standard_deviation_microstrain = 3
-[rewards]
-health_limit_microstrain = 400
-control = { soft = -0.1, hard = 0.1 }
-control_weight = 2.5
-error_scale_microstrain = 10
-[truth]
-kind = "scripted"
-gains = [{ state = "z1", first_step = 2, last_step = 3, gain_percent = 20 }]
-noise = { standard_deviation_microstrain = 3 }
-"""
-CAMPAIGN = """
-format = 1
-name = "pushed"
-trial = [{ name = "pushes", kind = "static", file = "pushes.csv" }]
-[[channel]]
-name = "patch"
-quantity = "strain"
-unit = "microstrain"
-output = "patch"
-noise = { standard_deviation = 0.5 }
-[[channel]]
-name = "corner"
-quantity = "displacement"
-unit = "mm"
-output = "corner"
-noise = { standard_deviation = 0.02 }
-"""
+INPUTS = Inputs(__file__)
+MISSION = INPUTS.text("skin_mission.toml")
+CAMPAIGN = INPUTS.text("skin_campaign.toml")
 
 
 def calculix(folder: Path, e: float, loss: float) -> tuple[dict[str, float], float]:

@@ -180,13 +180,8 @@ class FmuAsset(Asset):
             taken.add(plain)
             self._names[name] = plain
         inputs = (*binding.parameter.items(), *binding.control.items())
-        self._units = {name: scalar.unit for name, scalar in inputs}
-        self._units |= {self._names[name]: unit for name, unit in session.recorded_units.items()}
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units of parameters, control inputs and of what is recorded beside the observations."""
-        return self._units
+        recorded = {self._names[name]: unit for name, unit in session.recorded_units.items()}
+        self.units = {name: scalar.unit for name, scalar in inputs} | recorded
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make one communication step."""

@@ -22,7 +22,7 @@ from fmu_asset.door.exchange import Exchange
 from fmu_asset.folders import scratch_folder
 from fmu_asset.packing.structure_fmu import pack_wing
 from fmu_asset.ssp.writer import write_ssp
-from reporting.progress import Progress
+from reporting.progress import reporter
 from scenarios import binding_files
 from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.fmu_source import FmuSource
@@ -33,7 +33,7 @@ from twin_master.sentences import said
 
 
 def export_scenario(
-    loaded: LoadedScenario, out: Path, *, seed: int | None = None, replace_file: bool, progress: Progress
+    loaded: LoadedScenario, out: Path, *, seed: int | None = None, replace_file: bool
 ) -> Path:
     """Write the asset of a scenario as an SSP file.
 
@@ -49,8 +49,6 @@ def export_scenario(
         Seed of the run, from which the seeds of the FMUs are drawn; that of the scenario by default.
     replace_file : bool
         Whether an existing file may be replaced.
-    progress : Progress
-        Shows the stages.
 
     Raises
     ------
@@ -65,7 +63,7 @@ def export_scenario(
         raise MissionInputError(said("assets.no_fmu", name=scenario.mission.name, kind=scenario.asset.kind))
     source.check()
     with scratch_folder() as scratch:
-        source.prepare(scratch, progress)
+        source.prepare(scratch, reporter())
         binding = source.binding()
         if isinstance(source, SeveralSource):
             wiring = source.wiring()
@@ -77,12 +75,12 @@ def export_scenario(
         return write_ssp(wiring, out, parameter_names=names, stop_time=stop, replace=replace_file)
 
 
-def export_design(design: Path | None, out: Path, *, replace_file: bool, progress: Progress) -> Path:
+def export_design(design: Path | None, out: Path, *, replace_file: bool) -> Path:
     """Write the wing of a design, the shipped one if absent, as an SSP file with one component."""
     wing = load_design(design)
     binding = load_binding(binding_files()["uav_wing"])
     with scratch_folder() as scratch:
-        fmu = pack_wing(wing, scratch / "wing.fmu", progress=progress).path
+        fmu = pack_wing(wing, scratch / "wing.fmu").path
         wiring, names = _with_values(single_system(wing.name, fmu, binding), binding, {}, {})
         return write_ssp(wiring, out, parameter_names=names, replace=replace_file)
 

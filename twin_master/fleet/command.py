@@ -14,8 +14,6 @@ from reporting import terminal
 from reporting.words import counted
 from twin_master.viewer.command import shown
 
-told = terminal.told_by("twin_master")
-
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -30,7 +28,6 @@ ROWS = 20
 """Assets that the table on the console shows, the worst first."""
 
 
-@told("fleet watch")
 def watch(
     file: Path,
     *,
@@ -146,20 +143,10 @@ def _watched_table(standing: Mapping[str, Any]) -> "Table":
     return table
 
 
-fleet_app = typer.Typer(no_args_is_help=True, help="Fly fleets of assets, and learn across them.")
-fleet_app.command("watch")(watch)
-
 SHOWN = 10
 """Failures that are printed; the others stand in `fleet.json`."""
 
 
-@fleet_app.callback()
-def fleet() -> None:
-    """Fly fleets of assets, and learn across them."""
-
-
-@fleet_app.command("run")
-@told("fleet run")
 def run(
     file: Path,
     *,
@@ -179,8 +166,6 @@ def run(
     fly_and_show(found, out, engine, replace=replace, report=not no_report, json=json)
 
 
-@fleet_app.command("learn")
-@told("fleet learn")
 def learn(
     folder: Path, *, out: Path = Path("learnt.toml"), no_report: bool = False, json: bool = False
 ) -> None:
@@ -242,7 +227,6 @@ def _report(folder: Path) -> None:
         write_fleet_report(folder)
 
 
-@told("compare")
 def compare(folders: list[Path], *, json: bool = False) -> None:
     """Show the figures of several fleets or ensembles side by side."""
     from twin_master.fleet.reading import figure_rows

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fmu_asset.door.binding import Binding, load_binding
-from reporting.progress import Progress
+from reporting.progress import reporter
 from twin_master.assets.asset_source import BINDING_COPY, AssetBelief, PairedSource
 from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.design_source import DesignBelief
@@ -138,7 +138,6 @@ def grid_of_scenario(
     *,
     overrides: Overrides | None = None,
     settling_steps: int = 0,
-    progress: Progress,
 ) -> SamplingGrid:
     """Return the grid that a scenario asks for, with its FMU and binding copied into a folder.
 
@@ -159,7 +158,7 @@ def grid_of_scenario(
     believed = scenario.belief.source(scenario, flown)
     source = flown if believed is flown else PairedSource(flown, believed)
     source.check()
-    source.prepare(folder, progress)
+    source.prepare(folder, reporter())
     binding = load_binding(folder / BINDING_COPY)
     given = parse_grid(texts, binding)
     draws = source.draws(scenario.mission.seed)

@@ -25,7 +25,7 @@ from fmu_asset.errors import FmuError
 from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, written
 from reporting.folders import lock_folder
 from reporting.json_file import parse_json
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, reporter
 from reporting.provenance import hash_file
 from twin_master.assets.library_source import (
     FORMAT,
@@ -134,9 +134,7 @@ def sample_library(
         found = _read_blocks(grid, folder)
         todo = [number for number in range(len(grid.blocks)) if number not in found]
         begin = time.perf_counter()
-        with (progress or SilentProgress()).stage(
-            "Sampling the FMU", total=len(grid.blocks), unit="blocks"
-        ) as stage:
+        with reporter(progress).stage("Sampling the FMU", total=len(grid.blocks), unit="blocks") as stage:
             stage.advance(len(found))
             for number, values in _sampled(grid, todo, min(count, max(len(todo), 1))):
                 _keep_block(_block_file(folder, number), values)

@@ -18,7 +18,7 @@ from discrepancy.files.verdict import read_verdict_file as read_verdict
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.verdict import VerdictKind
-from discrepancy.verdict_folder import check_folder, write_verdict_folder
+from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
 from discrepancy.workflow import investigate
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_svg
@@ -42,7 +42,7 @@ def test_a_verdict_that_a_killed_process_had_moved_aside_is_put_back(tmp_path, w
     folder = tmp_path / "verdict"
     old_verdict(tmp_path / ".verdict.old-x" / "verdict")
     if who == "writes":
-        check_folder(folder, replace_it=True)
+        check_verdict_folder(folder, replace_it=True)
     else:
         with pytest.raises(VerdictFileError, match="not valid JSON"):  # of the old verdict, which is a word
             read_verdict_folder(folder)
@@ -117,7 +117,7 @@ def test_a_null_has_no_patch_and_is_replaced_on_demand_only(tmp_path):
     (other / "chapter.tex").write_text("x", encoding="utf-8")
     for place, words in ((other, "not touched"), (other / "chapter.tex", "no folder")):
         with pytest.raises(FileNotWrittenError, match=words):
-            check_folder(place, replace_it=True)
+            check_verdict_folder(place, replace_it=True)
 
 
 def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path):

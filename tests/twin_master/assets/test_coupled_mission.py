@@ -143,7 +143,7 @@ def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(folder, direct, tmp_p
         new_run(loaded, tmp_path / "part")
     resume_run(tmp_path / "part")
     check_same(tmp_path / "part", direct[name], "run.nc", "config.json", "summary.json", "journal.jsonl")
-    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False, progress=SilentProgress())
+    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
     flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
     assert rows(flown) == rows(direct[name])
     assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
@@ -270,7 +270,7 @@ def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path):
     assert all(drawn[0][name] != drawn[1][name] for name in ("damage_seed", "gauge_seed"))
     received = np.genfromtxt(whole / "csv" / "observed.csv", delimiter=",", skip_header=1)[:, 6]
     assert np.flatnonzero(np.isnan(received)).tolist() == [20, 21, 22, 23]  # the sixth gauge is lost
-    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False, progress=SilentProgress())
+    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
     assert rows(new_run(loaded, tmp_path / "ssp", Overrides(ssp=ssp)).folder) == rows(whole)
 
 

@@ -15,7 +15,6 @@ from scipy.stats import norm
 
 from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
-from reporting.progress import SilentProgress
 from scenarios import asset_scripts
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, table_of
@@ -76,7 +75,7 @@ def changed(key: str, entry: object) -> LoadedScenario:
 
 def sampled(folder: Path, *grid: str) -> Path:
     """Sample the FMU of the small mission."""
-    found = grid_of_scenario(small_pump(), folder / "made", [*grid], progress=SilentProgress())
+    found = grid_of_scenario(small_pump(), folder / "made", [*grid])
     return sample_library(found, folder / "pump.nc", workers=1).path
 
 
@@ -184,7 +183,6 @@ def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
         assert "\n" not in str(caught.value)
     given: dict[str, Any] = {
         "overrides": Overrides(strain_library=library_file),
-        "progress": SilentProgress(),
     }
     with pytest.raises(InvalidObservationLibraryError, match="kind `strain_library`, and one FMU can be"):
         grid_of_scenario(load_scenario("level_turns"), tmp_path, **given)

@@ -18,7 +18,6 @@ from fe.runtime.patch import (
     Washout,
 )
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
-from reporting.progress import SilentProgress
 from tests.command_line import refused
 from tests.twin_master.runs import edited, figures_of, text_of, written
 from twin_master.assets.reduced_model import check_model_patch
@@ -160,7 +159,7 @@ def test_the_asset_with_its_effects_can_be_exported(tmp_path):
     write_patch(tmp_path, *DRIFT)
     loaded = load_scenario(scenario_of(tmp_path, PATCH, '"effect.hidden.gain" = 0.2'))
     ssp = tmp_path / "wing.ssp"
-    system = export_scenario(loaded, ssp, seed=1, replace_file=False, progress=SilentProgress())
+    system = export_scenario(loaded, ssp, seed=1, replace_file=False)
     with zipfile.ZipFile(system) as archive:
         names = [name for name in archive.namelist() if name.endswith((".ssd", ".ssv"))]
         text = "".join(archive.read(name).decode() for name in names)
