@@ -223,7 +223,7 @@ def library_wings(scenario: Scenario, folder: Path) -> Callable[[ParameterDraws,
     """Return what gives the authors' wing with one of their samples of the factor."""
     library = load_strain_library(folder)
     return lambda draws, index: StrainLibrarySource(
-        scenario, replace(library, strain=library.strain_per_draw[index]), "one sample"
+        scenario, replace(library, strain=library.strain_per_draw[index])
     )
 
 

@@ -50,7 +50,7 @@ def of_library(
 ) -> tuple[Knowledge, StrainLibrarySource]:
     """Return what a twin knows of the wing of a strain library, and that wing; with other sections."""
     scenario = load_scenario(name).scenario.model_copy(update=sections)
-    source = StrainLibrarySource(scenario, load_strain_library(library), "h")
+    source = StrainLibrarySource(scenario, load_strain_library(library))
     return prepare_knowledge(scenario, source, seed), source
 
 

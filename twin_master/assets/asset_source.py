@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn
 
 import numpy as np
@@ -70,10 +71,8 @@ class AssetReading:
 class Asset:
     """An asset under control; one that inherits from this has no state unless it says so."""
 
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units of control inputs and monitors by name; those that are missing are dimensionless."""
-        return {}
+    units: Mapping[str, str] = MappingProxyType({})
+    """Units of control inputs and monitors by name; those that are missing are dimensionless."""
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Fly one step with the given control inputs and true health (SI)."""
@@ -192,6 +191,8 @@ class AssetSource:
 
     label: ClassVar = "asset"
     """What is flown or believed, where that is always the same."""
+    differ: bool = False
+    """Whether what is believed is known to be another model than what is flown."""
     model: "ReducedModel | None" = None
     """The reduced model of what is flown or believed, once prepared, where there is one."""
 
@@ -227,7 +228,7 @@ class AssetSource:
     @property
     def origin(self) -> FlownAndBelieved:
         """The same twice."""
-        return FlownAndBelieved(self.words, self.words)
+        return FlownAndBelieved(self.words, self.words, self.differ)
 
     def check(self) -> None:
         """Look at what is given before anything is made; raise what is wrong with it."""
@@ -310,13 +311,16 @@ class PairedSource(AssetSource):
     """
 
     def __init__(self, asset: AssetSource, model: AssetSource, *, differ: bool = True) -> None:
-        self._asset, self._model, self._differ = asset, model, differ
+        self._asset, self._model, self.differ = asset, model, differ
+        told = ("draws", "observation_table", "structural_table", "write_field")
+        for name, source in {"open": asset, **dict.fromkeys(told, model)}.items():
+            setattr(self, name, getattr(source, name))
 
     @property
     def origin(self) -> FlownAndBelieved:
         """Asset of the one, model of the other."""
         asset, model = self._asset.origin, self._model.origin
-        return FlownAndBelieved(asset.asset, model.model, differ=self._differ or asset.differ or model.differ)
+        return FlownAndBelieved(asset.asset, model.model, differ=self.differ or asset.differ or model.differ)
 
     def check(self) -> None:
         """Check both."""
@@ -331,28 +335,8 @@ class PairedSource(AssetSource):
         """Prepare both; return the hashes of both."""
         hashes = {**self._asset.prepare(folder, progress), **self._model.prepare(folder, progress)}
         flown = hashes.get(FLOWN_DESIGN_HASH)
-        self._differ = self._differ or (flown is not None and hashes.get("design", flown) != flown)
+        self.differ = self.differ or (flown is not None and hashes.get("design", flown) != flown)
         return hashes
-
-    def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the parameter of the twin's model."""
-        return self._model.draws(seed)
-
-    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predictions (E, S, U, G) of the twin's model."""
-        return self._model.observation_table(draws, model)
-
-    def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return what is there at the sensors by the twin's model; None where they show it."""
-        return self._model.structural_table(draws, model)
-
-    def open(self) -> Asset:
-        """Return the asset at its start."""
-        return self._asset.open()
-
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write the field of the twin's model."""
-        return self._model.write_field(path, state, control)
 
 
 class WatchedSection(AssetSection):
@@ -381,11 +365,17 @@ FLOWN_DESIGN_HASH = "flown_design"
 BINDING_COPY = "asset/binding.toml"
 PATCH_COPY = "asset/patch.json"
 MODEL_PATCH_COPY = "asset/model_patch.json"
+LIBRARY_COPY = "asset/UAVconfig.json"
+OBSERVATIONS_COPY = "asset/observation_library.nc"
+SSP_COPY = "asset/system.ssp"
 HASHED = {
     "binding": BINDING_COPY,
     "calibration": CALIBRATION_COPY,
     "patch": PATCH_COPY,
     "model_patch": MODEL_PATCH_COPY,
+    "observation_library": OBSERVATIONS_COPY,
+    "ssp": SSP_COPY,
+    "strain_library": LIBRARY_COPY,
 }
 """Files whose hashes a run tells, and where their copies stand in its folder."""
 

@@ -20,7 +20,7 @@ from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from reporting.toml_file import Fault
-from twin_master.assets.asset_source import BINDING_COPY
+from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource
 from twin_master.errors import MissionInputError
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, FileSection
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from fmu_asset.coupling.wiring import Wiring
     from twin_master.assets.fmu_source import Session
 
-SSP_COPY = "asset/system.ssp"
 COMPONENT_FOLDER = "asset/components"
 
 
@@ -147,6 +146,16 @@ class SeveralSource(FmuSource):
         """Return the system as it is flown, once prepared."""
         raise NotImplementedError
 
+    def _packed(self, progress: Progress) -> dict[str, Path]:
+        """Pack what is not an FMU yet; return what is flown, by the names of the hashes."""
+        return {}
+
+    def _make(self, progress: Progress) -> dict[str, str]:
+        hashes = {name: hash_file(file) for name, file in self._packed(progress).items()}
+        # What does not fit is said before anything is flown.
+        self._session(self.binding(), self.parameters()).close()
+        return hashes
+
     def _session(
         self, binding: Binding, parameters: Mapping[str, float], wiring: "Wiring | None" = None
     ) -> "Session":
@@ -163,28 +172,21 @@ class SspSource(SeveralSource):
 
     label = "system of an SSP file"
 
-    def wiring(self) -> "Wiring":
-        """Return the system as it is flown, once prepared."""
+    def wiring(self, folder: Path | None = None) -> "Wiring":
+        """Return the system as it is flown, once prepared, or with its FMUs in a folder."""
         from fmu_asset.ssp.check import join_ssp
         from fmu_asset.ssp.reader import read_ssp
 
-        return join_ssp(read_ssp(self.path(SSP_COPY), self.path(COMPONENT_FOLDER)))
+        return join_ssp(read_ssp(self.path(SSP_COPY), folder or self.path(COMPONENT_FOLDER)))
 
     def _fitted(self, binding: Binding, folder: Path) -> Binding:
-        from fmu_asset.ssp.check import join_ssp, left_out_sentence
-        from fmu_asset.ssp.reader import read_ssp
+        from fmu_asset.ssp.check import left_out_sentence
 
-        file = self.path(SSP_COPY)
-        wiring = join_ssp(read_ssp(file, folder))
-        if sentence := left_out_sentence(wiring, file):
+        wiring = self.wiring(folder)
+        if sentence := left_out_sentence(wiring, self.path(SSP_COPY)):
             raise MissionInputError(sentence)
         self._session(binding, self.parameters(), wiring)
         return binding
-
-    def _make(self, progress: Progress) -> dict[str, str]:
-        # What does not fit is said before anything is flown.
-        self._session(self.binding(), self.parameters()).close()
-        return {"ssp": hash_file(self.path(SSP_COPY))}
 
 
 class CoupledSource(SeveralSource):
@@ -211,17 +213,11 @@ class CoupledSource(SeveralSource):
             self._structure({component.name: folder for component in components})
         return binding
 
-    def _make(self, progress: Progress) -> dict[str, str]:
-        """Pack what is not an FMU yet."""
-        hashes = {}
+    def _packed(self, progress: Progress) -> dict[str, Path]:
         with progress.stage("Packing the FMUs"):
-            for component in self.section.component:
-                hashes[f"fmu_{component.name}"] = hash_file(self._packed(component, progress))
-        # What does not fit is said before anything is flown.
-        self._session(self.binding(), self.parameters()).close()
-        return hashes
+            return {f"fmu_{part.name}": self._fmu(part, progress) for part in self.section.component}
 
-    def _packed(self, component: ComponentSection, progress: Progress) -> Path:
+    def _fmu(self, component: ComponentSection, progress: Progress) -> Path:
         """Return the FMU of a component in the run folder; packed if it is not there."""
         from fmu_asset.packing.structure_fmu import pack_wing
 

@@ -65,10 +65,6 @@ class DesignSection(FmuSection):
         "patch": PATCH_COPY,
     }
 
-    def differs_from(self, belief: BeliefSection) -> bool:
-        """Return whether the asset has hidden effects, or the twin believes in some."""
-        return self.patch is not None or belief.departs
-
     def source(self, scenario: Scenario) -> "WingFmuSource":
         """Return the FMU of the wing."""
         return WingFmuSource(scenario, self)
@@ -90,11 +86,6 @@ class DesignBelief(BeliefSection):
     """A patch file: effects that the model carries."""
 
     kept: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
-
-    @property
-    def departs(self) -> bool:
-        """Whether effects were added to the model."""
-        return self.patch is not None
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "DesignSource":
         """Return the model of the wing."""

@@ -180,13 +180,8 @@ class FmuAsset(Asset):
             taken.add(plain)
             self._names[name] = plain
         inputs = (*binding.parameter.items(), *binding.control.items())
-        self._units = {name: scalar.unit for name, scalar in inputs}
-        self._units |= {self._names[name]: unit for name, unit in session.recorded_units.items()}
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units of parameters, control inputs and of what is recorded beside the observations."""
-        return self._units
+        recorded = {self._names[name]: unit for name, unit in session.recorded_units.items()}
+        self.units = {name: scalar.unit for name, scalar in inputs} | recorded
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make one communication step."""
@@ -296,16 +291,14 @@ class FmuSource(AssetSource):
         scenario, load, rows = self._scenario, self.section.load, []
         with self._session(self.binding(), self.parameters()) as session:
             chosen = self._observed(session.binding)
+
+            def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+                return session.step(control, health, load).values[chosen]
+
             for row, value in enumerate(draws.values):
                 others = {name: float(values[row]) for name, values in draws.others.items()}
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
-                rows.append(
-                    asked_table(
-                        scenario,
-                        model.states.coordinates,
-                        lambda control, health: session.step(control, health, load).values[chosen],
-                    )
-                )
+                rows.append(asked_table(scenario, model.states.coordinates, ask))
         return np.array(rows)
 
     def _observed(self, binding: Binding, role: str = "") -> slice:

@@ -21,7 +21,7 @@ from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetSource, FlownAndBelieved
+from twin_master.assets.asset_source import OBSERVATIONS_COPY, AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import ParameterDraws
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-OBSERVATIONS_COPY = "asset/observation_library.nc"
 KIND = "uav-twin observation library"
 FORMAT = 1
 RESERVED = ("draw", "control", "sensor", "observation", "parameter_value", "sensor_unit")
@@ -276,11 +275,6 @@ class LibrarySource(AssetSource):
         other = {True: " of another FMU", False: " of it", None: ""}[self._other_fmu]
         return f"observation library{other}"
 
-    @property
-    def origin(self) -> FlownAndBelieved:
-        """The library, twice."""
-        return FlownAndBelieved(self.words, self.words, differ=self._other_fmu is True)
-
     @cached_property
     def library(self) -> ObservationLibrary:
         """The library, which has what the scenario asks for.
@@ -336,7 +330,8 @@ class LibrarySource(AssetSource):
         hashes = self._model.prepare(self._folder, progress) if own else {}
         # Of several FMUs each has its own hash.
         self._other_fmu = self.library.fmu_hash != hash_file(fmu) if fmu.exists() else None
-        return {**hashes, "observation_library": hash_file(self.path(OBSERVATIONS_COPY))}
+        self.differ = self._other_fmu is True
+        return hashes
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter, from the calibration of the scenario."""

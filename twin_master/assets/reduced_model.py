@@ -10,7 +10,7 @@ from fmu_asset.door.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, InnerTruth, StatelessAsset
-from twin_master.assets.parameter import ParameterDraws
+from twin_master.assets.parameter import ParameterDraws, calibrated_means
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import packed_row
@@ -62,13 +62,15 @@ class ReducedModelSource(AssetSource):
     def _true_values(self) -> dict[str, float]:
         """What of the true asset is the same in every step, by the names of the model."""
         asset = self._scenario.asset
-        given = {**asset.true_parameters, **asset.constant_load}
+        means = calibrated_means(self._scenario.calibration)
+        given = {**means, **asset.true_parameters, **asset.constant_load}
         return {name: value for name, value in given.items() if name in self.wing.chosen}
 
     @property
     def _outputs(self) -> slice:
         """Which outputs of the model are observed, where those at rest are."""
-        return slice(0, self.wing.gauge_count)
+        gauges = self.wing.gauge_count
+        return slice(0, gauges) if self._scenario.observation.role == "strain" else slice(gauges, None)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return strains, displacements, natural frequencies or features of modes (E, S, U, G).
@@ -190,13 +192,8 @@ class RecordedStructure(Asset):
         begin, names = bound.observation_slice("acceleration").start, self._section.accelerometers
         variables = bound.observation["acceleration"].variables
         self._chosen = [begin + variables.index(f"acceleration.{name}") for name in names]
-        self._units = {name: item.unit for name, item in (*bound.parameter.items(), *bound.control.items())}
+        self.units = {name: item.unit for name, item in (*bound.parameter.items(), *bound.control.items())}
         self._turn = 0
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units of parameters and control inputs."""
-        return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make and identify the record of a turn.

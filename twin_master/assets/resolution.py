@@ -69,14 +69,11 @@ def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
     """
     if isinstance(given, Overrides):
         return given
-    values = dict(given or {})
-    known = {item.name: str(item.type) for item in fields(Overrides)}
+    values, known = dict(given or {}), [item.name for item in fields(Overrides)]
     if unknown := [key for key in values if key not in known]:
         raise MissionInputError(said("assets.overrides", known=", ".join(known), names=", ".join(unknown)))
-    for key, value in values.items():
-        if "Path" in known[key] and value is not None:
-            values[key] = Path(value)
-    return Overrides(**values)
+    paths = [item.name for item in fields(Overrides) if item.type == Path | None]
+    return Overrides(**values | {key: Path(values[key]) for key in paths if values.get(key) is not None})
 
 
 def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:

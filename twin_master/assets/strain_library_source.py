@@ -15,9 +15,7 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.json_file import read_json
-from reporting.progress import Progress
-from reporting.provenance import hash_file
-from twin_master.assets.asset_source import Asset, AssetBelief, AssetReading, AssetSource, StatelessAsset
+from twin_master.assets.asset_source import LIBRARY_COPY, Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import (
     InvalidStrainLibraryError,
@@ -34,7 +32,6 @@ FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""
 REPOSITORY = "https://github.com/michaelkapteyn/UAV-Digital-Twin"
 """Where the authors of Kapteyn et al. 2021 published their strain library."""
-LIBRARY_COPY = f"asset/{FILE_NAME}"
 _TOLERANCE = 1e-9
 
 REGION_NAMES = ("z1", "z2")
@@ -162,13 +159,10 @@ class StrainLibrarySection(AssetSection):
     """A strain library in the authors' format."""
 
     kind: Literal["strain_library"] = "strain_library"
+    own_figures: ClassVar = True
     file: str | None = None
 
     kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
-
-    def differs_from(self, belief: BeliefSection) -> bool:
-        """Return whether the twin believes something else."""
-        return not isinstance(belief, AssetBelief)
 
     def source(self, scenario: Scenario) -> "StrainLibrarySource":
         """Return the library, read.
@@ -183,21 +177,17 @@ class StrainLibrarySection(AssetSection):
         if self.file is None:
             where = REPOSITORY, FILE_NAME
             raise MissionInputError(said("assets.authors", scenario=scenario, where=where))
-        return _read(scenario, Path(self.file), compared=self.differs_from(scenario.belief))
+        return _read(scenario, Path(self.file))
 
 
 class StrainLibraryBelief(BeliefSection):
     """A strain library in the authors' format as the twin's model of an FMU."""
 
     kind: Literal["strain_library"] = "strain_library"
+    own_figures: ClassVar = True
     file: str
 
     kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
-
-    @property
-    def departs(self) -> bool:
-        """An FMU is no strain library."""
-        return True
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "StrainLibrarySource":
         """Return the library, read.
@@ -211,7 +201,7 @@ class StrainLibraryBelief(BeliefSection):
         """
         if not scenario.asset.is_fmu:
             raise MissionInputError(said("assets.believed"))
-        return _read(scenario, Path(self.file), compared=True)
+        return _read(scenario, Path(self.file))
 
 
 class StrainLibrarySource(AssetSource):
@@ -219,20 +209,15 @@ class StrainLibrarySource(AssetSource):
 
     label = "strain library"
 
-    def __init__(
-        self, scenario: Scenario, library: StrainLibrary, content_hash: str, path: Path | None = None
-    ) -> None:
+    def __init__(self, scenario: Scenario, library: StrainLibrary, path: Path | None = None) -> None:
         super().__init__(scenario)
         self.places = {} if path is None else {LIBRARY_COPY: path}
-        self._library, self._hash = library, content_hash
+        self._library = library
         rows = [("control", scenario.control_names, library.controls)]
         check_names("the scenario has the", "the strain library", rows, MissingObservationModelError)
         self._control_index = [library.controls.index(name) for name in scenario.control_names]
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
             raise MissingObservationModelError(said("assets.gauges", library=library, scenario=scenario))
-
-    def _make(self, progress: Progress) -> dict[str, str]:
-        return {"strain_library": self._hash}
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return the library's own samples of its parameter."""
@@ -267,15 +252,15 @@ class StrainLibrarySource(AssetSource):
         return StatelessAsset(observe)
 
 
-def _read(scenario: Scenario, path: Path, *, compared: bool) -> StrainLibrarySource:
-    """Return the library of a file; `compared` with a model, a control such as `3g` must be that load factor.
+def _read(scenario: Scenario, path: Path) -> StrainLibrarySource:
+    """Return the library of a file; beside another model, a control such as `3g` must be that load factor.
 
     Raises
     ------
     MissingObservationModelError
         It is another one: asset and model would fly different turns.
     """
-    for control in scenario.control if compared else ():
+    for control in scenario.control if scenario.another_model else ():
         named, given = control.name.removesuffix("g"), control.values.get("load_factor")
         try:
             expected = float(named)
@@ -284,4 +269,4 @@ def _read(scenario: Scenario, path: Path, *, compared: bool) -> StrainLibrarySou
         if given is not None and abs(given - expected) > _TOLERANCE:
             factors = expected, given
             raise MissingObservationModelError(said("assets.load_factor", control=control, factors=factors))
-    return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
+    return StrainLibrarySource(scenario, load_strain_library(path), path)

@@ -363,14 +363,3 @@ class StructureSource(NamedStructure, ReducedModelSource):
     def _make(self, progress: Progress) -> dict[str, str]:
         self.model = self.reduced(progress)
         return super()._make(progress)
-
-    @property
-    def _true_values(self) -> dict[str, float]:
-        means = calibrated_means(self._scenario.calibration)
-        known = {name: value for name, value in means.items() if name in self.wing.chosen}
-        return known | super()._true_values
-
-    @property
-    def _outputs(self) -> slice:
-        gauges = self.wing.gauge_count
-        return slice(0, gauges) if self._scenario.observation.role == "strain" else slice(gauges, None)

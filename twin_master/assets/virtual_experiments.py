@@ -1,8 +1,8 @@
 """The wing FMU on the test bench: the laboratory experiments of the calibration, flown through FMI."""
 
+from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
@@ -24,7 +24,7 @@ BINDING = "uav_wing_laboratory"
 """The shipped binding of the test bench."""
 
 
-class FmuTestBench:
+class FmuTestBench(ExitStack):
     """The wing FMU as a `calibration.virtual_wing.TestBench`: it is loaded and let go through FMI alone.
 
     A weight is a tip force in the quasi-static response, and the displacement of its point of application is
@@ -48,39 +48,19 @@ class FmuTestBench:
         If the FMU cannot be flown or its parameters are out of range.
     """
 
-    def __init__(
-        self,
-        fmu: Path,
-        truth: DigitalState,
-        *,
-        isolated: bool = True,
-    ) -> None:
+    def __init__(self, fmu: Path, truth: DigitalState, *, isolated: bool = True) -> None:
+        super().__init__()
         self._fmu, self._isolated = Path(fmu), isolated
         declared = [item.name for item in read_fmu(fmu).variables]
         regions = [name.removeprefix("health.") for name in declared if name.startswith("health.")]
         self._binding = load_binding(binding_files()[BINDING]).with_regions(regions)
         check_recorded(len(self._binding.observation["strain"].variables))
         self._parameters = {
-            "young_modulus_factor": truth.young_modulus_factor,
-            "servo_mass": truth.servo_mass,
-            "pitot_mass": truth.pitot_mass,
-            "damping_alpha": truth.damping_alpha,
-            "damping_beta": truth.damping_beta,
+            name: value for name, value in asdict(truth).items() if name not in ("geometry", "stiffness_loss")
         }
         self._health = dict(zip(regions, losses_of(truth.stiffness_loss, tuple(regions)), strict=True))
         self._static = self._session(self._binding, {"response": float(QUASI_STATIC)})
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the worker."""
-        self._static.close()
+        self.callback(self._static.close)
 
     def tip_displacement(self, load: float) -> float:
         """Return the displacement [m] of the load point, 5 cm from the tip, under a load there [N]."""

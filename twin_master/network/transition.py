@@ -22,8 +22,8 @@ from twin_master.sentences import said
 
 JOINT_NON_ZEROS = 512
 """Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
-JOINT_LEVELS = 1024
-"""Joint levels of neighbours up to which they may share a table: it has 8 MB for each control."""
+JOINT_LEVELS = 64
+"""Joint levels of neighbours up to which they may share a table, which is multiplied with its zeros."""
 
 
 def predecessor_lists(blocks: Sequence[Float]) -> Lists:
@@ -172,9 +172,8 @@ def _grouped(factors: Sequence[Float]) -> Iterator[Float]:
     Applying a block costs its non-zeros for each of the other levels.
     """
     counts = [np.count_nonzero(factor, axis=(1, 2)) for factor in factors]
-    states = prod(factor.shape[1] for factor in factors)
     non_zeros_of_all = np.prod(counts, axis=0, dtype=np.float64).max()
-    if len(factors) == 1 or (states <= JOINT_LEVELS and non_zeros_of_all <= JOINT_NON_ZEROS):
+    if len(factors) == 1 or non_zeros_of_all <= JOINT_NON_ZEROS:
         yield _joint(factors)
         return
     group, count = [factors[0]], counts[0] / factors[0].shape[1]

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 from pydantic import ModelWrapValidatorHandler, model_validator
 
 from reporting.toml_file import shown
-from scenarios import asset_scripts, binding_files, structure_files
+from scenarios import asset_scripts, binding_files, recording_files, structure_files
 from twin_master.scenario.section import Section, short
 
 KIND_FOLDER = Path(__file__).parents[1] / "assets"
@@ -37,6 +37,7 @@ class FileSection(Section):
     shipped: ClassVar = {
         "binding": binding_files,
         "design": _shipped_designs,
+        "observations": recording_files,
         "script": asset_scripts,
         "structure": structure_files,
     }
@@ -79,6 +80,13 @@ class KindSection(FileSection):
     """A table whose `kind` says which class it is of."""
 
     kind: str
+    own_figures: ClassVar[bool] = False
+    """Whether its observations are of no model that anything else flies or believes."""
+
+    @property
+    def departs(self) -> bool:
+        """Whether this is known to be another model than all else, by its own figures or a patch."""
+        return self.own_figures or getattr(self, "patch", None) is not None
 
     @classmethod
     def kinds(cls) -> dict[str, type[Self]]:
@@ -109,11 +117,6 @@ class KindSection(FileSection):
 class BeliefSection(KindSection):
     """What the twin believes: where its predicted observations come from."""
 
-    @property
-    def departs(self) -> bool:
-        """Whether this is known to be another model than that of any asset."""
-        return False
-
     @abstractmethod
     def source(self, scenario: Any, flown: Any) -> Any:
         """Return what the twin of a `Scenario` believes of what is flown, both `asset_source.AssetSource`."""
@@ -134,10 +137,6 @@ class AssetSection(KindSection):
     def constant_load(self) -> Mapping[str, float]:
         """Load inputs, the same in every step, SI."""
         return {}
-
-    def differs_from(self, belief: BeliefSection) -> bool:
-        """Return whether this is known to be another model than the one that the twin believes."""
-        return belief.departs
 
     @abstractmethod
     def source(self, scenario: Any) -> Any:

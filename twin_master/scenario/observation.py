@@ -66,26 +66,19 @@ class ModesSection(Section):
 
     @property
     def columns(self) -> list[int]:
-        """Which of frequency, damping ratio and relative shape at each further accelerometer are observed."""
-        found = [
-            place
-            for place, name in enumerate(("frequency", "damping_ratio"))
-            if name in self.standard_deviation
-        ]
-        if "shape" in self.standard_deviation:
-            found += range(2, 1 + len(self.accelerometers))
-        return found
+        """Which of the features are observed."""
+        return [place for place, (_, kind) in enumerate(self.features) if kind in self.standard_deviation]
+
+    @property
+    def features(self) -> list[tuple[str, Feature]]:
+        """Name and kind of frequency, damping ratio and relative shape at each further accelerometer."""
+        shapes: list[tuple[str, Feature]] = [(name, "shape") for name in self.accelerometers[1:]]
+        return [("frequency", "frequency"), ("damping_ratio", "damping_ratio"), *shapes]
 
     def filled(self) -> dict[str, Any]:
         """Return the keys of `[observation]` that follow: count, titles, unit, standard_deviation."""
-        features = ["frequency", "damping_ratio", *self.accelerometers[1:]]
-        kinds: list[Feature] = ["frequency", "damping_ratio"]
-        kinds += ["shape" for _ in self.accelerometers[1:]]
-        each = [
-            (f"{features[column]}_{number + 1}", kinds[column])
-            for number in self.places
-            for column in self.columns
-        ]
+        observed = [self.features[column] for column in self.columns]
+        each = [(f"{name}_{number + 1}", kind) for number in self.places for name, kind in observed]
         return {
             "count": len(each),
             "titles": tuple(title for title, _ in each),

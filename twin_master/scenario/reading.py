@@ -156,12 +156,14 @@ def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
 def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
     kind, location = error["type"], tuple(error["loc"])
     where, value = _written(location, table)
-    if kind == "unknown_key":
-        return f"unknown key `{where}`; the keys known there are {error['ctx']['told']}."
+    if kind in ("unknown_key", "missing_key"):  # of the table there; the missing one may carry a unit
+        key, told = error["ctx"]["key"], error["ctx"]["told"]
+        before = f"{where}." if where else ""
+        if kind == "missing_key":
+            return f"`{before}{told}` is missing."
+        return f"unknown key `{before}{key}`; the keys known there are {told}."
     if kind == "missing":
         return f"`{where}` is missing."
-    if kind == "missing_key":  # which may carry a unit
-        return f"`{where.removesuffix(str(location[-1]))}{error['ctx']['told']}` is missing."
     if kind == "value_error":
         return f"{error['ctx']['error']}{f' (in `{where}`)' if where else ''}."
     expected = str(error["msg"]).replace("Input should", "should", 1)

@@ -130,9 +130,7 @@ class Calibration(FileSection):
     mean: Number | None = None
     standard_deviation: NotNegative | None = None
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copy of the calibration file stands in a run folder."""
-        return {"file": CALIBRATION_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"file": CALIBRATION_COPY}
 
     def faults(self) -> Iterator[Fault]:
         """Yield what a source needs, or does not take."""
@@ -254,7 +252,7 @@ class Scenario(Section):
     @property
     def another_model(self) -> bool:
         """Whether what is flown is known to be another model than the one that the twin believes."""
-        return self.asset.differs_from(self.belief)
+        return self.belief.kind != "asset" and (self.asset.departs or self.belief.departs)
 
     def moved(self, folder: Path) -> Self:
         """Return the scenario with its relative paths from a folder."""

@@ -1,10 +1,10 @@
 """A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from reporting import toml_file
 from reporting.toml_file import Fault as Fault
@@ -67,14 +67,6 @@ def one_or_each(key: str, value: object, count: int) -> Fault:
     return came != count, said("scenario.one_or_each", key=key, count=count, came=came)
 
 
-def _wrong_key(
-    kind: Literal["unknown_key", "missing_key"], key: str, told: str, came: object
-) -> InitErrorDetails:
-    sentence = "unknown key, those known there are {told}" if kind == "unknown_key" else "{told} is missing"
-    error = PydanticCustomError(kind, sentence, {"told": told})
-    return InitErrorDetails(type=error, loc=(key,), input=came)
-
-
 class Section(toml_file.Section):
     """A table of the file: unknown keys are refused, and a unit in a key's name is honoured."""
 
@@ -92,18 +84,14 @@ class Section(toml_file.Section):
         }
         given = {str(key): cls.split_unit(str(key)) for key in table}
         bases = {base for base, _ in given.values()}
-        listed = ", ".join(known.values())
-        wrong = [
-            _wrong_key("unknown_key", key, listed, table.get(key))
-            for key, (base, _) in given.items()
-            if base not in known
-        ]
-        required = [name for name in cls.units if cls.model_fields[name].is_required()]
-        wrong += [
-            _wrong_key("missing_key", name, known[name], table) for name in required if name not in bases
-        ]
-        if wrong:
-            raise ValidationError.from_exception_data(cls.__name__, wrong)
+        for key, (base, _) in given.items():
+            if base not in known:
+                told = {"key": key, "told": ", ".join(known.values())}
+                raise PydanticCustomError("unknown_key", "unknown key {key}", told)
+        for name in cls.units:
+            if cls.model_fields[name].is_required() and name not in bases:
+                told = {"key": name, "told": known[name]}
+                raise PydanticCustomError("missing_key", "{told} is missing", told)
         converted: dict[object, object] = {}
         for (key, (base, unit)), value in zip(given.items(), table.values(), strict=True):
             if base in table and unit:

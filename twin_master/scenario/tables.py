@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from scenarios import recording_files
+from twin_master.scenario.asset import FileSection
 from twin_master.scenario.observation import RecordSection
 from twin_master.scenario.section import (
     Count,
@@ -320,9 +320,10 @@ NoticingOrNot = Annotated[Noticing | None, BeforeValidator(lambda given: None if
 """The table, or `notice = false`."""
 
 
-class WatchSection(Section):
+class WatchSection(FileSection):
     """How a real asset is watched."""
 
+    kept: ClassVar[Mapping[str, str]] = {"observations": ""}  # a run folder has no copy
     observations: str | None = None
     """A recorded file that is watched where nothing else is given, or the name of a shipped one."""
     lag: Count = 50
@@ -339,11 +340,4 @@ class WatchSection(Section):
     @property
     def recording(self) -> Path | None:
         """The recorded file."""
-        name = self.observations
-        return None if name is None else recording_files().get(name, Path(name))
-
-    def moved(self, folder: Path) -> Self:
-        """Return the table with the path of the recorded file from a folder; a run folder has no copy."""
-        if self.observations is None or self.observations in recording_files():
-            return self
-        return self.model_copy(update={"observations": str(folder / self.observations)})
+        return self.all_files().get("")

@@ -279,7 +279,7 @@ class TestOnTheWing:
     def sources(self, wing: ReducedModel, library: Path) -> tuple[Scenario, ReducedModelSource, PairedSource]:
         scenario = load_scenario("level_turns").scenario
         own = ReducedModelSource(scenario, wing)
-        flown = StrainLibrarySource(scenario, load_strain_library(library), "h")
+        flown = StrainLibrarySource(scenario, load_strain_library(library))
         return scenario, own, PairedSource(flown, own)
 
     def test_a_library_of_the_same_wing_is_no_mismatch(self, wing, tmp_path):

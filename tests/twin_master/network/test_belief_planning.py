@@ -70,6 +70,7 @@ def test_an_independent_solver_finds_the_same_value(name):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_bounds_hold_what_is_enumerated(seed, moves_first):
     problem = drawn(seed, 3, moves_first, discount=0.3)
+    problem = replace(problem, discount=problem.discount * [0.5, 1.0, 1.0])
     turns = 4
     rest = 0.3**turns * np.abs(problem.reward).max() / 0.7
     exact = enumerated(problem, problem.prior, turns)

@@ -261,8 +261,8 @@ def test_factors_share_a_table_where_that_is_small_and_blocks_where_it_costs_no_
     assert sizes == {1: [5], 2: [25], 4: [25, 25], 6: [25, 25, 25], 7: [25, 25, 25, 5]}
     full = np.full((40, 40), 1.0 / 40)
     assert [b.shape[1] for b in TransitionModel.from_factors([[full, full]]).blocks] == [40, 40]
-    still = np.eye(400)
-    assert [b.shape[1] for b in TransitionModel.from_factors([[still, still]]).blocks] == [400, 400]
+    fine = worsening_table(25, 0.1)  # a table of both costs as much in lists, and 12 times as much with zeros
+    assert [b.shape[1] for b in TransitionModel.from_factors([[fine, fine]]).blocks] == [25, 25]
     monkeypatch.setattr(transition_file, "JOINT_NON_ZEROS", 0)
     tables = [[worsening_table(n, p) for n in (3, 2, 4)] for p in (0.1, 0.2)]
     np.testing.assert_allclose(

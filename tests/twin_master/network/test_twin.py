@@ -23,9 +23,7 @@ from twin_master.scenario.reading import load_scenario, parse_scenario
 @pytest.fixture
 def knowledge(library_file: Path) -> Knowledge:
     scenario = load_scenario("paper_level_turns").scenario
-    return prepare_knowledge(
-        scenario, StrainLibrarySource(scenario, load_strain_library(library_file), "h"), 0
-    )
+    return prepare_knowledge(scenario, StrainLibrarySource(scenario, load_strain_library(library_file)), 0)
 
 
 def test_the_model_of_the_paper():
