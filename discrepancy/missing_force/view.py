@@ -153,9 +153,7 @@ class View:
         known = [item for item in (self.known, self.own) if item is not None]
         found = []
         for number, trial in enumerate(self.trials):
-            left = trial.residual - sum(
-                (item[number].readings for item in known), np.zeros_like(trial.residual)
-            )
+            left = trial.residual - sum(item[number].readings for item in known)
             for k, turned in self.turned[number].items():
                 left = left + trial.about[k] * turned.readings
             found.append(left)

@@ -16,7 +16,6 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.document import Origin
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
-from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.verdict import Scores
@@ -34,7 +33,6 @@ from reporting.figures import (
     publication_style,
 )
 from reporting.page import ReportFigure
-from reporting.words import listing
 
 from .kit import heat_map, panels, plain_powers
 from .motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
@@ -229,10 +227,8 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     if missing is not None:
         add("missing_force", missing_force_figure(missing), sentence=force_sentence(missing.told))
     if before is not None:
-        scale = {
-            "held_out": _held_out_words(before),
-            "scale": " Both panels have one scale." if after is not None else "",
-        }
+        names = [item.trial.name for item in before.trials if item.trial.held_out]
+        scale = {"beside": WORDS.say("beside", names=names, both=after is not None)}
         if content.design is not None:
             add("residual_map", planform_figure(before, after, content.design), **scale)
         add("residual_table", heat_figure(before, after), **scale)
@@ -259,12 +255,3 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     if content.self_calibration is not None:
         add("self_calibration", confusion_figure(content.self_calibration))
     return found
-
-
-def _held_out_words(residuals: ResidualSet) -> str:
-    """Return a sentence on which trials are held out."""
-    names = [item.trial.name for item in residuals.trials if item.trial.held_out]
-    if not names:
-        return "No trial is held out."
-    them = "them" if names[1:] else "it"
-    return f"Held out: {listing(names)}; nothing but release and zero was fitted to {them}."

@@ -30,20 +30,17 @@ class Shown(NamedTuple):
     dashes: str
     marker: str
     label: str
+    title: str
 
 
 def models(before: ResidualSet, after: ResidualSet | None) -> list[Shown]:
     """Return the model as it was and, where there is one, with the effect."""
     if after is None:
-        return [Shown(before, PREDICTION, "--", "o", "model")]
+        return [Shown(before, PREDICTION, "--", "o", "model", "model as it is")]
     return [
-        Shown(before, PREDICTION, "--", "o", "model as it was"), Shown(after, PAST, "-", "D", AFTER),
-    ]  # fmt: skip
-
-
-def titles(shown: Sequence[Shown]) -> list[str]:
-    """Return the titles of panels of one model each."""
-    return [f"{'ab'[n]}  {item.label}" for n, item in enumerate(shown)] if shown[1:] else ["model as it is"]
+        Shown(before, PREDICTION, "--", "o", "model as it was", "a  model as it was"),
+        Shown(after, PAST, "-", "D", AFTER, f"b  {AFTER}"),
+    ]
 
 
 def panels(rows: int, columns: int, height: float, **grid: Any) -> tuple[Figure, list[list[Axes]]]:

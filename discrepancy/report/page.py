@@ -143,7 +143,7 @@ def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Share]]:
 FUNCTIONS = (
     evidence_rows, not_compared_rows, parameter_rows, score_rows, effect_rows, what_is_missing,
     sizes_sentence, deciding, calibration_rows, group_lines, neighbours, seen_of, when_sentence,
-    words.hypothesis_name,    words.headline, words.meaning, words.shares_sentence,
+    words.hypothesis_name,    words.headline, words.shares_sentence,
     words.remainders_sentence, words.residual_sizes, words.tested_shares, words.force_sentence,
 )  # fmt: skip
 """What templates of the page and of the command call."""

@@ -18,13 +18,16 @@ from discrepancy.verdict import GapWindow
 from fe.wing.design import WingDesign
 from reporting.figures import LEVELS, OBSERVED, REFERENCE
 
-from .kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
+from .kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar
 
 MOST_RECORDS = 12
 """Records that are drawn; those with the largest gaps go first."""
 LONGEST_NAME = 26
 MOST_CELLS = 12
 """Rows or columns up to which a heat map has its numbers written in."""
+GAUGE: dict[str, Any] = {"cmap": LEVELS, "s": 46, "edgecolors": "#333333", "linewidths": 0.6, "zorder": 3}
+BELOW: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "top", "fontsize": 6.5}
+"""How gauges and their names are drawn on the wing."""
 _STRAIN = re.compile(r"strain\[(\d+)\]")
 
 
@@ -76,12 +79,15 @@ def planform_figure(before: ResidualSet, after: ResidualSet | None, design: Wing
     norm = scale_of(np.array(sizes))
     strain = [before.channels[name].quantity is Quantity.STRAIN for name in places]
     figure, rows = panels(len(sizes), 1, 1.62 * len(sizes) + 0.35, sharex=True)
-    for (axes,), row, title in zip(rows, sizes, titles(shown), strict=True):
+    for (axes,), row, item in zip(rows, sizes, shown, strict=True):
         _draw_planform(axes, design)
         for name, is_strain, value in zip(places, strain, row, strict=True):
             if np.isfinite(value):
-                _draw_gauge(axes, name, _depth(design, *places[name]), value, norm, is_strain)
-        axes.set(title=title, ylabel="chord, m")
+                place = _depth(design, *places[name])
+                marker = "o" if is_strain else "s"
+                axes.scatter(*place, c=[value], norm=norm, marker=marker, **GAUGE)
+                axes.annotate(name, place, (0.0, -6.5), **BELOW)
+        axes.set(title=item.title, ylabel="chord, m")
     rows[-1][0].set_xlabel("distance from the root, m")
     size_bar(figure, norm, [axes for (axes,) in rows])
     return figure
@@ -108,16 +114,6 @@ def _draw_planform(axes: Axes, design: WingDesign) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(3))
 
 
-def _draw_gauge(
-    axes: Axes, name: str, place: tuple[float, float], value: float, norm: Normalize, is_strain: bool
-) -> None:
-    axes.scatter(
-        *place, c=[value], cmap=LEVELS, norm=norm, s=46, marker="o" if is_strain else "s",
-        edgecolors="#333333", linewidths=0.6, zorder=3,
-    )  # fmt: skip
-    axes.annotate(name, place, (0.0, -6.5), textcoords="offset points", ha="center", va="top", fontsize=6.5)
-
-
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     """Draw the sizes of the residuals by channel and trial, before and after at one scale."""
     shown = models(before, after)
@@ -128,10 +124,10 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     height = max(0.22 * len(channels), 0.9) + below + 0.35
     figure, (row,) = panels(1, len(tables), height)
     few = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
-    for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
+    for number, (axes, (_, _, table), item) in enumerate(zip(row, tables, shown, strict=True)):
         names = ([""] * len(channels) if number else channels, trials)
         heat_map(axes, table, names, norm, 40, _cells(table) if few else None)
-        axes.set_title(title)
+        axes.set_title(item.title)
     size_bar(figure, norm, row)
     return figure
 

@@ -156,13 +156,6 @@ def remainders_sentence(verdict: Verdict) -> str:
     return WORDS.say("left", remainders=verdict.remainders)
 
 
-def meaning(verdict: Verdict) -> str:
-    """Return what the verdict means, in a sentence."""
-    judged = all(gate.passed is not None for gate in verdict.gates if gate.name == "absolute fit")
-    meant: dict[str, str] = WORDS.content["meaning"] | ({} if judged else WORDS.content["unjudged"])
-    return meant[verdict.kind]
-
-
 def _labels(effects: Iterable[tuple[str, str, bool]]) -> str:
     """Return effects joined, each of a name and a place, and whether its shape is free."""
     found = []

@@ -1,6 +1,8 @@
 """`uav-twin discrepancy` as a user calls it: example, check, run, and what goes wrong."""
 
+import itertools
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -20,11 +22,21 @@ def campaign(tmp_path: Path) -> Path:
     return folder
 
 
+def columns(shown: str, heads: str) -> dict[str, list[str]]:
+    """Return the rows of a printed table by their first cells; cells stand two blanks apart, or more."""
+    lines = iter(shown.splitlines())
+    assert any(re.split(r"  +", line.strip()) == heads.split("|") for line in lines)
+    rows = (re.split(r"  +", line.strip()) for line in itertools.takewhile(str.strip, lines))
+    return {first: rest for first, *rest in rows if rest}
+
+
 def test_from_an_example_to_a_verdict(campaign, tmp_path):
     table = (campaign / "campaign.toml").read_text(encoding="utf-8")
     (campaign / "campaign.toml").write_text(table.replace("held_out = true", "held_out = false"), "utf-8")
     shown = said("discrepancy", "check", str(campaign), *RIG)
-    assert "seating_offset" in shown
+    seen = columns(shown, "effect|shows best at|parameter|detectable from|prior median")
+    assert seen["seating_offset"][:2] == ["A", "offset ratio"]
+    assert 0.0 < float(seen["seating_offset"][2]) < float(seen["seating_offset"][3]) == 0.03
     assert "Not testable: washout and inertia_relief. The campaign has no flight trial to fit." in shown
     assert "Hold out a trial" in shown or "held out" in shown
     out = tmp_path / "verdict"
@@ -32,6 +44,10 @@ def test_from_an_example_to_a_verdict(campaign, tmp_path):
     stored = read_verdict_file(out / "verdict.json")
     assert f"Verdict: {stored.verdict.kind.value}" in shown
     assert "seating_offset" in stored.verdict.inclusion
+    (named,) = columns(shown, "effect|place|parameter|value|90 % interval").items()
+    low, high = map(float, named[1][3].split(" to "))
+    assert (named[0], *named[1][:2]) == ("seating_offset", "A", "offset ratio")
+    assert low < float(named[1][2]) < high
     assert stored.origin.command == (
         f"uav-twin discrepancy run '{campaign.resolve()}' --model single_mass_rig --seed 0 --calibrate 1"
     )

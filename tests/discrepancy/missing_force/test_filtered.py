@@ -198,6 +198,27 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     assert value == pytest.approx(wanted, abs=0.02)
 
 
+@pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
+def test_the_most_probable_process_is_the_top_of_a_grid(end):
+    """Also at the bounds of its time: what jumps from sample to sample, what stays as it is."""
+    random, count = np.random.default_rng(11), 60
+    residual = random.standard_normal((count, 2))
+    residual[:, 1] += {0: 5.0 * random.standard_normal(count), 1: 0.0}.get(
+        end, 5.0 * np.sin(8.0 * 0.02 * np.arange(count))
+    )
+    residual[:, 0] += 4.0 if end == 1 else 0.0
+    view = View([trial_of(0.02 * np.arange(count), residual)], np.zeros(0))
+    about = {0: Process(1.0, 0.2)}
+    found, value = view.most_probable(about, about)
+    times = np.geomspace(*view.times, 16)
+    grid = [view.evidence(about, {0: Process(s, t)}) for s in np.geomspace(1e-2, 1e2, 41) for t in times]
+    assert max(grid) - 1e-6 < value == pytest.approx(view.evidence(about, found), abs=1e-9)
+    near = view.most_probable(about, found, near=True)
+    assert near[1] == pytest.approx(value, abs=1e-6)
+    if end is not None:
+        assert found[0].time == pytest.approx(view.times[end], rel=1e-6)
+
+
 # ---------------------------------------------------------------- forces that act at times
 
 
