@@ -5,6 +5,7 @@ for what really happened, eqs. (9) and (10) of Kapteyn et al. 2021 with its weig
 """
 
 from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -83,16 +84,13 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             raise MissionInputError(said("environment.modes", name=self.scenario.mission.name))
         source = source_of(self.scenario)
         source.check()
-        self._folder = TemporaryDirectory(prefix="uav_twin_")  # holds what is packed as long as it is flown
-        self._asset: Asset | None = None
-        try:
-            source.prepare(Path(self._folder.name), progress or SilentProgress())
+        with ExitStack() as opened:  # what is packed is held as long as it is flown
+            folder = Path(opened.enter_context(TemporaryDirectory(prefix="uav_twin_")))
+            source.prepare(folder, progress or SilentProgress())
             self.knowledge = prepare_knowledge(self.scenario, source, self.scenario.mission.seed)
-            self._asset = source.open()
-        except BaseException:
-            self._folder.cleanup()
-            raise
-        self._start = self._asset.save_state()
+            self._asset: Asset | None = opened.enter_context(closing(source.open()))
+            self._start = self._asset.save_state()
+            self._opened = opened.pop_all()
         self._plant: Plant | None = None
         self._step, self._seed, self._control = 0, 0, 0
         self._seen: Float = np.empty(0)
@@ -150,9 +148,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
 
     def close(self) -> None:
         """Let go of the asset and what was packed for it."""
-        if self._asset is not None:
-            self._asset.close()
-            self._folder.cleanup()
+        self._opened.close()
         self._asset = self._plant = None
 
     def _fly(self, control: int, before: int | None) -> tuple[Float, float, dict[str, Any]]:

@@ -291,16 +291,14 @@ class FmuSource(AssetSource):
         scenario, load, rows = self._scenario, self.section.load, []
         with self._session(self.binding(), self.parameters()) as session:
             chosen = self._observed(session.binding)
+
+            def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+                return session.step(control, health, load).values[chosen]
+
             for row, value in enumerate(draws.values):
                 others = {name: float(values[row]) for name, values in draws.others.items()}
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
-                rows.append(
-                    asked_table(
-                        scenario,
-                        model.states.coordinates,
-                        lambda control, health: session.step(control, health, load).values[chosen],
-                    )
-                )
+                rows.append(asked_table(scenario, model.states.coordinates, ask))
         return np.array(rows)
 
     def _observed(self, binding: Binding, role: str = "") -> slice:

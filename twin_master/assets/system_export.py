@@ -127,16 +127,13 @@ def _with_values(
     for name, value in load.items():
         slot = exchange.slot("load", name)
         settings.append((slot.variable.kind, slot.variable.reference, slot.numbers(value).tolist()))
-    values = system.of_components(settings)
+    given: dict[str, dict[str, Setting]] = {
+        name: {key: Setting(number) for key, number in values.items()}
+        for name, values in system.of_components(settings).items()
+    }
     components = tuple(
-        replace(
-            component,
-            settings={
-                **component.settings,
-                **{key: Setting(number) for key, number in values.get(component.name, {}).items()},
-            },
-        )
-        for component in wiring.structure.components
+        replace(part, settings={**part.settings, **given.get(part.name, {})})
+        for part in wiring.structure.components
     )
     names = {
         system.ends[item.variable][0].end: name

@@ -196,11 +196,8 @@ class ComparedPolicy:
 
 def promised(scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy) -> ComparedPolicy:
     """Return what a policy on the belief brings in simulated missions."""
-
-    def rule(belief: Float, _turn: int) -> Index:
-        return policy.decide(belief)
-
-    return ComparedPolicy("planned on the belief", _simulated(scenario, problem, rule))
+    returns = _simulated(scenario, problem, lambda belief, _turn: policy.decide(belief))
+    return ComparedPolicy("planned on the belief", returns)
 
 
 def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPolicy, ...]:

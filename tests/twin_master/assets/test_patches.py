@@ -19,7 +19,7 @@ from fe.runtime.patch import (
 )
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from tests.command_line import refused
-from tests.twin_master.runs import edited, figures_of, text_of, written
+from tests.twin_master.runs import figures_of, text_of, written
 from twin_master.assets.reduced_model import check_model_patch
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
@@ -47,13 +47,14 @@ def write_patch(folder: Path, *primitives: Primitive) -> Path:
 
 def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str = "") -> Path:
     """The mission with lines in the tables of asset and belief and with further parameters."""
-    text = edited(TEXT, ('binding = "uav_wing"\n', f'binding = "uav_wing"\n{lines}'))
-    text = edited(text, ("[belief]\n", f"[belief]\n{belief}"))
-    if parameters:
-        text = edited(
-            text, ("young_modulus_factor = 1.0073 }", f"young_modulus_factor = 1.0073, {parameters} }}")
-        )
-    return written(folder, text)
+    more = f", {parameters}" if parameters else ""
+    return written(
+        folder,
+        TEXT,
+        ('binding = "uav_wing"\n', f'binding = "uav_wing"\n{lines}'),
+        ("[belief]\n", f"[belief]\n{belief}"),
+        ("factor = 1.0073 }", f"factor = 1.0073{more} }}"),
+    )
 
 
 def test_combinations_that_mean_nothing_are_refused(tmp_path):
@@ -96,9 +97,8 @@ def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):
 
 def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path):
     write_patch(tmp_path, *STRUCTURE)
-    source = asset_source(
-        resolve_scenario(load_scenario(scenario_of(tmp_path, PATCH, belief=PATCH)), Overrides())
-    )
+    loaded = load_scenario(scenario_of(tmp_path, PATCH, belief=PATCH))
+    source = asset_source(resolve_scenario(loaded, Overrides()))
     source.check()
     assert source.origin.asset.endswith("with hidden effects")
     assert source.origin.model.endswith("with effects")

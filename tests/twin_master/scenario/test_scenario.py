@@ -18,7 +18,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import ScenarioError, TwinMasterError, UnknownScenarioError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.graphical_model import worsening_table
-from twin_master.scenario.asset import AssetSection, BeliefSection
+from twin_master.scenario.asset import AssetSection
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
@@ -67,24 +67,19 @@ def test_files_that_are_none_or_name_what_is_not_there(tmp_path):
         load_scenario("level_turn")
 
 
-@pytest.mark.parametrize(
-    ("section", "key", "value", "words"),
-    [
-        ("mission", "seed", 10**40, ["mission.seed", "at most 9223372036854775807", "files"]),
-        ("mission", "seed", 10**5000, ["mission.seed", "thousands of digits"]),
+def test_numbers_that_no_file_or_float_holds_or_come_twice_are_refused():
+    for section, key, value, words in (
+        ("mission", "seed", 10**40, r"at most 9223372036854775807.*files.*mission\.seed"),
+        ("mission", "seed", 10**5000, r"thousands of digits.*mission\.seed"),
         ("observation", "standard_deviation_microstrain", 10**400,
-         ["observation.standard_deviation_microstrain", "finite"]),
-        ("rewards", "health_weight", 10**5000, ["rewards.health_weight", "thousands of digits"]),
-        ("observation", "standard_deviation", 1e-4, ["both given"]),  # with and without unit
-    ],
-    ids=["seed", "long_seed", "deviation", "long_weight", "both"],
-)  # fmt: skip
-def test_numbers_that_no_file_or_float_holds_or_come_twice_are_refused(section, key, value, words):
-    table = table_of("level_turns")
-    table[section][key] = value
-    with pytest.raises(ScenarioError) as caught:
-        parse_scenario(table, "mine.toml")
-    assert all(word in str(caught.value) for word in words), caught.value
+         r"observation\.standard_deviation_microstrain.*finite"),
+        ("rewards", "health_weight", 10**5000, r"rewards\.health_weight.*thousands of digits"),
+        ("observation", "standard_deviation", 1e-4, "both given"),  # with and without unit
+    ):  # fmt: skip
+        table = table_of("level_turns")
+        table[section][key] = value
+        with refused(ScenarioError, words):
+            parse_scenario(table, "mine.toml")
 
 
 def test_tables_are_checked():
@@ -174,13 +169,6 @@ def test_what_is_wrong_with_format_1_stays_wrong():
     ):
         with pytest.raises(ScenarioError, match=words):
             of_format_1("level_turns", asset)  # type: ignore[arg-type]
-
-
-def test_the_kinds():
-    assert {*AssetSection.kinds()} >= {
-        "design", "calibration", "fmu", "script", "coupled", "ssp", "strain_library",
-    }  # fmt: skip
-    assert {*BeliefSection.kinds()} >= {"asset", "design", "calibration", "library", "strain_library"}
 
 
 class Bellows(AssetSection):
