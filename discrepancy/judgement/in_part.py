@@ -39,8 +39,7 @@ from .conclusion import (
     small_terms,
 )
 from .consistency_gate import consistency_gate
-from .court import Court, families, names, part, percent
-from .court_of_force import ByForce
+from .court import ByForce, Court, families, names, part, percent
 from .proof import held_out_gate
 
 LEAST_SHOWN = 0.1
