@@ -53,13 +53,13 @@ from discrepancy.model_choice import choice_of_run as choice_of_run
 from discrepancy.model_choice import choose_model as choose_model
 from discrepancy.models.interface import Model as Model
 from discrepancy.parameters.calibration import calibrate_parameters as calibrate_parameters
-from discrepancy.report.check_tables import group_lines as group_lines
-from discrepancy.report.check_tables import needs as needs
-from discrepancy.report.check_tables import neighbours as neighbours
-from discrepancy.report.check_tables import seen_of as seen_of
 from discrepancy.report.figures import ReportInput as ReportInput
 from discrepancy.report.page import said_on_page as said_on_page
 from discrepancy.report.text import formula as formula
+from discrepancy.report.text import group_lines as group_lines
+from discrepancy.report.text import needs as needs
+from discrepancy.report.text import neighbours as neighbours
+from discrepancy.report.text import seen_of as seen_of
 from discrepancy.report.text import unit_text as unit_text
 from discrepancy.self_calibration import self_calibrate as self_calibrate
 from discrepancy.sources.examples import example_campaign as example_campaign

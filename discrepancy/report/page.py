@@ -11,9 +11,8 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
 from discrepancy.judgement.when import NO_GAP, when_sentence
 from discrepancy.report import text as words
-from discrepancy.report.check_tables import group_lines, neighbours, seen_of
 from discrepancy.report.figures import ReportInput
-from discrepancy.report.text import WORDS
+from discrepancy.report.text import WORDS, group_lines, neighbours, seen_of
 from discrepancy.self_calibration import SelfCalibration, Share, outcomes
 from discrepancy.verdict import Gate, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation

@@ -20,7 +20,7 @@ from discrepancy.judgement.next_experiment import (
     proposals,
 )
 from discrepancy.judgement.separability import CONFUSED, _groups, as_predicted, separability
-from discrepancy.report.check_tables import group_lines
+from discrepancy.report.text import group_lines
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 

@@ -11,22 +11,20 @@ from scipy.stats import norm
 from discrepancy.campaign.records import TrialKind
 from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
-from discrepancy.report.check_tables import (
-    group_lines,
-    needs,
-    neighbours,
-    seen_of,
-)
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import parameter_rows, render_report
 from discrepancy.report.residual_figures import size_table
 from discrepancy.report.text import (
     WORDS,
+    group_lines,
     headline,
+    needs,
+    neighbours,
     number,
     percent,
     remainders_sentence,
     residual_sizes,
+    seen_of,
     share_text,
     shares_sentence,
 )
