@@ -15,8 +15,7 @@ from scipy.signal import periodogram
 from discrepancy.campaign.records import FloatArray, Hold, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Course, Load, straight
-from discrepancy.models.fmu_file import FmuModelDescription, ReleaseOf
-from discrepancy.models.fmu_variables import FmuVariables
+from discrepancy.models.fmu_file import FmuModelDescription, FmuVariables, ReleaseOf
 from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
