@@ -17,10 +17,10 @@ from twin_master.viewer.command import shown
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from twin_master.fleet.engine import Engine
     from twin_master.fleet.flight import FleetOutcome
     from twin_master.fleet.plan import Fleet
     from twin_master.fleet.reading import Estimated
+    from twin_master.fleet.shard import Engine
     from twin_master.fleet.watching import WatchedAsset
 
 
@@ -187,7 +187,7 @@ def engine_of(workers: int | None, cluster: str | None) -> "Engine":
     """Return who flies, by what the user said."""
     import os
 
-    from twin_master.fleet.engine import Engine
+    from twin_master.fleet.shard import Engine
 
     if cluster is not None:
         if workers is not None:

@@ -21,9 +21,8 @@ from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderExistsError
-from twin_master.fleet.engine import Engine, Piece, flown
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
-from twin_master.fleet.shard import Kit, ShardResult, with_parameters
+from twin_master.fleet.shard import Engine, Kit, Piece, ShardResult, flown, with_parameters
 from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge

@@ -16,11 +16,11 @@ from tests.twin_master.runs import check_same, edited, text_of, written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderExistsError
 from twin_master.fleet import flight
-from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet, seed_range
 from twin_master.fleet.reading import Estimated, group_figures
 from twin_master.fleet.reading import open_fleet as fleet_groups
+from twin_master.fleet.shard import Engine
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import kept_knowledge
@@ -186,7 +186,7 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
 
     monkeypatch.setattr(flight, "prepared", preparing)
     monkeypatch.setattr(flight, "_check", lambda _fleet: None)
-    monkeypatch.setattr("twin_master.fleet.engine.fly_shard", lambda _kit, members: "it was flown")
+    monkeypatch.setattr("twin_master.fleet.shard.fly_shard", lambda _kit, members: "it was flown")
     south = FLEET[FLEET.index('[[group]]\nname = "south"') :]
     fleet = changed(fleet_file, (south, ""), ("count = 3", 'fmus = "*.fmu"'))
     outcome = fly_fleet(fleet, fleet_file.parent / "out", Engine(0))
@@ -232,7 +232,7 @@ def test_the_command_line(library_file, tmp_path):
 
 def test_without_the_extra_or_a_scheduler_nothing_is_begun(library_file, tmp_path, monkeypatch):
     fleet, folder = growing(library_file), tmp_path / "fleet"
-    monkeypatch.setattr("twin_master.fleet.engine.CONNECTING", 0.2)
+    monkeypatch.setattr("twin_master.fleet.shard.CONNECTING", 0.2)
     with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         fly_fleet(fleet, folder, Engine(cluster="tcp://127.0.0.1:9"))
     assert fly_fleet(fleet, folder).shards_flown == 3

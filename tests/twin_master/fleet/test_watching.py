@@ -21,7 +21,6 @@ from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
-from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import learn_from_fleet
@@ -29,6 +28,7 @@ from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import attention, group_figures, leaving
 from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import fleet_page, write_fleet_report
+from twin_master.fleet.shard import Engine
 from twin_master.fleet.view import WORST, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
