@@ -12,8 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from reporting.arrays import Float
-from twin_master.learning.hypotheses import Hypotheses, quantiles_of, shown_by
-from twin_master.learning.learning_filter import LearningFilter
+from twin_master.learning.learning_filter import Hypotheses, LearningFilter, quantiles_of, shown_by
 from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.rewards import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel

@@ -10,8 +10,7 @@ from scipy.stats import foldnorm, multivariate_normal, multivariate_t, norm
 
 from twin_master.errors import InvalidModelError
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.hypotheses import quantiles_of
-from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.learning_filter import LearningFilter, LearntPriors, quantiles_of
 from twin_master.learning.posterior import posterior_of_draws
 from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
