@@ -143,8 +143,8 @@ from twin_master.assets.resolution import Overrides as Overrides
 from twin_master.assets.system_export import export_design as export_design
 from twin_master.assets.system_export import export_scenario as export_scenario
 from twin_master.assets.virtual_experiments import FmuTestBench as FmuTestBench
-from twin_master.library.request import grid_of_fmu as grid_of_fmu
-from twin_master.library.request import grid_of_scenario as grid_of_scenario
+from twin_master.library.grid import grid_of_fmu as grid_of_fmu
+from twin_master.library.grid import grid_of_scenario as grid_of_scenario
 from twin_master.library.sampling import blocks_folder as blocks_folder
 from twin_master.library.sampling import sample_library as sample_library
 from twin_master.scenario.reading import load_scenario as load_scenario

@@ -21,7 +21,7 @@ from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
-from twin_master.library.request import grid_of_scenario
+from twin_master.library.grid import grid_of_scenario
 from twin_master.library.sampling import sample_library
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace, deterministic_policy
 from twin_master.network.inference import filter_sequence, predict, smooth

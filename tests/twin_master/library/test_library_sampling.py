@@ -18,8 +18,7 @@ from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.packing.contents import build_script_fmu
 from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
-from twin_master.library.grid import SamplingGrid
-from twin_master.library.request import grid_of_fmu, parse_grid
+from twin_master.library.grid import SamplingGrid, grid_of_fmu, parse_grid
 from twin_master.library.sampling import blocks_folder, sample_library
 
 BINDING = """
