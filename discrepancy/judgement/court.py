@@ -1,7 +1,7 @@
 """Hypotheses before a court: which may be named, what speaks against the others.
 
 Where no simulation leaves noise, hypotheses are compared by their readings, or along the missing force
-(`court_of_force`). Each has evidence, and is a share of what is missing, in trials that were fitted and in
+(`ByForce`). Each has evidence, and is a share of what is missing, in trials that were fitted and in
 those that were not.
 """
 

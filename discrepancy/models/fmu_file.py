@@ -1,4 +1,7 @@
-"""An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
+"""An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports.
+
+First the binding to these variables, in SI units.
+"""
 
 from collections.abc import Iterator, Mapping
 from math import pi

@@ -1,4 +1,7 @@
-"""Numbers, sizes in SI units and sentences of the report and of the summary on the terminal."""
+"""Numbers, sizes in SI units and sentences of the report and of the summary on the terminal.
+
+Last what a campaign can decide, in rows for both.
+"""
 
 import re
 from collections.abc import Collection, Iterable, Sequence

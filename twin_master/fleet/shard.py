@@ -2,6 +2,9 @@
 
 A piece of work carries all that it needs, so that it can be done on any machine, by any process, any number
 of times: the result is the same to the last bit.
+
+Who flies: this process, worker processes of this machine, or a Dask cluster at an address. Results come back
+in any order.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""The grid over which an FMU is sampled, and one worker's way through a block of it."""
+"""What a user asks to be sampled, the grid that comes of it, and one worker's way through a block of it."""
 
 import itertools
 import math

@@ -1,6 +1,6 @@
-"""Gaussian sensors: likelihood of what they show, and residuals.
+"""Gaussian sensors: the likelihood of what they show, residuals, and classes of what they may show.
 
-Kapteyn et al. 2021, eqs. (30) and (32).
+Kapteyn et al. 2021, eqs. (30) and (32). Sensors that are read only when asked for stand behind the gauges.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""The report of a run: one self-contained page and its figures, from nothing but the run folder."""
+"""The report of a run: one self-contained page and its figures, from nothing but the run folder.
+
+First the sentences with which it begins: what was decided, what is believed, whether the model holds.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
