@@ -147,7 +147,7 @@ class MessageReader:
                 observed[sensor] = shown
         turn, time, control = (record.get(name) for name in ("turn", "time", "control"))
         if turn is not None and (type(turn) is not int or not 0 <= turn <= LARGEST_SEED):
-            raise Refused("`turn` is a whole number from 0")
+            raise Refused(f"`turn` is a whole number from 0, and {turn!r:.40} came")
         time = float(time) if type(time) is int else time
         if time is not None and not (isinstance(time, float) and math.isfinite(time)):
             raise Refused("`time` is a number of seconds")
