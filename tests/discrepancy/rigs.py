@@ -1,5 +1,6 @@
 """Simulated campaigns of the single-mass rig, and sensitivities of fits."""
 
+import shutil
 import tomllib
 from dataclasses import fields, replace
 from functools import cache
@@ -20,6 +21,17 @@ from tests.refusals import Inputs
 
 MODEL = "single_mass_rig"
 INPUTS = Inputs(Path(__file__).with_name("models"))
+CAMPAIGNS = Inputs(Path(__file__).with_name("data"))
+
+
+def campaign_folder(path: Path, name: str, *changes: tuple[str, str, str]) -> Path:
+    """Write a campaign of the tests of data: of a file a piece is exchanged, the whole where it is empty."""
+    shutil.copytree(CAMPAIGNS.folder / name, path, dirs_exist_ok=True)
+    for file, old, new in changes:
+        text = (path / file).read_text(encoding="utf-8")
+        assert old in text
+        (path / file).write_text(text.replace(old, new, 1) if old else new, encoding="utf-8")
+    return path
 
 
 ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run rig", collect_provenance(0))
