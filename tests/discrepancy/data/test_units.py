@@ -1,91 +1,38 @@
 """Units of campaigns: those of old have kept their meaning, and pint knows the others."""
 
-from math import pi
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
+from tests.refusals import Inputs
 
-POWERS = {
-    Quantity.STRAIN: {"1": 0, "microstrain": -6, "percent": -2},
-    Quantity.DISPLACEMENT: {"m": 0, "mm": -3, "um": -6},
-    Quantity.VELOCITY: {"m/s": 0, "mm/s": -3},
-    Quantity.ACCELERATION: {"m/s2": 0, "mm/s2": -3},
-    Quantity.SIGNAL: {"V": 0, "mV": -3, "1": 0},
-    Quantity.ANGLE: {"rad": 0, "mrad": -3},
-    Quantity.ANGULAR_VELOCITY: {"rad/s": 0},
-    Quantity.ANGULAR_ACCELERATION: {"rad/s2": 0},
-    Quantity.FORCE: {"N": 0, "mN": -3, "kN": 3},
-    Quantity.TORQUE: {"N m": 0, "mN m": -3, "kN m": 3},
-    Quantity.PRESSURE: {"Pa": 0, "hPa": 2, "kPa": 3, "bar": 5, "mbar": 2, "MPa": 6},
-    Quantity.LEVEL: {"m": 0, "cm": -2, "mm": -3},
-    Quantity.FLOW: {"m3/s": 0, "l/s": -3},
-    Quantity.TEMPERATURE: {"degC": 0, "K": 0},
-    Quantity.HEAT: {"W": 0, "mW": -3, "kW": 3},
-    Quantity.VOLTAGE: {"V": 0, "mV": -3, "kV": 3},
-    Quantity.CURRENT: {"A": 0, "mA": -3},
-    Quantity.CHARGE: {"C": 0, "mC": -3},
-}
-FACTORS = {
-    (Quantity.VELOCITY, "km/h"): 1.0 / 3.6,
-    (Quantity.ACCELERATION, "g"): 9.80665,
-    (Quantity.ANGLE, "deg"): pi / 180.0,
-    (Quantity.ANGULAR_VELOCITY, "deg/s"): pi / 180.0,
-    (Quantity.ANGULAR_VELOCITY, "rpm"): 2.0 * pi / 60.0,
-    (Quantity.ANGULAR_ACCELERATION, "deg/s2"): pi / 180.0,
-    (Quantity.FLOW, "l/min"): 1e-3 / 60.0,
-    (Quantity.FLOW, "m3/h"): 1.0 / 3600.0,
-    (Quantity.CHARGE, "A h"): 3600.0,
-}
-"""What the units of campaigns were before pint: written down, for their meaning must not change."""
+
+def rows(table):
+    """Return quantity, unit and its power or factor, of a part of `units.toml`."""
+    known = Inputs(__file__).table("units.toml")[table]
+    return [(Quantity(name), unit, size) for name, row in known.items() for unit, size in row.items()]
 
 
 def test_the_units_of_old_mean_the_same():
-    known = {(quantity, unit): power for quantity, row in POWERS.items() for unit, power in row.items()}
-    for (quantity, unit), power in known.items():
+    """What they were before pint is written down, for their meaning must not change."""
+    for quantity, unit, power in rows("powers"):
         assert conversion_of(quantity, unit).factor == float(f"1e{power}"), unit
-    for (quantity, unit), factor in FACTORS.items():
-        assert conversion_of(quantity, unit).factor == pytest.approx(factor, rel=1e-15), unit
     usual = {(quantity, unit) for quantity, row in UNITS.items() for unit in row.usual}
-    assert usual == known.keys() | FACTORS.keys()
+    assert usual == {row[:2] for table in ("powers", "factors") for row in rows(table)}
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e150, max_value=1e150))
 def test_a_unit_and_back_is_the_same_to_rounding(value):
-    for quantity, row in POWERS.items():
-        for unit, power in row.items():
-            known = conversion_of(quantity, unit)
-            assert known.to_si(value) == pytest.approx(value * 10.0**power, rel=1e-15)
-            assert known.from_si(known.to_si(value)) == pytest.approx(value, rel=1e-15)
+    for quantity, unit, power in rows("powers"):
+        known = conversion_of(quantity, unit)
+        assert known.to_si(value) == pytest.approx(value * 10.0**power, rel=1e-15)
+        assert known.from_si(known.to_si(value)) == pytest.approx(value, rel=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("unit", "quantity", "factor"),
-    [
-        ("kip", Quantity.FORCE, 4448.2216152605),
-        ("kgf", Quantity.FORCE, 9.80665),
-        ("kp", Quantity.FORCE, 9.80665),
-        ("in", Quantity.DISPLACEMENT, 0.0254),
-        ("mg", Quantity.ACCELERATION, 9.80665e-3),
-        ("m/s²", Quantity.ACCELERATION, 1.0),
-        ("m/s^2", Quantity.ACCELERATION, 1.0),
-        ("m s-2", Quantity.ACCELERATION, 1.0),
-        ("kNm", Quantity.TORQUE, 1e3),
-        ("N·mm", Quantity.TORQUE, 1e-3),
-        ("N/mm²", Quantity.PRESSURE, 1e6),
-        ("µε", Quantity.STRAIN, 1e-6),
-        ("µm/m", Quantity.STRAIN, 1e-6),
-        ("μm/m", Quantity.STRAIN, 1e-6),  # the Greek letter
-        ("‰", Quantity.STRAIN, 1e-3),
-        ("U/min", Quantity.ANGULAR_VELOCITY, 2.0 * pi / 60.0),
-        ("°", Quantity.ANGLE, pi / 180.0),
-        ("mAh", Quantity.CHARGE, 3.6),
-    ],
-)
-def test_units_as_laboratories_write_them(unit, quantity, factor):
+@pytest.mark.parametrize(("quantity", "unit", "factor"), rows("factors") + rows("others"))
+def test_units_as_laboratories_write_them(quantity, unit, factor):
     assert quantity in quantities_of(unit)
     assert conversion_of(quantity, unit).factor == pytest.approx(factor, rel=1e-15)
 
