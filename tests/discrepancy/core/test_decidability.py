@@ -19,7 +19,7 @@ from discrepancy.judgement.next_experiment import (
     oscillates,
     proposals,
 )
-from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
+from discrepancy.judgement.separability import CONFUSED, _groups, as_predicted, separability
 from discrepancy.report.text import group_lines
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs

@@ -6,7 +6,7 @@ import pytest
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.errors import CatalogueError
-from discrepancy.models.interface import Conditions
+from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import Clock, DecayingLine, ModelPatch, SensorGain, SensorRotation
 
@@ -20,21 +20,21 @@ TRIALS = tuple(
 )
 RING, PULL = TRIALS
 CHANNELS = {
-    "tip": Channel("tip", Quantity.DISPLACEMENT, "x", None),
+    "tip": Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", None),
     "g0": Channel("g0", Quantity.STRAIN, "strain[0]", None),
     "g1": Channel("g1", Quantity.STRAIN, "strain[1]", None),
 }
 CAMPAIGN = Campaign("mass", CHANNELS, TRIALS, 20.0, {}, "")
 
 
-def test_observations_are_responses_through_the_sensors_of_a_patch(oscillator):
+def test_observations_are_responses_through_the_sensors_of_a_patch(cantilever):
     def seen(trial, *items, **conditions):
         given = Conditions(np.ones(1), **conditions)
-        return observe(oscillator, CAMPAIGN, trial, ModelPatch(items), given)
+        return observe(cantilever, CAMPAIGN, trial, ModelPatch(items), given)
 
     for trial in TRIALS:
         outputs = tuple((CHANNELS[name].output, CHANNELS[name].quantity) for name in trial.channels)
-        response = oscillator.respond(trial, outputs, ModelPatch(), Conditions(np.ones(1)))
+        response = cantilever.respond(trial, outputs, ModelPatch(), Conditions(np.ones(1)))
         assert np.array_equal(seen(trial).values, response.values)
         assert (seen(trial).rates is None) == (not trial.is_dynamic)
     plain = seen(RING).values
@@ -44,7 +44,10 @@ def test_observations_are_responses_through_the_sensors_of_a_patch(oscillator):
     assert np.abs(one - plain).max() > 1e-5
     # a turned gauge asks for components
     c, s = np.cos(0.2), np.sin(0.2)
-    expected = PULL.force / 400.0 * (1e-2 * c**2 - 0.3e-2 * s**2 + 0.2e-2 * s * c)
+    parts = tuple((f"strain[0]{part}", Quantity.STRAIN) for part in ("", *ACROSS))
+    strains = cantilever.respond(PULL, parts, ModelPatch(), Conditions(np.ones(1))).values
+    assert np.abs(strains[-1]).min() > 1e-6
+    expected = strains @ [c**2, s**2, s * c]
     assert seen(PULL, SensorRotation("g0", 0.2)).values[:, 0] == pytest.approx(expected)
     # a decaying line scales with the release
     for initial in (np.zeros((0, 2)), np.array([[0.1, 0.0]])):
