@@ -12,13 +12,12 @@ from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.catalogue.effect_file import effects_of_file
-from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import PointMass
-from tests.discrepancy.rigs import campaign_folder, one_mass
+from tests.discrepancy.rigs import campaign_folder, one_mass, setting_of
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
@@ -148,7 +147,7 @@ def pump(tmp_path_factory):
 def test_the_example_of_the_page_pulls_as_it_says(pump, write):
     """And says why it is not offered without its event."""
     (effect,) = effects_of_file(write(PUMP_PULL))
-    setting = Setting(pump, MODEL, MODEL.scales(pump))
+    setting = setting_of(pump, MODEL)
     assert effect.unavailable(setting) is None
     patch = effect.patch(setting, {"slope": 0.4}, "slide")
     quiet, pumping = (
@@ -160,7 +159,7 @@ def test_the_example_of_the_page_pulls_as_it_says(pump, write):
     expected = 0.2 * since**3 / 6.0 + 0.2 * 5.5**2 / 2.0 * after
     np.testing.assert_allclose(pumping, expected, atol=1e-6 * expected.max())
     without = replace(pump, events=())
-    assert effect.unavailable(Setting(without, MODEL, MODEL.scales(without))) == (
+    assert effect.unavailable(setting_of(without, MODEL)) == (
         "No trial to fit has pump_on and pump_on_until as [[event]]; those that are fitted have none."
     )
 
@@ -171,7 +170,7 @@ def test_an_effect_acts_from_a_parameter_after_an_event_on(pump, write):
         'force = "slope * max(0, time - pump_on)"', 'offset = "slope"\nbegin = "pump_on + slope"'
     )
     (effect,) = effects_of_file(write(text.replace('places = "ports"', 'places = "channels"')))
-    patch = effect.patch(Setting(pump, MODEL, MODEL.scales(pump)), {"slope": 0.75}, "x")
+    patch = effect.patch(setting_of(pump, MODEL), {"slope": 0.75}, "x")
     shown = observe(MODEL, pump, pump.trials[1], patch, Conditions(np.zeros(0))).values[:, 0]
     np.testing.assert_array_equal(shown, np.where((TIME >= 3.25) & (TIME < 8.0), 0.75, 0.0))
 

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from benchmarks.study_hidden_effects import fly_mission
 from discrepancy.application import apply_verdict
 from discrepancy.campaign.records import Quantity
-from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import choice_of_run, choose_model
 from discrepancy.models.interface import Conditions
@@ -25,20 +24,11 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PointMass, SensorDrift, SensorGain, SensorRotation
-from tests.discrepancy.rigs import ORIGIN
+from tests.discrepancy.rigs import ORIGIN, chosen
 
 TURNS = 24
 DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
-RIVALS = [
-    effect_by_identifier(name, library())
-    for name in (
-        "gauge_zero_drift",
-        "gauge_gain",
-        "stiffness_drift",
-        "local_stiffness_loss",
-        "inertia_relief",
-    )
-]
+RIVALS = chosen("gauge_zero_drift", "gauge_gain", "stiffness_drift", "local_stiffness_loss", "inertia_relief")
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +163,7 @@ def test_a_drifting_gauge_is_found_in_the_run_and_applied(run, campaign, tmp_pat
 def test_a_mass_that_the_twin_does_not_know_is_found_in_the_run(tmp_path, mass):
     folder = tmp_path / "heavy"
     fly_mission(folder, 7, (PointMass(mass, 2.0),) if mass else (), turns=12)
-    effects = [effect_by_identifier(name, library()) for name in ("point_mass", "inertia_relief")]
+    effects = chosen("point_mass", "inertia_relief")
     found = investigate(run_campaign(folder), run_model(folder), effects, thorough=False)
     if not mass:
         assert found.verdict.kind is VerdictKind.NOTHING_MISSING

@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from benchmarks.public_rigs.__main__ import BLOWN, RIGS, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, TrialKind
-from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import load_model
@@ -29,6 +28,7 @@ from discrepancy.sources.measured_rigs import (
 )
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
+from tests.discrepancy.rigs import chosen
 from uav_twin.cli import app
 
 PUBLIC = os.environ.get("UAV_TWIN_PUBLIC_RIGS")
@@ -52,8 +52,7 @@ def rig(tmp_path_factory):
 
 
 def judged(rig, *effects):
-    chosen = [effect_by_identifier(name, library()) for name in effects]
-    return investigate(*rig, chosen, thorough=False).verdict
+    return investigate(*rig, chosen(*effects), thorough=False).verdict
 
 
 def is_sound(campaign, model):
