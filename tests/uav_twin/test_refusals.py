@@ -36,6 +36,7 @@ def folder(
         "bad.ssp": "nothing", "bar.inp": INPUTS.text("bar.inp"), "bar.toml": INPUTS.text("bar.toml"),
         "library.toml": text.replace(flown, library), "pull.csv": TWO["pull.csv"].decode(),
         "filled/pull.csv": TWO["pull.csv"].decode(),
+        "run.nc": "", "misspelt.csv": "turn,strian_24\n0,1e-4\n", "lines.jsonl": "{}\n",
         "room.toml": INPUTS.text("room.toml"), "cold.csv": "time,outside\n120,5\n180,-41\n",
         "my_part.toml": structure_files()["bracket"].read_text(encoding="utf-8"),
     }.items():  # fmt: skip
@@ -46,7 +47,7 @@ def folder(
     return place
 
 
-@pytest.mark.parametrize(("line", "sentence", "code"), ROWS, ids=[row[0] for row in ROWS])
+@pytest.mark.parametrize(("line", "sentence", "code"), ROWS, ids=[" ".join(row[:2]) for row in ROWS])
 def test_what_is_wrong_is_one_sentence_with_its_exit_code(
     folder, heat_exchanger, monkeypatch, line, sentence, code
 ):

@@ -20,7 +20,7 @@ from calibration.result.file import (
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
 from reporting.progress import SilentProgress
-from scenarios import scenario_files
+from tests.refusals import Inputs
 from tests.twin_master.runs import edited, table_of, text_of, written
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.parameter import draw_parameter
@@ -191,20 +191,7 @@ def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, 
     asset_source(scenario).check()
 
 
-COUPLED = next(name for name in scenario_files() if 'kind = "coupled"' in text_of(name))
-UNKNOWN = r"spring 7 has the parameter nonsense, which the binding \w+ does not know; .*`uav-twin"
-OF_A_WING = r"the parameter servo_mass, which the design .* `uav-twin calibrate`"
-
-
-@pytest.mark.parametrize(
-    ("scenario", "means", "words"),
-    [
-        ("level_turns", {"young_modulus_factor": 1.0, "nonsense": 1.0}, UNKNOWN),
-        ("level_turns", {"young_modulus_factor": 1.0, "servo_mass": 0.17}, OF_A_WING),
-        ("level_turns", {"young_modulus_factor": 1.3}, r"factor = 1\.[23]\d*, but .* 0\.9 to 1\.1"),
-        (COUPLED, {"young_modulus_factor": 1.0, "nonsense": 1.0}, "parameter nonsense, which the binding"),
-    ],
-)
+@pytest.mark.parametrize(("scenario", "means", "words"), Inputs(__file__).refused("campaign"))
 def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario, means, words):
     given = Overrides(calibration=of_campaign(tmp_path / "calibration.nc", **means))
     with pytest.raises(MissionInputError, match=words):

@@ -26,33 +26,6 @@ from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
-COUPLED = """[asset]
-kind = "coupled"
-binding = "coupled.toml"
-parameters = { conductance = 6100.0 }
-load = { wall_temperature = 80.0 }
-
-[[asset.component]]
-name = "exchanger"
-fmu = "HeatExchanger.fmu"
-parameters = { conductance = 5000.0 }
-
-[[asset.connection]]
-source = "flow"
-target = "exchanger.mass_flow"
-
-[[asset.connection]]
-source = "fouling"
-target = "exchanger.fouling"
-
-[[asset.connection]]
-source = "exchanger.outlet"
-target = "outlet"
-
-[belief]
-kind = "asset"
-
-"""
 INPUTS = Inputs(__file__)
 BOTH = pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
 
@@ -69,7 +42,7 @@ def folder(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     written(place, binding, *names, name="coupled.toml")
     text = (place / "fouling.toml").read_text(encoding="utf-8")
     asset = text[text.index("[asset]") : text.index("[calibration]")]
-    written(place, text, (asset, COUPLED), name="coupled_fouling.toml")
+    written(place, text, (asset, INPUTS.text("coupled.toml")), name="coupled_fouling.toml")
     return place
 
 

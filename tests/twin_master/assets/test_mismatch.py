@@ -22,7 +22,6 @@ from fe.runtime.reduced import ReducedModel
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from scenarios import binding_files
-from tests.command_line import refused
 from tests.conftest import synthetic_library
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
@@ -31,7 +30,7 @@ from twin_master.assets.asset_source import AssetReading, PairedSource, Stateles
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
+from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError, TwinMasterError
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
@@ -56,13 +55,6 @@ ITSELF = '[belief]\nkind = "asset"\n'
 def test_combinations_that_mean_nothing_are_refused_in_one_sentence(old, new, words, tmp_path):
     with in_one_sentence(ScenarioError, ".*".join(map(re.escape, words))):
         load_scenario(written(tmp_path, TEXT, (old, new)))
-
-
-def test_without_the_library_one_sentence_says_where_to_get_it(tmp_path):
-    error = refused("run", "model_mismatch", "--out", tmp_path / "run")
-    for word in ("UAV-Digital-Twin", "UAVconfig.json", "--strain-library FILE", "asset.file"):
-        assert word in error
-    assert not list(tmp_path.iterdir())
 
 
 def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
@@ -108,20 +100,11 @@ def test_the_option_names_the_file_and_keeps_the_model(library_file, tmp_path):
         resolve_scenario(load_scenario("model_mismatch"), Overrides(fmu=tmp_path / "x.fmu"))
 
 
-def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path):
-    for change, error, sentence in (
-        (("= 3.0 }", "= 2.5 }"), MissingObservationModelError, r"3g at load factor 3, .* 2\.5"),
-        (
-            ('"young_modulus_factor"', '"stiffness"'),
-            MissingObservationModelError,
-            r"young_modulus_factor.*set `belief\.kind`",
-        ),
-        (("count = 24", "count = 23"), MissingObservationModelError, "24 gauges"),
-        ((DESIGN, 'design = "no.toml"\n'), MissionInputError, r"no\.toml cannot be read"),
-    ):
-        scenario = resolved(library_file, written(tmp_path, TEXT, change))
-        with pytest.raises(error, match=sentence):
-            asset_source(scenario).check()
+@pytest.mark.parametrize(("old", "new", "sentence"), Inputs(__file__).refused("disagreeing"))
+def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path, old, new, sentence):
+    scenario = resolved(library_file, written(tmp_path, TEXT, (old, new)))
+    with in_one_sentence(TwinMasterError, sentence):
+        asset_source(scenario).check()
 
 
 def linear_case(seed: int, spread: float) -> tuple[np.ndarray, ...]:
