@@ -1,7 +1,6 @@
 """A calibration file in a scenario: what the twin draws from it, what the run keeps, what is refused."""
 
 import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from calibration.result.file import (
 )
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
-from reporting.progress import SilentProgress
 from tests.refusals import Inputs
 from tests.twin_master.runs import edited, table_of, text_of, written
 from twin_master.assets.fmu_source import FmuSource
@@ -164,22 +162,6 @@ def test_what_is_refused_before_a_folder_is_made(file, tmp_path, library_file):
     ):
         with pytest.raises(ScenarioError, match=words):
             parse_scenario(table | {"calibration": calibration}, "mine.toml")
-
-
-@pytest.mark.long
-def test_the_wing_among_several_fmus_is_tailored_too(file, tmp_path):
-    scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
-    assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
-    source = asset_source(scenario)
-    source.check()
-    (tmp_path / "run").mkdir()
-    hashes = source.prepare(tmp_path / "run", SilentProgress())
-    assert hashes["design"] == load_calibration(file).design_hash
-    with zipfile.ZipFile(tmp_path / "run" / "asset" / "components" / "wing.fmu") as archive:
-        record = json.loads(archive.read("resources/calibration.json"))
-    assert record["asset"] == "Wing 7 (é)"
-    moved = scenario.portable().moved(tmp_path / "run")
-    assert moved.asset.component[1].design == "calibration"
 
 
 def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, tmp_path):
