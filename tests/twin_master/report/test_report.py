@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.result.file import run_record
 from reporting.figures import to_svg
+from reporting.page import ReportFigure
 from reporting.words import number
 from tests.refusals import Inputs
 from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
@@ -241,7 +242,9 @@ def test_a_calibration_file_shows_its_wing(run, make_calibration):
     flown = rescripted(plain, asset={"design": "calibration", "parameters": {}})
     mean, wide = wing.mean("young_modulus_factor"), wing.standard_deviation("young_modulus_factor")
     assert true_value(flown) == mean  # the FMU starts at the mean
-    page = report.render_page(flown, {"calibration": DRAWING}, {"calibration": ("", "")})
+    page = report.render_page(
+        flown, {"calibration": DRAWING}, {"calibration": ReportFigure("calibration", None, "", "")}
+    )
     assert "The calibrated wing: Wing 7 (é)" in page
     servo = wing.mean("servo_mass"), wing.standard_deviation("servo_mass")
     assert f'{number(servo[0])}</td><td class="number">{number(servo[1])}' in page
