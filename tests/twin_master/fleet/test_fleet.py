@@ -17,7 +17,7 @@ from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderExistsError
 from twin_master.fleet import flight
 from twin_master.fleet.flight import fly_fleet, group_folder
-from twin_master.fleet.plan import Fleet, ensemble, load_fleet, seed_range
+from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Estimated, group_figures
 from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.shard import Engine, unflown
@@ -159,12 +159,6 @@ def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
     assert not (fleet_file.parent / "out").exists()
 
 
-@pytest.mark.parametrize("text", ["7", "3:3", "5:1", "a:b", "-1:4", "1:2:3", "0:1000000000000"])
-def test_seeds_are_a_range(text):
-    with pytest.raises(FleetError, match=r"FIRST:END|1000000 twins at most"):
-        seed_range(text)
-
-
 def test_a_truth_beyond_the_model_is_refused(fleet_file):
     soft = r"south: the true young_modulus_factor of 2 of 2 assets is outside"
     with pytest.raises(FleetError, match=soft):
@@ -230,8 +224,6 @@ def test_the_command_line(library_file, tmp_path):
     (notices,) = (tmp_path / "b" / "fleet.zarr").glob("*/notices")
     shutil.rmtree(notices)
     assert "lacks notices: fly the fleet again" in refused("compare", tmp_path / "a", tmp_path / "b")
-    for wrong in (("--seeds", "0:3", "--seed", 1), ("--workers", 2)):
-        refused("run", "growing_damage", *wrong, code=2)
 
 
 def test_without_the_extra_or_a_scheduler_nothing_is_begun(library_file, tmp_path, monkeypatch):

@@ -1,9 +1,7 @@
 """The report shows what the run holds, is reproducible, and refuses a damaged run with one sentence."""
 
-import errno
 import html
 import json
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +13,6 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.result.file import run_record
-from reporting.errors import DiskFullError
 from reporting.figures import to_svg
 from reporting.page import ReportFigure
 from reporting.words import number
@@ -296,21 +293,6 @@ def test_a_turn_that_is_none_of_the_run(folder):
     for now in (-1, 50):
         with pytest.raises(RunFolderError, match=r"must lie in 0\.\.49"):
             report.write_report(folder, now=now)
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_a_full_disk_keeps_the_old_report(run, tmp_path, monkeypatch):
-    place = stored(run, tmp_path / "run")
-    (place / "report.html").write_text("old")
-
-    def fail(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "no space")
-
-    monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(DiskFullError):
-        report.write_report(place)
-    assert (place / "report.html").read_text() == "old"
-    assert list((place / "figures").iterdir()) == []
 
 
 def test_a_title_that_would_be_broken_mathematics(run):
