@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import rel_entr
 
 from reporting.arrays import Float, Index
@@ -129,7 +129,7 @@ class GaussianSensorModel(QuantityModel):
         for array in (independent, self.total_standard_deviation, self.interval):
             array.setflags(write=False)
         by_control = np.ascontiguousarray(1.0 / independent.transpose(1, 0, 2))
-        self._inverse_deviation, self._log_scale = by_control, np.log(by_control)
+        self._inverse_deviation = by_control
         self._scaled_interval = np.ascontiguousarray(
             self.interval.transpose(1, 0, 2, 3) * by_control[..., None]
         )
@@ -142,6 +142,7 @@ class GaussianSensorModel(QuantityModel):
         size = float(np.max(np.abs(values) * by_control[..., None]))
         part, self._function = separated(beside.reshape(-1, self.draw_count), size)
         self._part = np.ascontiguousarray(part).reshape(*self._mean.shape, len(self._function))
+        self._shared = dict[int, tuple[Any, ...]]()  # by control, of the sensors that were there last
 
     def checked(self, observation: ArrayLike) -> Float:
         """Return observations (..., G) in which NaN stands for a lost sensor.
@@ -230,13 +231,47 @@ class GaussianSensorModel(QuantityModel):
         inside = self.averages_inside and draws == 1
         result = np.zeros((len(observations), self.state_count, draws))
         for sensors in np.eye(self.sensor_count, dtype=bool) if inside else [np.array([True])]:
-            found = np.empty_like(result)
-            log_densities(
-                np.where(sensors, observations, np.nan), control, self._mean, self._part, self._function,
-                self._inverse_deviation, self._log_scale, self._scaled_interval, self._log_weight, found,
-            )  # fmt: skip
-            result += found
+            seen = sensors & ~np.isnan(observations)
+            alike: dict[tuple[int, bytes], list[int]] = {}
+            there = seen.view(f"V{self.sensor_count}")[:, 0].tolist()  # as bytes
+            for row, kind in enumerate(zip(control.tolist(), there, strict=True)):
+                alike.setdefault(kind, []).append(row)
+            for kind, rows in alike.items():
+                result[rows] += self._alike(observations[rows], *kind, draws)
         return result
+
+    def _alike(self, observations: Float, control: int, seen: bytes, draws: int) -> Float:
+        """Return log densities (T, S, E) or (T, S, 1) of what the same sensors show under a control."""
+        there = np.frombuffer(seen, dtype=bool)
+        if self._shared.get(control, (b"",))[0] != seen:
+            self._shared[control] = seen, *self._shared_by(control, there)
+        _, scale, offset, inverse, outward, part = self._shared[control]
+        offset = offset - self._log_weight if draws == 1 else offset
+        result = np.empty((len(observations), self.state_count, draws))
+        shown = np.ascontiguousarray(np.where(there, observations, 0.0).T)
+        mean, function = self._mean[control], self._function
+        log_densities(shown, mean, inverse, outward, part, function, offset, scale, result)
+        return result
+
+    def _shared_by(self, control: int, there: NDArray[np.bool_]) -> tuple[Float, ...]:
+        """Return what all observations by the same sensors share, as `log_densities` takes it.
+
+        First are the log of their scale (S,) and half the squares of what each draw adds (S, E). The
+        covariance is the unit matrix plus interval times its transpose, inverted by Woodbury's identity: with
+        the Cholesky factor L of 1 + interval' interval, outward (F, G) is L^-1 interval'. With d what is
+        observed beside the mean, -|d - A b_e|² / 2 of a draw e is -|d|² / 2 + (A'd) b_e - |A b_e|² / 2.
+        """
+        interval, part = (
+            np.where(there[:, None], given[control], 0.0) for given in (self._scaled_interval, self._part)
+        )
+        root = np.linalg.cholesky(np.eye(interval.shape[-1]) + interval.swapaxes(1, 2) @ interval)
+        outward = np.linalg.solve(root, interval.swapaxes(1, 2))
+        whole = part - outward.swapaxes(1, 2) @ (outward @ part)
+        offset = 0.5 * np.sum((whole.swapaxes(1, 2) @ part @ self._function) * self._function, axis=1)
+        inverse = self._inverse_deviation[control] * there
+        scale = np.log(inverse[:, there]).sum(axis=1) - LOG_ROOT_TWO_PI * there.sum()
+        scale -= np.log(np.einsum("sff->sf", root)).sum(axis=1)
+        return scale, offset, inverse, outward, whole
 
     def nearest(
         self, observation: Float, control_index: int, value: Float, precision: ArrayLike = 1.0
