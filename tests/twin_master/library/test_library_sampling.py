@@ -16,19 +16,12 @@ from hypothesis import strategies as st
 
 from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.packing.contents import build_script_fmu
+from tests.refusals import Inputs
 from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
 from twin_master.library.grid import SamplingGrid, grid_of_fmu, parse_grid
 from twin_master.library.sampling import blocks_folder, sample_library
 
-BINDING = """
-binding = { name = "wayward", step_size = 1.0 }
-control.push = { variable = "push", unit = "N" }
-control.mode = { variable = "mode", unit = "1" }
-health.wear = { variable = "wear", unit = "1" }
-parameter.gain = { variable = "gain", unit = "1" }
-observation.lever = { variables = ["shown", "double"], unit = ["m", "mm"] }
-"""
 FINE, LAG, COUNT, DIE, SLEEP, REFUSE, SLOW = (float(mode) for mode in range(7))
 WEAR, GAIN, PUSH = (0.0, 0.25, 0.5), (0.9, 1.0, 1.1), (2.0, 4.0)
 
@@ -37,8 +30,7 @@ WEAR, GAIN, PUSH = (0.0, 0.25, 0.5), (0.9, 1.0, 1.1), (2.0, 4.0)
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("wayward")
     fmu = build_script_fmu(Path(__file__).with_name("wayward.py"), folder / "wayward.fmu").path
-    (folder / "binding.toml").write_text(BINDING)
-    return fmu, folder / "binding.toml"
+    return fmu, Inputs(__file__).folder / "wayward.toml"
 
 
 def grid(files: tuple[Path, Path], mode: float = FINE, **changes: object) -> SamplingGrid:
@@ -192,22 +184,6 @@ def test_what_does_not_fit_is_named_before_anything_is_started(files, tmp_path):
     with pytest.raises(InvalidObservationLibraryError, match="exists"):
         sample_library(grid(files), out, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["lever.nc"]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("wear", "NAME=VALUES"),
-        ("tear=1", "NAME=VALUES with a name of the binding wayward"),
-        ("wear=a,b", "must give numbers"),
-        ("wear=0:1:0", "must give numbers"),
-        ("wear=0:1", "must give numbers"),
-        ("wear=nan", "must give numbers"),
-    ],
-)
-def test_a_grid_that_is_none_is_refused(files, text, words):
-    with pytest.raises(InvalidObservationLibraryError, match=words):
-        grid_of_fmu(*files, [text])
 
 
 def test_grids_are_read(files):
