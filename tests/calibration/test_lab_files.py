@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.dynamics.records import read_records
+from calibration.dynamics.trials import average
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import read_lengths
 from calibration.paper.procedure import read_published_results
@@ -37,16 +38,8 @@ def test_published_pairs():
     assert data.load / 9.81 == pytest.approx(np.tile([0.25, 0.5, 0.75, 1.0], 2))
     assert data.load_standard_deviation == pytest.approx(0.0981 / 1.96)
     assert data.displacement_standard_deviation == pytest.approx(0.5e-3 / 1.96)
-    with pytest.raises(ValueError, match="read-only"):
-        data.load[0] = 1.0
-    for sentence, change in (
-        ("one length", {"load": data.load[:4]}),
-        ("no measurement", dict.fromkeys(("load", "displacement", "run"), np.array([]))),
-        ("not both zero", {"load_standard_deviation": 0.0, "displacement_standard_deviation": 0.0}),
-        ("load of reading 2 is nan", {"load": np.where(np.arange(8) == 1, np.nan, data.load)}),
-    ):
-        with pytest.raises(ExperimentDataError, match=sentence):
-            dataclasses.replace(data, **change)
+    with pytest.raises(ExperimentDataError, match="load of reading 2 is 0"):
+        dataclasses.replace(data, load=np.where(np.arange(8) == 1, 0.0, data.load))
 
 
 @pytest.mark.parametrize("above", ["", "datafiles", "src/datafiles"])
@@ -89,11 +82,11 @@ def test_the_published_figures_are_those_of_the_authors_folder(reference):
 
 def test_digitised_records_are_fitted_by_their_extremes(reference):
     read = read_lab_folder(reference)
-    assert len(read.trials.fits) == 5
-    assert [read.trials.average("frequency", mode).mean for mode in (0, 1)] == pytest.approx(
+    assert len(read.trials) == 5
+    assert [average(read.trials, "frequency", mode).mean for mode in (0, 1)] == pytest.approx(
         (5.6547, 29.94), rel=1e-3
     )
-    assert [read.trials.average("damping_ratio", mode).mean for mode in (0, 1)] == pytest.approx(
+    assert [average(read.trials, "damping_ratio", mode).mean for mode in (0, 1)] == pytest.approx(
         (0.0280, 0.0573), rel=0.03
     )
     assert sum(name.startswith("ring_down_") for name in read.input_hashes) == 5
