@@ -39,11 +39,11 @@ def broken(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere(page):
     assert broken(page) == []
 
 
-def test_a_broken_link_is_found(tmp_path: Path) -> None:
+def test_a_broken_link_is_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A `b` c, d\n[a](page.md#a-b-c-d) [b](#nowhere) [c](none.md) `[d](none.md)`\n")
     assert broken(page) == ["#nowhere", "none.md"]

@@ -9,7 +9,7 @@ TURNED = ("one sees", "the house", "that we know", "believes ours", "gone on wit
 """Turns of other languages that were found once."""
 
 
-def test_pages_use_the_terms_of_the_glossary() -> None:
+def test_pages_use_the_terms_of_the_glossary():
     glossary = ROOT / "docs" / "glossary.md"
     rows = re.findall(r"^\| (.+?) \| .+ \| (.+?) \|$", glossary.read_text(encoding="utf-8"), re.MULTILINE)
     refused = [word for _, words in rows[2:] for word in words.split(", ")]

@@ -4,7 +4,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -38,9 +37,7 @@ def group(draw: st.DrawFn) -> Group:
 
 @settings(max_examples=25)
 @given(groups=st.dictionaries(st.sampled_from(["one", "two", "three"]), group(), min_size=1))
-def test_xarray_reads_what_was_written(
-    groups: dict[str, Group], tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_xarray_reads_what_was_written(groups, tmp_path_factory):
     file, again = (tmp_path_factory.mktemp("groups") / "file.nc" for _ in range(2))
     attrs = {"title": "a tree", "seed": 7}
     write_groups(file, groups, attrs)
@@ -56,7 +53,7 @@ def test_xarray_reads_what_was_written(
                 assert variable.values.dtype.kind == "U" or tree[name][key].dtype == variable.values.dtype
 
 
-def test_a_run_is_flown_and_stored_without_heavy_libraries() -> None:
+def test_a_run_is_flown_and_stored_without_heavy_libraries():
     """`uav-twin run --no-report` reads the program's modules and none of these."""
     code = (
         "import sys, twin_master.workflow, twin_master.assets.design_source\n"

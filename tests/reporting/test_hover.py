@@ -1,7 +1,6 @@
 """A figure of a page says the values that were drawn."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,7 +62,7 @@ CELLS = {
 """What is said in maps: number of the panel, share of its width and height; None where there is no value."""
 
 
-def test_drawing_changes_nothing_of_a_figure() -> None:
+def test_drawing_changes_nothing_of_a_figure():
     figure = drawing()
     first = figures.to_svg(figure)
     assert figures.to_svg(figure) == first
@@ -74,7 +73,7 @@ def test_drawing_changes_nothing_of_a_figure() -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")
-def test_the_pointer_and_a_tap_are_told_what_was_drawn(tmp_path: Path) -> None:
+def test_the_pointer_and_a_tap_are_told_what_was_drawn(tmp_path):
     page = Page("Values")
     page.add_figure(figures.to_svg(drawing()), "Caption.", title="Figure")
     file = tmp_path / "page.html"

@@ -5,7 +5,7 @@ import pickle
 from reporting.memory import Memory
 
 
-def test_the_least_recently_used_are_forgotten_where_there_is_no_room() -> None:
+def test_the_least_recently_used_are_forgotten_where_there_is_no_room():
     ended = list[str]()
     kept = Memory(6, weight=len, end=ended.append)
     for text in ("one", "two", "one", "four"):  # seven letters do not fit
@@ -17,7 +17,7 @@ def test_the_least_recently_used_are_forgotten_where_there_is_no_room() -> None:
     assert ended == ["two", "one", "a", "four"]
 
 
-def test_another_process_is_handed_nothing() -> None:
+def test_another_process_is_handed_nothing():
     kept = Memory(2)
     kept.get("x", lambda: 1)
     assert pickle.loads(pickle.dumps(kept)).get("x", lambda: 2) == 2

@@ -4,7 +4,6 @@ import gc
 import os
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +35,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "a.nc"
 
 
-def test_what_was_written_comes_back_to_the_last_bit(path: Path) -> None:
+def test_what_was_written_comes_back_to_the_last_bit(path):
     with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as opened:
         plain = opened.load()
     found = read_groups(path)
@@ -51,7 +50,7 @@ def test_what_was_written_comes_back_to_the_last_bit(path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"text", b"\x89HDF\r\n\x1a\n", b"CDF\x01" + bytes(40)])
-def test_what_is_no_netcdf_is_one_sentence(tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_netcdf_is_one_sentence(tmp_path, content):
     with pytest.raises(DamagedFileError, match="there is no file"):
         read_groups(tmp_path / "a.nc")
     (tmp_path / "a.nc").write_bytes(content)
@@ -83,12 +82,7 @@ def refuse(path: Path) -> object:
 
 
 @pytest.mark.parametrize("reading", [spin, wait, crash, fill, refuse])
-def test_no_end_a_crash_and_a_full_memory_are_one_sentence(
-    path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-    reading: Callable[[Path], object],
-) -> None:
+def test_no_end_a_crash_and_a_full_memory_are_one_sentence(path, monkeypatch, capfd, reading):
     fork, readers = os.fork, []
 
     def forked() -> int:
@@ -109,7 +103,7 @@ def test_no_end_a_crash_and_a_full_memory_are_one_sentence(
         os.kill(readers[0], 0)
 
 
-def test_finalizers_of_this_process_do_not_run_in_the_reader(path: Path, tmp_path: Path) -> None:
+def test_finalizers_of_this_process_do_not_run_in_the_reader(path, tmp_path):
     """A worker of an FMU must not be ended by a fork that collects the garbage of its parent."""
     told = tmp_path / "told"
 
@@ -131,7 +125,7 @@ def test_finalizers_of_this_process_do_not_run_in_the_reader(path: Path, tmp_pat
     assert told.read_text().split() == [str(os.getpid())]
 
 
-def test_a_warning_of_threads_is_no_error(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_of_threads_is_no_error(path, monkeypatch):
     fork = os.fork
 
     def warned() -> int:
@@ -142,7 +136,7 @@ def test_a_warning_of_threads_is_no_error(path: Path, monkeypatch: pytest.Monkey
     assert read_groups(path).attrs["schema"] == "outer"
 
 
-def test_the_fork_holds_no_file_of_this_process(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fork_holds_no_file_of_this_process(path, monkeypatch):
     """Or the lock of a run folder would outlive a process that is killed while a file is read."""
     monkeypatch.setattr(
         netcdf, "_groups", lambda path: " ".join(found.name for found in Path("/proc/self/fd").iterdir())

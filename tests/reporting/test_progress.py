@@ -18,7 +18,7 @@ def fly(progress: Progress) -> None:
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_stages_and_notes_are_shown(terminal: bool) -> None:
+def test_stages_and_notes_are_shown(terminal):
     stream = io.StringIO()
     fly(RichProgress(Console(file=stream, force_terminal=terminal, width=120, color_system=None)))
     text = stream.getvalue()
@@ -28,14 +28,14 @@ def test_stages_and_notes_are_shown(terminal: bool) -> None:
     assert "Inside" in text
 
 
-def test_silence() -> None:
+def test_silence():
     progress = SilentProgress()
     assert isinstance(progress, Progress)
     assert isinstance(RichProgress(Console(file=io.StringIO())), Progress)
     fly(progress)
 
 
-def test_an_exception_passes_and_the_terminal_is_given_back() -> None:
+def test_an_exception_passes_and_the_terminal_is_given_back():
     stream = io.StringIO()
     progress = RichProgress(Console(file=stream, force_terminal=True, width=120, color_system=None))
 
@@ -51,14 +51,14 @@ def test_an_exception_passes_and_the_terminal_is_given_back() -> None:
     fly(progress)
 
 
-def test_standard_output_stays_free(capsys: pytest.CaptureFixture[str]) -> None:
+def test_standard_output_stays_free(capsys):
     fly(RichProgress())
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "Flying" in captured.err
 
 
-def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
     seconds = iter([0.0, 1.0, 12.0, 15.0, 23.0, 23.5, 30.0])
     monkeypatch.setattr("reporting.progress.time.perf_counter", lambda: next(seconds))
     stream = io.StringIO()

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import socket
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +10,14 @@ import pytest
 from reporting import provenance
 
 
-def test_versions_of_the_stack() -> None:
+def test_versions_of_the_stack():
     versions = provenance.stack_versions(["numpy", "no-such-distribution"])
     assert versions["numpy"] == np.__version__
     assert versions["no-such-distribution"] == "not installed"
     assert versions["python"].count(".") == 2
 
 
-def test_a_record_is_plain_and_names_no_machine() -> None:
+def test_a_record_is_plain_and_names_no_machine():
     record = provenance.collect_provenance(7, input_hashes={"z": "1", "a": "2"})
     assert record == provenance.collect_provenance(7, input_hashes={"a": "2", "z": "1"})
     text = json.dumps(record.as_dict())
@@ -28,7 +27,7 @@ def test_a_record_is_plain_and_names_no_machine() -> None:
     assert socket.gethostname() not in text
 
 
-def test_hash_of_a_tree_sees_names_and_contents_but_not_line_ends(tmp_path: Path) -> None:
+def test_hash_of_a_tree_sees_names_and_contents_but_not_line_ends(tmp_path):
     def hashed(**files: bytes) -> str:
         for path in tmp_path.iterdir():
             path.unlink()
@@ -44,14 +43,14 @@ def test_hash_of_a_tree_sees_names_and_contents_but_not_line_ends(tmp_path: Path
     assert hashed(a=b"x", b=b"y") != hashed(a=b"xy", b=b"")
 
 
-def test_hash_of_a_package() -> None:
+def test_hash_of_a_package():
     assert len(provenance.source_hash("reporting")) == 64
     assert provenance.source_hash("reporting") != provenance.source_hash("scenarios")
     with pytest.raises(ValueError, match="no package"):
         provenance.source_hash("no_such_package")
 
 
-def test_hash_of_a_record_and_a_file(tmp_path: Path) -> None:
+def test_hash_of_a_record_and_a_file(tmp_path):
     assert provenance.hash_record({"a": 1, "b": [1.5, "µ"]}) == provenance.hash_record(
         {"b": [1.5, "µ"], "a": 1}
     )

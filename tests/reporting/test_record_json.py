@@ -26,7 +26,7 @@ class Outer:
     words: tuple[str, ...]
 
 
-def test_a_record_is_plain_data_of_json() -> None:
+def test_a_record_is_plain_data_of_json():
     record = Outer(math.nan, (Inner("a", 1), Inner("b", 2, 0.1)), Inner("c", 3), np.array([0.1, 2.0]), ("x",))
     first, second, third = ({"name": name, "count": n} for n, name in enumerate("abc", start=1))
     assert json.loads(json.dumps(plain(record), allow_nan=False)) == {

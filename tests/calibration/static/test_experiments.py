@@ -32,16 +32,8 @@ def test_published_pairs():
     assert data.load / 9.81 == pytest.approx(np.tile([0.25, 0.5, 0.75, 1.0], 2))
     assert data.load_standard_deviation == pytest.approx(0.0981 / 1.96)
     assert data.displacement_standard_deviation == pytest.approx(0.5e-3 / 1.96)
-    with pytest.raises(ValueError, match="read-only"):
-        data.load[0] = 1.0
-    for sentence, change in (
-        ("one length", {"load": data.load[:4]}),
-        ("no measurement", dict.fromkeys(("load", "displacement", "run"), np.array([]))),
-        ("not both zero", {"load_standard_deviation": 0.0, "displacement_standard_deviation": 0.0}),
-        ("load of reading 2 is nan", {"load": np.where(np.arange(8) == 1, np.nan, data.load)}),
-    ):
-        with pytest.raises(ExperimentDataError, match=sentence):
-            dataclasses.replace(data, **change)
+    with pytest.raises(ExperimentDataError, match="load of reading 2 is 0"):
+        dataclasses.replace(data, load=np.where(np.arange(8) == 1, 0.0, data.load))
 
 
 @pytest.mark.parametrize("above", ["", "datafiles", "src/datafiles"])

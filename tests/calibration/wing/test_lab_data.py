@@ -2,6 +2,7 @@
 
 import pytest
 
+from calibration.dynamics.trials import average
 from calibration.errors import ExperimentFileError
 from calibration.wing.lab_data import published_data, read_lab_folder
 
@@ -18,11 +19,11 @@ def test_the_published_figures_are_those_of_the_authors_folder(reference):
 
 def test_digitised_records_are_fitted_by_their_extremes(reference):
     read = read_lab_folder(reference)
-    assert len(read.trials.fits) == 5
-    assert [read.trials.average("frequency", mode).mean for mode in (0, 1)] == pytest.approx(
+    assert len(read.trials) == 5
+    assert [average(read.trials, "frequency", mode).mean for mode in (0, 1)] == pytest.approx(
         (5.6547, 29.94), rel=1e-3
     )
-    assert [read.trials.average("damping_ratio", mode).mean for mode in (0, 1)] == pytest.approx(
+    assert [average(read.trials, "damping_ratio", mode).mean for mode in (0, 1)] == pytest.approx(
         (0.0280, 0.0573), rel=0.03
     )
     assert sum(name.startswith("ring_down_") for name in read.input_hashes) == 5

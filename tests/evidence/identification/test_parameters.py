@@ -6,10 +6,8 @@ from hypothesis import strategies as st
 from evidence.identification.errors import IdentificationError
 from evidence.identification.parameters import (
     CLUSTERS,
-    FreeParameter,
     fixed_parameters,
     layout_of,
-    scaled,
     set_layout,
     values_of,
     wing_parameters,
@@ -21,7 +19,7 @@ DESIGN = load_design()
 PARAMETERS = wing_parameters(DESIGN)
 
 
-def test_every_parameter_is_documented_and_bounded() -> None:
+def test_every_parameter_is_documented_and_bounded():
     names = [parameter.name for parameter in (*PARAMETERS, *fixed_parameters())]
     assert len(names) == len(set(names))
     for parameter, value in zip(PARAMETERS, values_of(DESIGN, PARAMETERS), strict=True):
@@ -33,7 +31,7 @@ def test_every_parameter_is_documented_and_bounded() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.floats(-0.4, 0.4), min_size=len(PARAMETERS), max_size=len(PARAMETERS)))
-def test_what_is_written_is_read_back(steps: list[float]) -> None:
+def test_what_is_written_is_read_back(steps):
     values = values_of(DESIGN, PARAMETERS)
     width = np.array([parameter.standard_deviation for parameter in PARAMETERS])
     lower = np.array([parameter.lower for parameter in PARAMETERS])
@@ -43,7 +41,7 @@ def test_what_is_written_is_read_back(steps: list[float]) -> None:
     assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
-def test_writing_one_number_changes_nothing_else() -> None:
+def test_writing_one_number_changes_nothing_else():
     for parameter in PARAMETERS:
         if not parameter.path:
             continue
@@ -52,7 +50,7 @@ def test_writing_one_number_changes_nothing_else() -> None:
         assert values_of(moved, others).tolist() == values_of(DESIGN, others).tolist()
 
 
-def test_the_layout_is_two_rows_and_two_staggered_clusters() -> None:
+def test_the_layout_is_two_rows_and_two_staggered_clusters():
     content = {"planform": {"semi_span": 2.0}, "gauges": {"positions": [(0.0, 0.0)] * 24}}
     layout = {
         "row A first": 0.1, "row A pitch": 0.06, "row A gap": 0.2, "row A chord": 0.5,
@@ -71,12 +69,7 @@ def test_the_layout_is_two_rows_and_two_staggered_clusters() -> None:
     assert layout_of(content) == pytest.approx(layout)
 
 
-def test_scaled_values_count_prior_deviations() -> None:
-    parameter = FreeParameter("k", "N/m", 4.0, 2.0, 0.0, 9.0, "why", ("root", "flap_spring"))
-    assert scaled([parameter], np.array([7.0])).tolist() == [1.5]
-
-
-def test_a_start_laid_out_otherwise_is_refused() -> None:
+def test_a_start_laid_out_otherwise_is_refused():
     webs = [web.model_dump() for web in DESIGN.webs]
     webs[1]["shear_modulus"] *= 2.0
     with pytest.raises(

@@ -7,15 +7,11 @@ from hypothesis import strategies as st
 
 from evidence.sandwich_plate.plate import (
     FIELDS,
-    A,
-    B,
     Plate,
     Surface,
     U,
-    V,
     W,
     plane_stress,
-    surface_strain,
     tensor_mesh,
 )
 from evidence.sandwich_plate.plate_frame import strip_stiffness
@@ -51,30 +47,6 @@ def test_a_core_that_hardly_shears_locks_mildly_and_converges(check):
     assert all(1.8 < np.log2(coarse / fine) < 2.5 for coarse, fine in itertools.pairwise(errors))
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_rigid_motions_of_any_surface_strain_nothing(seed):
-    random = np.random.default_rng(seed)
-    mesh = tensor_mesh(3, 2)
-    plate = Plate(mesh.translated(random.uniform(-1, 1, 2)).scaled(random.uniform(0.1, 2.0, 2)))
-    height, slope_x, slope_y = random.standard_normal((3, *plate.weights.shape))
-    surface = Surface(height, slope_x, slope_y)
-    # u + z a and so on of a translation and a rotation, at the nodes
-    shift, turn = random.standard_normal((2, 3))
-    x, y = plate.node_points.T
-    fields = np.zeros((len(FIELDS), plate.nodes))
-    fields[U], fields[V] = shift[0] - turn[2] * y, shift[1] + turn[2] * x
-    fields[A], fields[B] = turn[1], -turn[0]
-    fields[W] = shift[2] + turn[0] * y - turn[1] * x
-    cells = np.arange(mesh.nelements)
-    sheet = plane_stress(np.ones_like(height), 0.3, np.full_like(height, 0.4))
-    stiffness = plate.face_stiffness(cells, surface, 0.1, sheet) + plate.core_stiffness(
-        cells, np.abs(height), sheet, np.ones((*height.shape, 2))
-    )
-    force = stiffness @ fields.ravel()
-    assert np.abs(force).max() < 1e-10 * (abs(stiffness) @ np.abs(fields.ravel())).max()
-
-
 def test_an_inclined_sheet_stretches_along_itself():
     # A flat sheet z = 0.75 x moved along its own slope by 0.01 of its length: strain 0.01 in it.
     plate = Plate(tensor_mesh(2, 2))
@@ -107,21 +79,6 @@ def test_turned_strains_are_those_of_the_tangent_basis(seed):
     expected = [first @ tensor @ first, second @ tensor @ second, 2.0 * first @ tensor @ second]
     assert surface.turned(plan[:, None])[:, 0] == pytest.approx(expected)
     assert surface.area_ratio == pytest.approx(np.linalg.norm(np.cross(*along)))
-
-
-def test_shape_functions_at_places_are_those_of_the_fields():
-    plate = Plate(tensor_mesh(3, 2))
-    x, y = plate.node_points.T
-    places = np.random.default_rng(3).uniform((0, 0), (3, 2), (25, 2))
-    dofs, values, slope_x, slope_y = plate.at(places)
-    fields = np.zeros((len(FIELDS), plate.nodes))
-    fields[W] = 1.0 + x**2 - 0.5 * x * y
-    w = fields.ravel()[dofs].reshape(25, len(FIELDS), -1)[:, W]
-    assert (values * w).sum(axis=1) == pytest.approx(1.0 + places[:, 0] ** 2 - 0.5 * places.prod(axis=1))
-    assert (slope_x * w).sum(axis=1) == pytest.approx(2.0 * places[:, 0] - 0.5 * places[:, 1])
-    assert (slope_y * w).sum(axis=1) == pytest.approx(-0.5 * places[:, 0])
-    flat = Surface(np.zeros(25), np.zeros(25), np.zeros(25))
-    assert surface_strain(flat, values, slope_x, slope_y).shape == (25, 3, 45)
 
 
 def test_a_strip_is_a_beam():
