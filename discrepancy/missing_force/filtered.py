@@ -8,6 +8,7 @@ Unknowns that act in proportion follow from what whitened readings and columns s
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -120,6 +121,11 @@ class Filtered:
             rows[channel, at] = np.sqrt(share)
         rows *= self.white[:, None]
         return generator, intensity, rows, start
+
+    @property
+    def key(self) -> tuple[bytes, ...]:
+        """What trials of one system and grid have alike, which are filtered together."""
+        return tuple(item.tobytes() for item in (*self.system, *self.trial.steps, self.trial.used))
 
     def steps(self, columns: FloatArray) -> Steps:
         """Return the record with columns (K, N, C) to be filtered."""
@@ -237,9 +243,14 @@ def regression(
     """Return the products of residuals (N, C) and columns (K, N, C), one of a trial each, whitened alike."""
     total: FloatArray | float = 0.0
     log_determinant = 0.0
+    alike: dict[tuple[bytes, ...], list[tuple[Filtered, FloatArray]]] = {}
     for one, residual, given in zip(filtered, residuals, columns, strict=True):
-        found = one.products(np.concatenate((residual[None], given, one.trial.local)))
-        products, half = without(*found, one.trial.local_precision)
-        total = total + products
-        log_determinant += float(half)
+        alike.setdefault(one.key, []).append((one, np.concatenate((residual[None], given, one.trial.local))))
+    for group in alike.values():
+        whole, half_of = group[0][0].products(np.concatenate([given for _, given in group]))
+        ends = np.cumsum([0, *(len(given) for _, given in group)]).tolist()
+        for (one, _), (begin, end) in zip(group, pairwise(ends), strict=True):
+            products, half = without(whole[begin:end, begin:end], half_of, one.trial.local_precision)
+            total = total + products
+            log_determinant += float(half)
     return Regression(np.asarray(total), log_determinant)
