@@ -305,14 +305,6 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     assert (found.lower[-1, 0], found.upper[-1, 0]) == pytest.approx((low, high), abs=1e-3 * spread)
 
 
-def test_a_turn_says_what_the_store_says(turns, expectation):
-    found = expectation.filtered([turn.carried for turn in turns], observations())
-    for t, turn in enumerate(turns):
-        mean, noise = turn.expected()
-        np.testing.assert_allclose(found.mean[t], mean, atol=1e-12)
-        np.testing.assert_allclose(found.noise[t], noise)
-
-
 def test_quantiles_are_those_of_the_mixture():
     weight, mean, deviation = np.array([0.5, 0.3, 0.2]), np.array([0.0, 4.0, 5.0]), np.array([1.0, 0.5, 0.0])
     levels = np.array([0.025, 0.5, 0.9])
