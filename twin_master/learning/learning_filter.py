@@ -94,8 +94,6 @@ class LearntPriors:
         Degrees of freedom of the noise scale; 0 takes the assumed noise for known.
     gain, offset : float or (G,)
         Prior standard deviation of gain error [1] and offset [SI] of each sensor; 0 is not learnt.
-    transition_factors : (R,)
-        Factors on the probabilities to leave a state, equally probable at first.
     sensor_unit : str
         Unit of the offset.
     """
@@ -105,7 +103,6 @@ class LearntPriors:
     noise_degrees: float = 0.0
     gain: ArrayLike = 0.0
     offset: ArrayLike = 0.0
-    transition_factors: tuple[float, ...] = (1.0,)
     sensor_unit: str = "1"
 
 
@@ -122,8 +119,9 @@ class LearningFilter:
     sensor_model : GaussianSensorModel
         Predictions (E, S, U, G), weights of the draws, and the noise that is assumed.
     priors : LearntPriors
-    transitions : sequence of TransitionModel, optional
-        Transitions for each of `transition_factors`; those of the model if there is one factor.
+    transitions : mapping of float to TransitionModel, optional
+        Those of each factor on the probabilities to leave a state, equally probable at first; those of the
+        model if left out.
     name : str
         Name of the twin, for messages.
 
@@ -138,19 +136,16 @@ class LearningFilter:
         model: GraphicalModel,
         sensor_model: GaussianSensorModel,
         priors: LearntPriors,
-        transitions: Sequence[TransitionModel] | None = None,
+        transitions: Mapping[float, TransitionModel] | None = None,
         name: str = "twin",
     ) -> None:
         if sensor_model.averages_inside:
             raise InvalidModelError(said("learning.inside", what="learning"))
-        moves = transitions or [model.transition]
-        if len(moves) != len(priors.transition_factors):
-            counts = len(priors.transition_factors), len(moves)
-            raise InvalidModelError(said("learning.tables", counts=counts))
+        moves = transitions or {1.0: model.transition}
         self.model, self.sensor_model, self._name = model, sensor_model, name
-        self.priors = priors
+        self.priors, self._factors = priors, np.array([*moves])
         draws, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
-        blocks = zip(*(move.blocks for move in moves), strict=True)
+        blocks = zip(*(move.blocks for move in moves.values()), strict=True)
         self._transition = TransitionModel(tuple(map(np.concatenate, blocks)))  # one factor after the other
         self._draw: Index = np.tile(np.arange(draws), factors)
         self._first_control: Index = np.repeat(np.arange(factors), draws) * len(model.controls)
@@ -260,7 +255,7 @@ class LearningFilter:
 
     def _averaged_anew(self, log_belief: Float) -> Float:
         """Return a belief (K, S) in which the draws have their first weights again, whatever the state."""
-        factors = len(self.priors.transition_factors)
+        factors = len(self._factors)
         by_factor = log_belief.reshape(factors, -1, log_belief.shape[1])
         merged = np.repeat(np.logaddexp.reduce(by_factor, axis=1), by_factor.shape[1], axis=0)
         return np.asarray(merged + self._log_weight[:, None] + np.log(factors))
@@ -269,7 +264,7 @@ class LearningFilter:
         """Return the posterior of everything that is learnt."""
         weight = filtered.sum(axis=1)  # of each hypothesis
         result: dict[str, Learnt] = {}
-        factors = np.asarray(self.priors.transition_factors)
+        factors = self._factors
         if self.priors.parameter is not None and self.priors.draws is not None:
             own, prior = weight.reshape(len(factors), -1).sum(axis=0), self.sensor_model.draw_weight
             result[self.priors.parameter] = posterior_of_draws(self.priors.draws, prior, own)

@@ -74,8 +74,8 @@ def enumerated(turns: int) -> Float:
 
 
 def learner_of_all() -> LearningFilter:
-    priors = LearntPriors("e", [0.9, 1.0, 1.1], transition_factors=FACTORS)
-    return LearningFilter(model(), sensors(), priors, [model(f).transition for f in FACTORS])
+    moves = {factor: model(factor).transition for factor in FACTORS}
+    return LearningFilter(model(), sensors(), LearntPriors("e", [0.9, 1.0, 1.1]), moves)
 
 
 def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories():
@@ -197,8 +197,6 @@ def test_a_belief_that_underflows_comes_back():
 def test_an_average_inside_the_product_is_refused():
     with pytest.raises(InvalidModelError, match="learning needs"):
         LearningFilter(model(), sensors(average="inside"), LearntPriors("e", [1, 2, 3]))
-    with pytest.raises(InvalidModelError, match="one transition table for each"):
-        LearningFilter(model(), sensors(), LearntPriors(transition_factors=(1.0, 2.0)))
 
 
 SETTINGS = RewardSettings(2.0, (-0.1, 0.1), 0.8, (2.0, 3.0))
