@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import (
     FIRST_PEAK,
-    Frequencies,
     amplitude_dependence,
+    average,
     fit_ring_down,
     fit_trials,
     prepare,
@@ -35,9 +35,9 @@ def ring_down(time, frequency=TRUE[0], ratio=TRUE[1], amplitude=TRUE[2], phase=T
     return signal
 
 
-def fitted(time, signal, procedure=Frequencies.FITTED, width=0.0):
+def fitted(time, signal, free=True, width=0.0):
     record = RingDownRecord(time, signal, averaging_width=width)
-    return fit_ring_down(record, procedure, start=None)
+    return fit_ring_down(record, free=free, start=-1.0)
 
 
 def test_two_modes_are_recovered():
@@ -52,7 +52,7 @@ def test_two_modes_are_recovered():
         assert mode.damped_frequency == pytest.approx(f * math.sqrt(1.0 - z**2), rel=1e-8)
     assert fit.residual_deviation < 1e-10
 
-    first, second = fitted(time, ring_down(time), Frequencies.PEAKS).modes
+    first, second = fitted(time, ring_down(time), free=False).modes
     assert (first.frequency, first.damping_ratio) == (
         pytest.approx(5.65, rel=2e-3), pytest.approx(0.0281, rel=2e-2),
     )  # fmt: skip
@@ -79,7 +79,7 @@ def test_a_fast_record_is_decimated_and_cropped():
     assert prepared.sampling_rate == pytest.approx(2000.0)
     assert prepared.time[0] > FIRST_PEAK
     printed = RingDownRecord(np.round(time, 4), record.signal)  # to few digits, which is even enough
-    for fit in (fit_ring_down(shown, Frequencies.FITTED) for shown in (record, printed)):
+    for fit in (fit_ring_down(shown, free=True) for shown in (record, printed)):
         assert fit.modes[0].frequency == pytest.approx(5.65, rel=1e-4)
         assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
         assert fit.modes[1].damping_ratio == pytest.approx(0.0717, rel=1e-2)
@@ -110,14 +110,14 @@ def test_standard_errors_are_those_of_the_linearised_signal(seconds, ratio):
 def test_a_linear_wing_shows_no_dependence_on_amplitude():
     """And one trial has the error of its fit."""
     time = np.arange(0.0, 6.0, 1.0 / 125.0)
-    trials = fit_trials([RingDownRecord(time, ring_down(time))], start=None)
-    points = amplitude_dependence(trials.fits[0], first=1.0)
+    trials = fit_trials([RingDownRecord(time, ring_down(time))], start=-1.0)
+    points = amplitude_dependence(trials[0])[2:]  # before, the second mode is still there
     assert len(points) > 8
     assert [p.frequency for p in points] == pytest.approx([5.65] * len(points), rel=1e-4)
     assert [p.damping_ratio for p in points] == pytest.approx([0.0281] * len(points), rel=1e-2)
-    mean = trials.average("damping_ratio", 0)
+    mean = average(trials, "damping_ratio", 0)
     assert math.isnan(mean.standard_deviation)
-    assert mean.standard_error == trials.fits[0].modes[0].standard_error["damping_ratio"]
+    assert mean.standard_error == trials[0].modes[0].standard_error["damping_ratio"]
     with pytest.raises(ExperimentDataError, match="no ring-down record"):
         fit_trials([])
 
@@ -133,7 +133,7 @@ def test_a_linear_wing_shows_no_dependence_on_amplitude():
 def test_any_two_separate_modes_are_recovered(first, second, ratios, share, phase):
     time = np.arange(0.0, 6.0, 1.0 / 200.0)
     signal = ring_down(time, (first, second), ratios, (0.01, 0.01 * share), (phase, 1.0))
-    fit = fit_ring_down(RingDownRecord(time, signal), Frequencies.FITTED, start=None)
+    fit = fit_ring_down(RingDownRecord(time, signal), free=True, start=-1.0)
     assert [m.frequency for m in fit.modes] == pytest.approx([first, second], rel=1e-5)
     assert [m.damping_ratio for m in fit.modes] == pytest.approx(ratios, rel=1e-4)
 
@@ -149,20 +149,20 @@ def test_the_digitised_records(reference):
     records = read_records(reference)
     assert len(records) == 5
     trials = fit_trials(records)
-    assert trials.average("frequency", 0).mean == pytest.approx(5.65, rel=0.005)
-    assert trials.average("frequency", 1).mean == pytest.approx(29.9, rel=0.005)
-    assert trials.average("damping_ratio", 0).mean == pytest.approx(0.028, rel=0.10)
+    assert average(trials, "frequency", 0).mean == pytest.approx(5.65, rel=0.005)
+    assert average(trials, "frequency", 1).mean == pytest.approx(29.9, rel=0.005)
+    assert average(trials, "damping_ratio", 0).mean == pytest.approx(0.028, rel=0.10)
     # Trials repeat each other closely; mode 2 is seen by 8.1 ms columns of pixels.
-    assert trials.average("frequency", 0).standard_deviation < 0.002
-    assert trials.average("frequency", 1).standard_deviation < 0.1
+    assert average(trials, "frequency", 0).standard_deviation < 0.002
+    assert average(trials, "frequency", 1).standard_deviation < 0.1
     # The wing is not linear: as the amplitude falls, frequency rises and damping falls.
-    points = amplitude_dependence(trials.fits[0])
+    points = amplitude_dependence(trials[0])
     assert points[0].frequency < 5.58
     assert 5.70 < points[-1].frequency < 5.80
     assert points[0].amplitude > 10.0 * points[-1].amplitude
     assert points[0].damping_ratio > 1.2 * points[-1].damping_ratio
-    fitted = fit_trials(records, Frequencies.FITTED)
-    assert 5.57 < fitted.average("frequency", 0).mean < 5.60
+    fitted = fit_trials(records, free=True)
+    assert 5.57 < average(fitted, "frequency", 0).mean < 5.60
 
 
 TIME = np.arange(0.0, 4.0, 1.0 / 200.0)
@@ -173,15 +173,15 @@ GOOD = ring_down(TIME)
 @pytest.mark.parametrize(
     ("scale", "signal", "start", "words"),
     [
-        (1.0, 0.01 * np.cos(2 * np.pi * 5.65 * TIME) + 0.01 * np.cos(2 * np.pi * 30.0 * TIME), None,
+        (1.0, 0.01 * np.cos(2 * np.pi * 5.65 * TIME) + 0.01 * np.cos(2 * np.pi * 30.0 * TIME), -1.0,
          "does not decay"),
-        (1.0, GOOD[::-1], None, "does not decay"),
-        (1.0, 0.01 * np.exp(-TIME) * np.cos(2.0 * np.pi * 5.65 * TIME), None, "two spectral peaks"),
-        (1.0, 0.01 * np.exp(-TIME), None, "oscillation"),
-        (1.0, np.random.default_rng(0).standard_normal(TIME.size), None, "does not decay"),
-        (1.0, ring_down(TIME, amplitude=(0.01, 3e-5), ratio=(0.05, -0.006)), None, "decay"),  # a mode grows
-        (1e3, GOOD, None, "shows nothing above"),
-        (1e-6, GOOD, None, "too short"),
+        (1.0, GOOD[::-1], -1.0, "does not decay"),
+        (1.0, 0.01 * np.exp(-TIME) * np.cos(2.0 * np.pi * 5.65 * TIME), -1.0, "two spectral peaks"),
+        (1.0, 0.01 * np.exp(-TIME), -1.0, "oscillation"),
+        (1.0, np.random.default_rng(0).standard_normal(TIME.size), -1.0, "does not decay"),
+        (1.0, ring_down(TIME, amplitude=(0.01, 3e-5), ratio=(0.05, -0.006)), -1.0, "decay"),  # a mode grows
+        (1e3, GOOD, -1.0, "shows nothing above"),
+        (1e-6, GOOD, -1.0, "too short"),
         (1.0, GOOD, 3.5, "remain"),
     ],
 )  # fmt: skip
@@ -196,13 +196,11 @@ FROM_100 = np.arange(TIME.size) >= 100
 @pytest.mark.parametrize(
     ("time", "signal", "words"),
     [
-        (TIME, np.where(np.arange(TIME.size) == 17, math.nan, GOOD), "reading 18 is nan"),
         (TIME, np.clip(GOOD, -0.008, 0.008), "clipped"),
         (TIME, np.zeros(TIME.size), "constant"),
         (TIME[:20], GOOD[:20], "at least 64"),
         (TIME + 0.1 * FROM_100, GOOD, "after sample 100"),
         (TIME[::-1], GOOD, "even steps"),
-        (TIME, GOOD[1:], "vectors of one length"),
     ],
 )
 def test_bad_records_are_told_in_one_sentence(time, signal, words):
@@ -215,17 +213,17 @@ def test_bad_records_are_told_in_one_sentence(time, signal, words):
     seed=st.integers(0, 10_000),
     rates=st.tuples(st.floats(-3.0, 30.0), st.floats(-3.0, 30.0)),
     noise=st.sampled_from([0.0, 1e-3, 0.1]),
-    procedure=st.sampled_from(list(Frequencies)),
+    free=st.booleans(),
 )
-@example(seed=330, rates=(13.46484375, 15.625), noise=0.1, procedure=Frequencies.PEAKS)  # a wave that is gone
-def test_any_record_is_fitted_or_refused(seed, rates, noise, procedure):
+@example(seed=330, rates=(13.46484375, 15.625), noise=0.1, free=False)  # a wave that is gone
+def test_any_record_is_fitted_or_refused(seed, rates, noise, free):
     generator = np.random.default_rng(seed)
     time = np.arange(0.0, 3.0, 1.0 / 125.0)
     signal = noise * generator.standard_normal(time.size)
     for rate, frequency in zip(rates, generator.uniform(0.5, 60.0, 2), strict=True):
         signal = signal + np.exp(-rate * time) * np.cos(2.0 * np.pi * frequency * time)
     try:
-        fit = fit_ring_down(RingDownRecord(time, signal), procedure, start=None)
+        fit = fit_ring_down(RingDownRecord(time, signal), free=free, start=-1.0)
     except CalibrationError:
         return
     assert all(0.0 < mode.damping_ratio < 1.0 for mode in fit.modes)
@@ -286,12 +284,12 @@ def test_damping_of_a_drawn_signal():
     record = drawn()
     trials = fit_trials([record])
     refined = refine_by_extremes(trials)
-    first, second = refined.fits[0].modes
+    first, second = refined[0].modes
     assert first.damping_ratio == pytest.approx(0.0281, rel=0.02)
     # The spectral peak of a mode damped by 7 % lies a little off its frequency.
     assert second.damping_ratio == pytest.approx(0.0717, rel=0.10)
-    assert second.damped_frequency == trials.fits[0].modes[1].damped_frequency
-    middle = abs(trials.average("damping_ratio", 1).mean / 0.0717 - 1.0)
+    assert second.damped_frequency == trials[0].modes[1].damped_frequency
+    middle = abs(average(trials, "damping_ratio", 1).mean / 0.0717 - 1.0)
     assert abs(second.damping_ratio / 0.0717 - 1.0) <= middle + 0.02
     assert 0.0 < second.standard_error["damping_ratio"] < 0.02
     with pytest.raises(ExperimentDataError, match="no lowest and highest"):
