@@ -63,6 +63,22 @@ def discretised(
     return moves, noises
 
 
+@callable_when_compiled
+def read(cover: FloatArray, row: FloatArray, gain: FloatArray) -> float:
+    """Return the variance of a reading, given a covariance (n, n), which it reduces, and fill its gain (n,)."""
+    weight = cover @ row
+    size = row @ weight + 1.0
+    gain[:] = weight / size
+    for i in range(len(row)):  # from both sides in turn: what the first leaves by rounding the second takes
+        for j in range(len(row)):
+            cover[i, j] -= gain[i] * weight[j]
+    weight = cover @ row
+    for i in range(len(row)):
+        for j in range(len(row)):
+            cover[i, j] += (gain[i] - weight[i]) * gain[j]
+    return float(size)
+
+
 @compiled
 def forward(
     moves: FloatArray, noises: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray,
@@ -129,18 +145,9 @@ def forward(
                 continue
             row, left = rows[c], white[k - first, c]
             if not steady:
-                weight = cover @ row
-                sizes[c] = row @ weight + 1.0
+                sizes[c] = read(cover, row, gains[c])
                 if not sizes[c] > LEAST_SIZE:
                     return covers, means, white, halves, all_gains, all_sizes
-                gains[c] = weight / sizes[c]
-                for i in range(n):  # from both sides in turn: what the first leaves the second takes
-                    for j in range(n):
-                        cover[i, j] -= gains[c, i] * weight[j]
-                weight = cover @ row
-                for i in range(n):
-                    for j in range(n):
-                        cover[i, j] += (gains[c, i] - weight[i]) * gains[c, j]
             left[:] = columns[k, c]
             for j in range(n):
                 factor = row[j]
