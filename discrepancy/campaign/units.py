@@ -3,20 +3,14 @@
 import re
 import unicodedata
 from contextlib import suppress
-from decimal import Decimal
-from fractions import Fraction
 from functools import cache
-from math import isfinite, pi
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from discrepancy.campaign.records import FloatArray, Quantity
+from discrepancy.campaign.records import Quantity
 from reporting.words import listing
 
 if TYPE_CHECKING:
     from pint import UnitRegistry
-
-_Value = TypeVar("_Value", float, FloatArray)
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2 in one g, exact by definition."""
@@ -79,42 +73,11 @@ UNITS = {
 """All that files, tables and figures know of a quantity: a new kind of sensor is one more row."""
 
 
-class Conversion(NamedTuple):
-    """What makes SI of a unit: a fraction, so that a power of ten rounds once."""
-
-    numerator: float = 1.0
-    denominator: float = 1.0
-
-    @property
-    def factor(self) -> float:
-        """What one of the unit is in SI."""
-        return self.numerator / self.denominator
-
-    def to_si(self, value: _Value) -> _Value:
-        """Return numbers of the unit in SI."""
-        return value * self.numerator / self.denominator
-
-    def si_text(self, number: str) -> str:
-        """Return the text of a printed number in SI, rounded once."""
-        value = float(number)
-        if value == 0.0 or not isfinite(value * self.factor):  # also what is too large or small for a number
-            return repr(value * self.factor)
-        return repr(float(Fraction(number) * Fraction(self.numerator) / Fraction(self.denominator)))
-
-    def from_si(self, value: _Value) -> _Value:
-        """Return numbers of SI in the unit."""
-        return value * self.denominator / self.numerator
-
-
 @cache
 def _known_units() -> "UnitRegistry[Any]":
-    """Return the units of pint in fractions of integers; pi is that of floats, and so are its multiples."""
-    import pint
+    import pint  # takes a third of a second
 
-    known: UnitRegistry[Any] = pint.UnitRegistry(None, non_int_type=Fraction, on_redefinition="ignore")
-    known.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
-    known.define(f"pi = {Decimal(pi)} = π")
-    return known
+    return pint.UnitRegistry()
 
 
 def _expression(unit: str, *, acceleration: bool) -> str:
@@ -134,8 +97,8 @@ def _expression(unit: str, *, acceleration: bool) -> str:
 
 
 @cache
-def conversion(unit: str, si: str) -> Conversion:
-    """Return what makes a unit of SI of another; an angle is no number here, and a hertz no rad/s.
+def conversion(unit: str, si: str) -> float:
+    """Return what one of a unit is in a unit of SI; an angle is no number here, and a hertz no rad/s.
 
     Raises
     ------
@@ -143,7 +106,7 @@ def conversion(unit: str, si: str) -> Conversion:
         pint does not know the unit, or it is of another quantity.
     """
     if unit == si:
-        return Conversion()  # pint takes a third of a second to load
+        return 1.0
     from pint.errors import PintError
 
     known = _known_units()
@@ -154,20 +117,19 @@ def conversion(unit: str, si: str) -> Conversion:
             factor, root = known.get_root_units(known.parse_units(expression))
         except (PintError, AttributeError, TypeError, ArithmeticError) as cause:
             raise ValueError(f"{text!r} is no unit") from cause
-        factors.append(Fraction(str(factor)))
+        factors.append(float(factor))
         roots.append(root)
     if roots[0] != roots[1]:
         raise ValueError(f"{unit!r} cannot become {si}")
-    factor = factors[0] / factors[1]
-    return Conversion(float(factor.numerator), float(factor.denominator))
+    return factors[0] / factors[1]
 
 
 @cache
-def conversion_of(quantity: Quantity, unit: str) -> Conversion:
-    """Return what makes SI of a quantity's unit; raises ValueError with what is expected."""
+def conversion_of(quantity: Quantity, unit: str) -> float:
+    """Return what one of a quantity's unit is in SI; raises ValueError with what is expected."""
     try:
         if quantity is Quantity.TEMPERATURE and unit in _NEVER_CONVERTED:
-            return Conversion()
+            return 1.0
         if quantity is Quantity.TEMPERATURE:
             raise ValueError
         if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):
