@@ -117,7 +117,7 @@ def conversion(unit: str, si: str) -> float:
             factor, root = known.get_root_units(known.parse_units(expression))
         except (PintError, AttributeError, TypeError, ArithmeticError) as cause:
             raise ValueError(f"{text!r} is no unit") from cause
-        factors.append(float(factor))
+        factors.append(float(str(factor)))
         roots.append(root)
     if roots[0] != roots[1]:
         raise ValueError(f"{unit!r} cannot become {si}")
