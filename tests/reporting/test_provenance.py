@@ -1,13 +1,19 @@
-"""Provenance names what made a result and nothing else."""
+"""Records as plain data; provenance names what made a result and nothing else; what is kept in memory."""
 
 import hashlib
 import json
+import math
+import pickle
 import socket
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from reporting import provenance
+from reporting.memory import Memory
+from reporting.record_json import plain
 
 
 def test_versions_of_the_stack():
@@ -59,3 +65,49 @@ def test_hash_of_a_record_and_a_file(tmp_path):
     (tmp_path / "f").write_bytes(b"abc")
     assert provenance.hash_file(tmp_path / "f") == hashlib.sha256(b"abc").hexdigest()
     assert provenance.hash_bytes(b"abc") == hashlib.sha256(b"abc").hexdigest()
+
+
+@dataclass(frozen=True)
+class Inner:
+    name: str
+    count: int
+    limit: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Outer:
+    value: float
+    inner: tuple[Inner, ...]
+    one: Inner
+    values: NDArray[np.float64]
+    words: tuple[str, ...]
+
+
+def test_a_record_is_plain_data_of_json():
+    record = Outer(math.nan, (Inner("a", 1), Inner("b", 2, 0.1)), Inner("c", 3), np.array([0.1, 2.0]), ("x",))
+    first, second, third = ({"name": name, "count": n} for n, name in enumerate("abc", start=1))
+    assert json.loads(json.dumps(plain(record), allow_nan=False)) == {
+        "value": None,
+        "inner": [{**first, "limit": None}, {**second, "limit": 0.1}],
+        "one": {**third, "limit": None},
+        "values": [0.1, 2.0],
+        "words": ["x"],
+    }
+
+
+def test_the_least_recently_used_are_forgotten_where_there_is_no_room():
+    ended = list[str]()
+    kept = Memory(6, weight=len, end=ended.append)
+    for text in ("one", "two", "one", "four"):  # seven letters do not fit
+        assert kept.get(text, lambda text=text: text) == text
+    assert ended == ["two", "one"]
+    kept.get("a", lambda: "a")
+    assert kept.get("four", lambda: "made anew") == "four"
+    kept.clear()
+    assert ended == ["two", "one", "a", "four"]
+
+
+def test_another_process_is_handed_nothing():
+    kept = Memory(2)
+    kept.get("x", lambda: 1)
+    assert pickle.loads(pickle.dumps(kept)).get("x", lambda: 2) == 2
