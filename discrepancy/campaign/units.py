@@ -1,30 +1,16 @@
 """Units of a campaign's files as pint knows them, and their conversion to SI."""
 
 import re
-import unicodedata
 from contextlib import suppress
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from discrepancy.campaign.records import Quantity
+from reporting.units import exact_meaning
 from reporting.words import listing
-
-if TYPE_CHECKING:
-    from pint import UnitRegistry
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2 in one g, exact by definition."""
-_ALIASES = {"kp": "kgf", "rev": "turn", "U": "turn", "%": "percent", "‰": "permille", "°": "degree"}
-"""Names of units that pint does not know, or reads as something else."""
-_LONGEST = 40
-"""Letters of a unit: pint takes long over more."""
-_PART = re.compile(r"([^\W\d_]+|[%‰°]|1)(?:\^?([+-]?\d))?")
-"""One factor of a unit: a name and its power."""
-_WORDS = {
-    "chain", "chains", "dB", "decade", "hand", "hands", "link", "links", "octave", "point", "points", "rod",
-    "rods",
-}  # fmt: skip
-"""What pint takes for lengths and ratios, and measuring programmes do not."""
 _NEVER_CONVERTED = {"degC", "°C", "K"}
 """Temperatures: a campaign has one of the two for all."""
 
@@ -74,29 +60,6 @@ UNITS = {
 
 
 @cache
-def _known_units() -> "UnitRegistry[Any]":
-    import pint  # takes a third of a second
-
-    return pint.UnitRegistry()
-
-
-def _expression(unit: str, *, acceleration: bool) -> str:
-    """Return a unit as pint reads it; raises ValueError if it is not made of names and powers."""
-    text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST]).replace("**", "^")
-    parts = re.split(r"\s*([*/.·⋅]|\s)\s*", text)
-    for at in range(0, len(parts), 2):
-        found = _PART.fullmatch(parts[at])
-        if found is None or found[1] in _WORDS or len(unit) > _LONGEST:
-            raise ValueError(f"{unit!r} is no unit")
-        name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", _ALIASES.get(found[1], found[1]))
-        name = re.sub(r"^([mμ]?)g$", r"\1g_0", name) if acceleration else name
-        parts[at] = name if found[2] is None else f"({name})**{found[2]}"
-        if at:
-            parts[at - 1] = "/" if parts[at - 1] == "/" else "*"
-    return "".join(parts)
-
-
-@cache
 def conversion(unit: str, si: str) -> float:
     """Return what one of a unit is in a unit of SI; an angle is no number here, and a hertz no rad/s.
 
@@ -106,22 +69,12 @@ def conversion(unit: str, si: str) -> float:
         pint does not know the unit, or it is of another quantity.
     """
     if unit == si:
-        return 1.0
-    from pint.errors import PintError
-
-    known = _known_units()
-    factors, roots = [], []
-    for text in (unit, si):
-        try:
-            expression = _expression(text, acceleration=si == UNITS[Quantity.ACCELERATION].si)
-            factor, root = known.get_root_units(known.parse_units(expression))
-        except (PintError, AttributeError, TypeError, ArithmeticError) as cause:
-            raise ValueError(f"{text!r} is no unit") from cause
-        factors.append(float(str(factor)))
-        roots.append(root)
-    if roots[0] != roots[1]:
+        return 1.0  # pint takes a third of a second to load
+    gravity = si == UNITS[Quantity.ACCELERATION].si
+    (dimension, one, _), (wanted, other, _) = (exact_meaning(text, gravity=gravity) for text in (unit, si))
+    if dimension != wanted:
         raise ValueError(f"{unit!r} cannot become {si}")
-    return factors[0] / factors[1]
+    return float(one / other)
 
 
 @cache
