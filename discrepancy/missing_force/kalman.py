@@ -65,7 +65,7 @@ def discretised(
 
 @callable_when_compiled
 def read(cover: FloatArray, row: FloatArray, gain: FloatArray) -> float:
-    """Return the variance of a reading, given a covariance (n, n), which it reduces, and fill its gain (n,)."""
+    """Return the variance of a reading; take it into a covariance (n, n), and fill its gain (n,)."""
     weight = cover @ row
     size = row @ weight + 1.0
     gain[:] = weight / size
