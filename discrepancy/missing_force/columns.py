@@ -4,6 +4,7 @@ A law is taken along a motion that is known: what it would have been, had the po
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,7 +14,7 @@ from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.trial import Part, SeenTrial
+from discrepancy.missing_force.trial import Part, SeenTrial, seen_trial
 from discrepancy.missing_force.view import Column, Motion, View, combined
 from discrepancy.models.interface import Response
 from discrepancy.models.sensing import observe_response
@@ -86,10 +87,22 @@ class Columns:
         Which trials of the problem the view's are.
     point : Point
         About which the view's trials are linear.
+    own : ModelPatch
+        Laws that the model has itself.
     """
 
-    def __init__(self, problem: Problem, numbers: Sequence[int], point: Point) -> None:
-        self.problem, self.numbers, self.point = problem, numbers, point
+    def __init__(self, problem: Problem, numbers: Sequence[int], point: Point, own: ModelPatch) -> None:
+        self.problem, self.numbers, self.point, self.own = problem, numbers, point, own
+
+    def bare(self) -> View:
+        """Return the trials as they are seen about the point."""
+        trials = [seen_trial(self.problem, number, self.point) for number in self.numbers]
+        return View(trials, self.problem.shared.precision)
+
+    def along(self, view: View, motions: Sequence[Motion], known: Column | None = None) -> View:
+        """Return a view along motions, the model's own laws included, with what else is known."""
+        own = self.of_patch(view, motions, self.own) if len(self.own) else None
+        return replace(view, motions=motions, own=own, known=known)
 
     def of(
         self, view: View, motions: Sequence[Motion], candidate: Candidate, values: FloatArray

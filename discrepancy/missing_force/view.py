@@ -58,14 +58,6 @@ class Motion:
     speeds: FloatArray
     deviations: Mapping[int, tuple[FloatArray, float]]
 
-    def part(self, at: slice) -> "Motion":
-        """Return the motion at some of the fine stamps."""
-        forces, left = ({port: item[at] for port, item in of.items()} for of in (self.forces, self.left))
-        return replace(
-            self, added=self.added[at], forces=forces, left=left, explained=self.explained[at],
-            positions=self.positions[at], speeds=self.speeds[at],
-        )  # fmt: skip
-
     @property
     def laws(self) -> dict[int, FloatArray]:
         """Forces of the hypothesis (F,) by port."""
