@@ -74,7 +74,7 @@ class EventSearch:
     Attributes
     ----------
     trials, columns : sequence of SeenTrial, sequence of (K, N, C) ndarray
-        What is looked at: stamps and which readings count; residuals, columns of shared unknowns and local ones.
+        What is looked at: stamps, and which readings count; residuals and columns of all unknowns.
     flips : sequence of (N,) ndarray of bool
         By trial, the samples at which it does.
     """

@@ -18,9 +18,8 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
-from .columns import Columns
 from .filtered import Process, Solution
-from .hypotheses import both_signs, log_prior, scaled, sized, stepped, variants
+from .hypotheses import Columns, both_signs, log_prior, scaled, sized, stepped, variants
 from .view import Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)

@@ -17,8 +17,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
 
-from .columns import Columns
-from .hypotheses import scaled, sees_forces
+from .hypotheses import Columns, scaled, sees_forces
 from .naming import Explained, ForceSearch
 from .trial import SeenTrial
 from .view import Motion, View
