@@ -84,10 +84,7 @@ class EventSearch:
     ) -> None:
         self.view, self.port, self.process, self.turning = view, port, process, turning
         self.trials = [replace(one, time=one.time[::every], used=one.used[::every]) for one in view.trials]
-        self.columns = [
-            np.concatenate((residual[None], columns, trial.local))[:, ::every]
-            for trial, residual, columns in zip(view.trials, view.residuals, view.columns, strict=True)
-        ]
+        self.columns = [rows[:, ::every] for rows in view.rows]
         self.flips = [np.zeros(len(trial.time), dtype=bool) for trial in self.trials]
         if turning and view.motions:  # of readings alone nothing moves
             moves = zip(view.trials, view.motions, strict=True)
