@@ -151,28 +151,21 @@ def test_white_noise_has_no_remainder(freedom):
     for seed in range(40):
         problem, found, left = ringing(seed, 150, noise=NoiseRecord(0.02, freedom))
         wrong += left.acts
+        assert np.all(left.factor >= 1.0)
         if seed == 0:
             assert refitted(problem, widened(problem, left), found) is found
     assert wrong <= 1
 
 
-def test_white_noise_beyond_its_record_forgets_at_once():
-    """Noise a fifth above its record: of some size, and no time over which it forgets."""
-    generator = np.random.default_rng(4)
-    loud = 0.02 * np.sqrt(0.2)
-    problem, _, left = ringing(3, 600, lambda rows: loud * generator.standard_normal(len(rows)))
-    first = problem.channel_names.index("y1")
-    assert left.size[first] == pytest.approx(np.sqrt(0.2), rel=0.3)
-    assert left.time[first] < 0.05
-    assert np.all(left.factor >= 1.0)
-
-
-@pytest.mark.parametrize(("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0)])
+@pytest.mark.parametrize(
+    ("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0), (np.sqrt(0.2), 1e-6, 0.0)]
+)
 def test_size_time_and_frequency_are_found(size, tau, frequency):
+    """And of white noise a fifth above its record a size, and no time over which it forgets."""
     problem, _, left = ringing(4, 900, coloured(size, tau, frequency))
     first = problem.channel_names.index("y1")
     assert left.size[first] == pytest.approx(size, rel=0.4)
-    assert left.time[first] == pytest.approx(tau, rel=0.6)
+    assert left.time[first] == pytest.approx(tau, rel=0.6, abs=0.04)
     assert 2.0 * np.pi * left.frequency[first] == pytest.approx(frequency, abs=1.0)
     assert np.all(np.delete(left.size, first) == 0.0)
     assert not left.is_noise
