@@ -32,15 +32,12 @@ def setting():
         name: Channel(name, quantity, output, noise, 0.005, 1e-5)
         for name, (output, quantity) in OUTPUTS.items()
     }
-    names = tuple(OUTPUTS)
+    given_to_all = {"channels": tuple(OUTPUTS), "load_place": "end"}
     trials = tuple(
-        replace(
-            item, channels=names, load_place="end", values=item.values[:, :2], used=item.used[:, :2],
-            release=Release(0.01) if item.release else None,
-        )
-        for item in given.trials
+        replace(item, **given_to_all, values=item.values[:, :2], used=item.used[:, :2], release=release)
+        for item, release in ((item, item.release and Release(0.01)) for item in given.trials)
         if item.name != "flight"
-    )  # fmt: skip
+    )
     chain = replace(given, channels=channels, trials=trials)
     means = np.array([item.mean for item in model.parameters])
     for item in trials:

@@ -185,20 +185,6 @@ def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():
     assert found.chi_square > 3.0 * said.chi_square  # told against the recorded noise
 
 
-def test_evidence_counts_independent_samples():
-    """A drift of the same channel gains much by white noise from a slow remainder, and little beside it."""
-    gains = []
-    for seed in range(6):
-        problem, none, _ = ringing(seed, 400, coloured(4.0, 0.4, 0.0, seed), offset_deviation=0.0)
-        drift = kit.fitted(problem, Term(kit.drift_effect(channel="y1"), "y1"))
-        wide = widened(problem, left_by(problem, drift))
-        pair = [refitted(problem, wide, item).log_evidence for item in (none, drift)]
-        gains.append((drift.log_evidence - none.log_evidence, pair[1] - pair[0]))
-    white, honest = np.array(gains).T
-    assert white.max() > 20.0
-    assert honest.max() < 4.0
-
-
 def test_colour_of_the_noise_is_told_from_a_remainder():
     """The same process in the trials, in the noise record or not."""
     generator = np.random.default_rng(5)
