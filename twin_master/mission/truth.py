@@ -77,21 +77,16 @@ class Truth:
     def _apply_faults(self, scenario: Scenario) -> None:
         steps = np.arange(scenario.mission.steps)
         for fault in scenario.truth.sensor_faults:
-            if fault.sensors == "all":
-                sensors = np.arange(scenario.observation.count)
-            else:
-                sensors = np.asarray(fault.sensors) - 1
             last = fault.last_step if fault.last_step is not None else scenario.mission.steps
             active = (steps >= fault.first_step) & (steps <= last)
-            cells = np.ix_(active, sensors)
+            cells = np.ix_(active, np.array(fault.places(scenario.observation.count)))
             if fault.kind == "dropout":
                 self.status[cells] = SensorStatus.LOST
             else:
                 assert fault.rate is not None  # the schema asks for it
                 self.drift[cells] += (fault.rate * (steps[active] - fault.first_step + 1.0))[:, None]
-                self.status[cells] = np.maximum(
-                    self.status[cells], SensorStatus.DRIFTING * (self.status[cells] != SensorStatus.LOST)
-                )
+                lost = self.status[cells] == SensorStatus.LOST
+                self.status[cells] = np.where(lost, SensorStatus.LOST, SensorStatus.DRIFTING)
 
     def state(self, step: int, previous_state: Float | None, previous_control: int | None) -> Float:
         """Return the true state of a step: (F,), a value of each state factor in SI.

@@ -123,8 +123,7 @@ def _truth(scenario: Scenario, name: str) -> Float | None:
     healthy = np.zeros(observation.count)
     for fault in truth.sensor_faults:
         if fault.kind == "drift":
-            sensors = range(1, observation.count + 1) if fault.sensors == "all" else fault.sensors
-            healthy[[sensor - 1 for sensor in sensors]] = np.nan
+            healthy[fault.places(observation.count)] = np.nan
     return healthy
 
 
