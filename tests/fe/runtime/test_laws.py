@@ -381,6 +381,21 @@ def test_a_mass_within_the_friction_never_moves_and_leaves_under_a_larger_force(
     assert moved.q[-1, 0] > 0.5 / STIFFNESS
 
 
+@pytest.mark.parametrize("ratio", [0.35, 0.4, 0.49, 0.55, 0.75, 0.9])
+@pytest.mark.parametrize("steps", [11, 17, 31])
+def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(ratio, steps):
+    # Half kicks at both ends of a step move about an equilibrium that is nearer by friction h^2 / 12. A mass
+    # that begins nearer by as much moves as the exact one does, always nearer, and stops where that stops:
+    # before the spring is free of load (2 ratio > 1) as well as beyond.
+    strength, duration = ratio * STIFFNESS, 0.8
+    shift = strength * (duration / steps) ** 2 / 12.0
+    moved = ring(
+        coulomb(strength), start=1.0 - shift, duration=duration, count=2, substeps=steps, kernel=None
+    )
+    assert moved.v[-1, 0] == pytest.approx(0.0, abs=1e-12)
+    assert moved.q[-1, 0] == pytest.approx(2.0 * ratio - 1.0, abs=0.03 * shift)
+
+
 # ---------------------------------------------------------------- stiffness
 
 
