@@ -2,18 +2,24 @@
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from fe.reduction.model_cache import reduced_model
 from scenarios import scenario_files
+from twin_master.assets.asset_source import Asset, AssetSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
+from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.turns import History, Turn
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.schema import Scenario
 
 
 def edited(text: str, *changes: tuple[str, str]) -> str:
@@ -52,6 +58,25 @@ def of_library(
     scenario = load_scenario(name).scenario.model_copy(update=sections)
     source = StrainLibrarySource(scenario, load_strain_library(library))
     return prepare_knowledge(scenario, source, seed), source
+
+
+def of_wing(given: str | Scenario, seed: int = 3) -> tuple[Knowledge, ReducedModelSource]:
+    """Return what a twin of the shipped wing knows, and that wing."""
+    scenario = load_scenario(given).scenario if isinstance(given, str) else given
+    source = ReducedModelSource(scenario, reduced_model())
+    return prepare_knowledge(scenario, source, seed), source
+
+
+def flight_of(
+    knowledge: Knowledge,
+    source: AssetSource,
+    *sinks: Callable[[Turn], None],
+    seed: int = 3,
+    asset: Asset | None = None,
+) -> History:
+    """Return the mission of a seed, flown by an asset or by what its source opens."""
+    plant = knowledge.plant(knowledge.truth(seed), asset or source.open())
+    return fly(knowledge.scenario, knowledge.twin(), plant, *sinks)
 
 
 def figures_of(folder: Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import pytest
 from calibration.errors import PosteriorError
 from tests.command_line import refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, edited, text_of, written
+from tests.twin_master.runs import check_same, edited, flight_of, text_of, written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderExistsError
 from twin_master.fleet import flight
@@ -22,7 +22,6 @@ from twin_master.fleet.reading import Estimated, group_figures
 from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.shard import Engine
 from twin_master.mission.journal import JournalFile
-from twin_master.mission.loop import fly
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
@@ -194,11 +193,8 @@ def test_figures_are_those_of_the_flights(library_file, tmp_path):
     fleet = growing(library_file, count=4)
     folder, (group,) = fly_fleet(fleet, tmp_path / "fleet").folder, fleet.groups
     knowledge = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
-    asset = group.scenarios[0].asset.source(group.scenarios[0]).open()
-    flights = [
-        fly(knowledge.scenario, knowledge.twin(), knowledge.plant(knowledge.truth(seed), asset))
-        for seed in range(4)
-    ]
+    source = group.scenarios[0].asset.source(group.scenarios[0])
+    flights = [flight_of(knowledge, source, seed=seed) for seed in range(4)]
     figures = group_figures(fleet_groups(folder)["growing_damage"])
     error = [knowledge.model.states.mean(f.filtered) - f.state for f in flights]
     for name, expected in (

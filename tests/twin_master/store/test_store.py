@@ -9,9 +9,8 @@ import pytest
 import xarray as xr
 
 from reporting.errors import FileNotWrittenError
-from tests.twin_master.runs import of_library
+from tests.twin_master.runs import flight_of, of_library
 from twin_master.errors import RunFolderError
-from twin_master.mission.loop import fly
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Reference
@@ -28,9 +27,7 @@ def result(library_file: Path) -> MissionResult:
 
 def flown(name: str, library_file: Path) -> MissionResult:
     knowledge, source = of_library(name, library_file)
-    truth = knowledge.truth(3)
-    flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
-    return MissionResult(knowledge.scenario, knowledge, flight, truth)
+    return MissionResult(knowledge.scenario, knowledge, flight_of(knowledge, source), knowledge.truth(3))
 
 
 def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_path):
