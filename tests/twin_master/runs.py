@@ -46,6 +46,22 @@ def table_of(name: str) -> dict[str, Any]:
     return tomllib.loads(text_of(name))
 
 
+def merged(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table with other values, also in its tables; "" for a key that goes."""
+    found = {key: value for key, value in table.items() if changes.get(key) != ""}
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(found.get(key), dict):
+            found[key] = merged(found[key], value)
+        elif value != "":
+            found[key] = value
+    return found
+
+
+def changed_scenario(name: str, changes: Mapping[str, Any]) -> LoadedScenario:
+    """Return a shipped scenario with other values in its tables."""
+    return loaded_from(merged(table_of(name), changes), name)
+
+
 def loaded_from(table: dict[str, Any], name: str) -> LoadedScenario:
     """Return a scenario that stands where a shipped one does."""
     return LoadedScenario(parse_scenario(table, name), scenario_files()[name], "0" * 64)

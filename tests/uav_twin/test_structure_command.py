@@ -21,7 +21,7 @@ from scenarios import structure_files
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import loaded_from, table_of
+from tests.twin_master.runs import changed_scenario, loaded_from
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
@@ -249,12 +249,8 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def mission(**calibration: object) -> LoadedScenario:
     """The shipped mission in six shifts, of an asset whose parameters are not named."""
-    table = table_of("bracket")
-    table["mission"] |= {"steps": 6, "prediction_steps": 2}
-    table["asset"] = {"kind": "structure", "structure": "bracket", "isolated": False}
-    table["truth"]["gains"] = []
-    table["calibration"] |= calibration
-    return loaded_from(table, "bracket")
+    changes = {"mission": {"steps": 6, "prediction_steps": 2}, "asset": {"isolated": False, "parameters": ""}}
+    return changed_scenario("bracket", changes | {"truth": {"gains": []}, "calibration": calibration})
 
 
 def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated):

@@ -1,5 +1,6 @@
 """A twin that believes an observation library, and the pump's mission against its equations."""
 
+import copy
 import itertools
 import json
 import math
@@ -17,7 +18,7 @@ from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
 from scenarios import asset_scripts
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, table_of
+from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, merged, table_of
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
@@ -35,36 +36,17 @@ pytestmark = pytest.mark.usefixtures("no_report")
 INPUTS = Inputs(__file__)
 
 
-def pump_table() -> dict[str, Any]:
-    """Return the shipped mission cut down: five shifts, 3 x 2 levels, four draws, and sensors that fail."""
-    table = table_of("pump_wear")
-    table["mission"] |= {"steps": 5, "prediction_steps": 3}
-    table["state"][0] |= {"levels_percent": [0, 30, 60], "prior": [1, 0, 0]}
-    table["state"][1] |= {"levels_percent": [0, 60], "prior": [1, 0]}
-    table["calibration"] |= {"draws": 4}
-    table["asset"] |= {"isolated": False}
-    table["observation"] |= {"between_levels": False}  # what is enumerated below
-    table["truth"]["gains"] = [
-        {"state": "wear", "first_step": 1, "gain_percent": 20},
-        {"state": "clogging", "first_step": 3, "gain_percent": 50},
-    ]
-    table["truth"]["sensor_faults"] = [
-        {"kind": "dropout", "sensors": [1], "first_step": 1, "last_step": 1},
-        {"kind": "dropout", "sensors": "all", "first_step": 2, "last_step": 2},
-    ]
-    return table
+PUMP = merged(table_of("pump_wear"), INPUTS.table("small_pump.toml"))
 
 
 def small_pump(**asset: Any) -> LoadedScenario:
     """Return the small mission, with changes of its asset."""
-    table = pump_table()
-    table["asset"] |= asset
-    return loaded_from(table, "pump_wear")
+    return loaded_from(merged(PUMP, {"asset": asset}), "pump_wear")
 
 
 def changed(key: str, entry: object) -> LoadedScenario:
     """Return the small mission with another entry at a key such as `state.0.unit`."""
-    table = pump_table()
+    table = copy.deepcopy(PUMP)
     *path, last = key.split(".")
     node: Any = table
     for part in path:
@@ -139,7 +121,7 @@ def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
 
 
 def test_names_and_order_of_controls_and_states_do_not_matter(made, tmp_path):
-    table, figures = pump_table(), []
+    table, figures = copy.deepcopy(PUMP), []
     table["state"].reverse()
     table["control"].reverse()
     for name, loaded in (("a", small_pump()), ("b", loaded_from(table, "pump_wear"))):
