@@ -197,23 +197,9 @@ def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
 @pytest.mark.xdist_group("wing")
 def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
-    script = (
-        (10, 19, "z1", 0.02), (20, 20, "z1", 0.2), (30, 30, "z1", 0.2),
-        (5, 14, "z2", 0.02), (5, 5, "z2", 0.2), (25, 25, "z2", 0.2),
-    )  # fmt: skip
-    entries = ", ".join(
-        f'"script[{i}].first" = {first}.0, "script[{i}].last" = {last}.0, "script[{i}].{region}" = {gain}'
-        for i, (first, last, region, gain) in enumerate(script, start=1)
-    )
-    faults = (
-        '"dropout_start[1]" = 28.0, "dropout_end[1]" = 1000.0, "dropout_start[{17..20}]" = 12.0, '
-        '"dropout_end[{17..20}]" = 19.0, "blackout.start" = 36.0, "blackout.end" = 38.0, '
-        '"drift_rate[12]" = 6e-6, "drift_start[12]" = 8.0'
-    )
-    damage = ('"probability.z1" = 0.10, "probability.z2" = 0.10', entries)
-    gauges = ('noise = 150e-6, "dropout_start[6]" = 20.0, "dropout_end[6]" = 30.0', faults)
     quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
-    split = plant_of(shipped("three_fmus", tmp_path, damage, gauges), tmp_path / "split")
+    lived = INPUTS.table("lived_by_fmus.toml")["changes"]
+    split = plant_of(shipped("three_fmus", tmp_path, *lived), tmp_path / "split")
     single = plant_of(shipped("failing_gauges", tmp_path, quiet), tmp_path / "single")
     controls = np.random.default_rng(3).integers(2, size=50).tolist()
     for step, control in enumerate(controls):

@@ -164,18 +164,9 @@ def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(files, 
 
 def test_what_does_not_fit_is_named_before_anything_is_started(files, tmp_path):
     out = tmp_path / "lever.nc"
-    for changes, words in (
-        (
-            {"states": {"tear": (0.0,)}},
-            "the state tear, which the binding wayward does not know; it knows wear",
-        ),
-        ({"controls": {"a": {"pull": 1.0}}}, "control input pull"),
-        ({"parameter": "gains"}, "the parameter gains"),
-        ({"states": {}}, "needs at least one state"),
-        ({"states": {"wear": (0.2, 0.1)}}, "must increase"),
-    ):
+    for changes, words in Inputs(__file__).refused("grids"):
         with pytest.raises(InvalidObservationLibraryError, match=words):
-            sample_library(grid(files, **changes), out, workers=1)  # type: ignore[arg-type]
+            sample_library(grid(files, **changes), out, workers=1)
     with pytest.raises(InvalidObservationLibraryError, match="suffix"):
         sample_library(grid(files), tmp_path / "lever.csv", workers=1)
     with pytest.raises(InvalidObservationLibraryError, match="at least 1"):

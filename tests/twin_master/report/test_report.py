@@ -30,6 +30,7 @@ from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import LearntQuantity
 from twin_master.store.summary import Fallback, of_fallback
 
+INPUTS = Inputs(__file__)
 DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
 
 
@@ -75,9 +76,7 @@ OTHERWISE: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("gentle", "otherwise", "said"), Inputs(__file__).table("first_sentences.toml")["rows"]
-)
+@pytest.mark.parametrize(("gentle", "otherwise", "said"), INPUTS.table("first_sentences.toml")["rows"])
 def test_the_first_sentence_follows_the_record(run, gentle, otherwise, said):
     turns = (turn for begin, end in gentle for turn in range(begin, end))
     assert first_sentence(run, *turns, **OTHERWISE[otherwise]) == said
@@ -260,21 +259,13 @@ def test_a_calibration_file_shows_its_wing(run, make_calibration):
 
 # ------------------------------------------------------------------------------- what is refused
 
-BROKEN = {
-    "no run": ("run.nc", None, r"holds no run\.nc"),
-    "empty": ("run.nc", b"", "damaged"),
-    "text": ("run.nc", b"not a run", r"damaged.* resume the run or fly it again\.$"),
-    "half a configuration": ("config.json", b'{"half": ', r"config\.json"),
-    "a list": ("config.json", b"[1]", r"config\.json"),
-    "no configuration": ("config.json", None, r"config\.json.*fly it again"),
-}
 
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_a_damaged_run_gives_one_sentence(run, tmp_path, name):
+@pytest.mark.parametrize(("file", "content", "sentence"), INPUTS.table("damaged.toml")["rows"])
+def test_a_damaged_run_gives_one_sentence(run, tmp_path, file, content, sentence):
     place = stored(run, tmp_path / "run")
-    file, content, sentence = BROKEN[name]
-    (place / file).unlink() if content is None else (place / file).write_bytes(content)
+    (place / file).unlink()
+    if content:
+        (place / file).write_text(content, encoding="utf-8")
     with pytest.raises(RunFolderError, match=sentence) as caught:
         report.write_report(place)
     assert "\n" not in str(caught.value)
