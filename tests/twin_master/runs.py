@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from fe.reduction.model_cache import reduced_model
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.reduced_model import ReducedModelSource
@@ -18,8 +17,9 @@ from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.turns import History, Turn
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
+from uav_twin import load_scenario, reduced_model
 
 
 def edited(text: str, *changes: tuple[str, str]) -> str:

@@ -12,10 +12,9 @@ from benchmarks.seeds import fly_seeds
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
 from tests.twin_master.runs import check_same, cut_off_after, of_wing
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import parse_scenario
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import fly, load_scenario, resume
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing"), pytest.mark.usefixtures("no_report")]
 
@@ -35,7 +34,7 @@ def test_the_papers_policy_and_its_reliability():
 
 def test_the_whole_chain_and_its_resumption(wing, tmp_path):
     loaded = load_scenario("paper_level_turns")
-    outcome = new_run(loaded, tmp_path / "whole")
+    outcome = fly(loaded, tmp_path / "whole")
     figures = {figure.key: figure for figure in outcome.figures}
     assert figures["policy_switch_damage"].value == pytest.approx(60.0)
     assert float(figures["strain_error_bound"].value or 0.0) < 3.0
@@ -46,8 +45,8 @@ def test_the_whole_chain_and_its_resumption(wing, tmp_path):
     assert config["inputs"]["design"] == wing.design_hash
     assert (outcome.folder / "wing.vtu").stat().st_size > 10_000
     with cut_off_after(23):
-        new_run(loaded, tmp_path / "part")
-    resume_run(tmp_path / "part")
+        fly(loaded, tmp_path / "part")
+    resume(tmp_path / "part")
     names = "run.nc config.json summary.json calibration.json wing.vtu asset/asset.fmu"
     check_same(tmp_path / "part", outcome.folder, *names.split())
 
@@ -67,7 +66,7 @@ def test_the_mission_is_the_same_with_the_compiled_wing(tmp_path):
         table = loaded.scenario.to_dict()
         table["asset"]["packed"] = packed
         scenario = replace(loaded, scenario=parse_scenario(table, "level_turns"))
-        trees.append(open_run(new_run(scenario, tmp_path / packed).folder))
+        trees.append(open_run(fly(scenario, tmp_path / packed).folder))
     with zipfile.ZipFile(tmp_path / "compiled" / "asset" / "asset.fmu") as archive:
         assert not any(name.endswith(".py") for name in archive.namelist())
     for group in groups:

@@ -16,14 +16,13 @@ from tests.twin_master.runs import check_same, cut_off_after, journal, table_of,
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
-from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
 from twin_master.mission.truth import Plant, Truth
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import fly as new_run
+from uav_twin import fly_fleet, load_scenario, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
 INPUTS = Inputs(__file__)
@@ -97,7 +96,7 @@ def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder, tmp_path):
         new_run(loaded, tmp_path / "run")
     assert len(journal(tmp_path / "run")) == 16
     with pytest.raises(FmuError, match=r"not finite.*outlet"):
-        resume_run(tmp_path / "run")
+        resume(tmp_path / "run")
 
 
 def test_a_system_of_one_fmu_flies_as_the_fmu_alone(folder, direct, tmp_path):
@@ -114,14 +113,14 @@ def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(folder, direct, tmp_p
     loaded = load_scenario(folder / f"{name}.toml")
     with cut_off_after(11):
         new_run(loaded, tmp_path / "part")
-    resume_run(tmp_path / "part")
+    resume(tmp_path / "part")
     check_same(tmp_path / "part", direct[name], "run.nc", "config.json", "summary.json", "journal.jsonl")
     ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
     flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
     assert rows(flown) == rows(direct[name])
     assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
     ssp.unlink()
-    assert rows(resume_run(flown).folder) == rows(direct[name])
+    assert rows(resume(flown).folder) == rows(direct[name])
 
 
 ANY = TwinMasterError, FmuError

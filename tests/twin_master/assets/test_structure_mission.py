@@ -14,7 +14,6 @@ import pytest
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError, InvalidDesignError
 from fe.structure.operators import load_and_assemble
-from scenarios import structure_files
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, cut_off_after, edited, loaded_from, merged, table_of, written
 from twin_master.assets.candidates import with_candidates
@@ -22,12 +21,12 @@ from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.assets.structure_source import StructureBelief
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.network.identified import packed_row
-from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.scenario.reading import LoadedScenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import open_run
 from twin_master.watch.message import MessageReader
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import fly as new_run
+from uav_twin import load_scenario, resume, structure_files
 
 FILE = structure_files()["bracket"]
 TEXT = FILE.read_text(encoding="utf-8")
@@ -131,7 +130,7 @@ def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(flown, tmp_p
     for file in files:
         file.unlink()
     moved = (tmp_path / "part").rename(tmp_path / "moved")
-    resume_run(moved, report=False)
+    resume(moved, report=False)
     check_same(moved, flown, "csv/observed.csv", "csv/estimated.csv", "csv/decisions.csv")
 
 

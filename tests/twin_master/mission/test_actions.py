@@ -12,7 +12,6 @@ import pytest
 from scipy.stats import norm
 
 import uav_twin
-from fe.reduction.model_cache import reduced_model
 from tests.command_line import said
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
@@ -21,7 +20,6 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     decision_problem,
@@ -38,13 +36,14 @@ from twin_master.mission.preparation import (
     knowledge_of,
 )
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
-from twin_master.network.estimator import Carried, Estimator, ExactFilter
+from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.store.writing import open_run
+from uav_twin import Carried, ExactFilter, WatchfulEstimator, reduced_model
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3

@@ -21,19 +21,14 @@ from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network import memory
 from twin_master.network import transition as transition_file
 from twin_master.network.distributions import distribution, stochastic_matrix
-from twin_master.network.graphical_model import (
-    Factor,
-    GraphicalModel,
-    StateSpace,
-    deterministic_policy,
-    worsening_table,
-)
-from twin_master.network.inference import filter_sequence, predict, smooth
+from twin_master.network.graphical_model import Factor, StateSpace, deterministic_policy, worsening_table
+from twin_master.network.inference import predict, smooth
 from twin_master.network.memory import check_scenario_fits
-from twin_master.network.planner import given_policy, value_iteration
+from twin_master.network.planner import given_policy
 from twin_master.network.sensor_model import check_noise
 from twin_master.network.transition import TransitionModel
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import parse_scenario
+from uav_twin import GraphicalModel, filter_sequence, load_scenario, value_iteration
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SPACE = StateSpace((Factor("z1", LEVELS), Factor("z2", (0.0, 0.5, 1.0))))

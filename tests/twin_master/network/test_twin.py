@@ -15,10 +15,11 @@ from scenarios import scenario_files
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
-from twin_master.network.inference import filter_sequence, smooth
-from twin_master.network.twin import Twin, TwinTurn, build_graphical_model
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.network.estimator import Learnt
+from twin_master.network.inference import smooth
+from twin_master.network.twin import TwinTurn, build_graphical_model
+from twin_master.scenario.reading import parse_scenario
+from uav_twin import Carried, Estimate, ExactFilter, Twin, filter_sequence, load_scenario
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from benchmarks.browser import CHROMIUM, open_browser
-from fe.wing.design import SHIPPED_DESIGN, load_design
+from fe.wing.design import SHIPPED_DESIGN
 from reporting.figures import new_figure, to_svg
 from reporting.files import atomic_write_bytes
 from tests.refusals import Inputs
@@ -31,11 +31,10 @@ from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.report.structure import design_of, planform_of
-from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Belief, Flight
 from twin_master.viewer.messages import LATEST, Request, Teller
-from twin_master.workflow import fly as new_run
+from uav_twin import fly, load_design, load_scenario
 
 TURNS = 50
 
@@ -43,7 +42,7 @@ TURNS = 50
 @pytest.fixture(scope="module")
 def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("view") / "run"
-    new_run(load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False)
+    fly(load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False)
     # The gauges of the library are those of the shipped wing: with its design the page shows them from above.
     shutil.copy(SHIPPED_DESIGN, folder / DESIGN_COPY)
     return folder
