@@ -258,7 +258,7 @@ def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
 
 GRID = (
     "--grid",
-    "wear=0,0.3",
+    "health.wear=0,0.3",
     "--grid",
     "clogging=0,0.6",
     "--grid",

@@ -13,7 +13,6 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, figures_of, journal, text_of, written
 from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.network.twin import build_graphical_model
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
@@ -28,14 +27,6 @@ def test_without_the_table_the_filter_is_the_exact_one():
     loaded = load_scenario("level_turns")
     assert loaded.scenario.to_dict()["learning"] is None
     assert isinstance(prepare_twin("paper_level_turns").twin().estimator, ExactFilter)
-
-
-def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave():
-    scenario = load_scenario("level_turns").scenario
-    once, thrice = (build_graphical_model(scenario, factor).transition.matrix for factor in (1.0, 3.0))
-    assert thrice[1, 0, 1] == pytest.approx(0.3 * 0.7)
-    assert once[1, 0, 1] == pytest.approx(0.1 * 0.9)
-    assert thrice.sum(axis=-1) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("learning"))

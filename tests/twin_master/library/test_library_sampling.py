@@ -19,7 +19,7 @@ from fmu_asset.packing.contents import build_script_fmu
 from tests.refusals import Inputs
 from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
-from twin_master.library.grid import SamplingGrid, grid_of_fmu, parse_grid
+from twin_master.library.grid import SamplingGrid, grid_of_fmu
 from twin_master.library.sampling import blocks_folder, sample_library
 
 FINE, LAG, COUNT, DIE, SLEEP, REFUSE, SLOW = (float(mode) for mode in range(7))
@@ -175,15 +175,6 @@ def test_what_does_not_fit_is_named_before_anything_is_started(files, tmp_path):
     with pytest.raises(InvalidObservationLibraryError, match="exists"):
         sample_library(grid(files), out, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["lever.nc"]
-
-
-def test_grids_are_read(files):
-    from fmu_asset.door.binding import load_binding
-
-    found = parse_grid(["health.wear=0:1:5", "push=1,2", "gain=3"], load_binding(files[1]))
-    assert found["health"] == {"wear": (0.0, 0.25, 0.5, 0.75, 1.0)}
-    assert found["control"] == {"push": (1.0, 2.0)}
-    assert found["parameter"] == {"gain": (3.0,)}
 
 
 @given(st.integers(1, 40), st.lists(st.integers(1, 12), min_size=1, max_size=3), st.integers(1, 6))

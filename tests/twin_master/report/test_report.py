@@ -28,7 +28,6 @@ from twin_master.report.reading import Run
 from twin_master.run_folder import to_json
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import LearntQuantity
-from twin_master.store.summary import Fallback, of_fallback
 
 INPUTS = Inputs(__file__)
 DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
@@ -185,18 +184,6 @@ def test_the_present_is_chosen_before_the_first_change_of_control(run):
     for change in (1, 2, 5):  # of which nothing would be seen before it
         assert now(np.where(turns < change, 1, 0)) == 33
     assert now(np.where(turns < 6, 1, 0)) == 3
-
-
-def test_a_fallback_that_came_before_the_damage_has_no_delay():
-    scenario = load_scenario("level_turns").scenario
-
-    def values(*steps: int | None) -> list[object]:
-        fallback = Fallback("z1", 0.6, *steps)
-        return list(of_fallback(fallback, scenario)[2])
-
-    assert values(30, 30, 12) == [60.0, 30, None, None, 12]
-    assert values(30, 31, None) == [60.0, 30, 31, 1, None]
-    assert values(30, 30, None) == [60.0, 30, 30, 0, None]
 
 
 @pytest.mark.usefixtures("no_drawing")
