@@ -33,7 +33,7 @@ from twin_master.run_folder import (
     FIELD_NAME,
     KIND,
     create_run_folder,
-    is_run_folder,
+    folder_config,
     lock_run_folder,
     read_config,
     tidy,
@@ -64,7 +64,7 @@ def fly(
 def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
     """The mission of level turns; tests change copies of its folder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "_report", lambda folder, _tree: (folder / "report.html").touch())
+        patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
         return fly(tmp_path_factory.mktemp("flown") / "run", library_file)
 
 
@@ -158,7 +158,7 @@ DEEP = '{"a":' * 5000 + "1" + "}" * 5000
 @pytest.mark.parametrize("text", [DEEP, "[1]", "", '{"kind": NaN}', '{"kind": ' + "1" * 5000 + "}"])
 def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
     written(tmp_path, text, name="config.json")
-    assert not is_run_folder(tmp_path)
+    assert not folder_config(tmp_path)
     with pytest.raises(NotResumableError, match="is no run folder"):
         read_config(tmp_path)
     with pytest.raises(RunFolderExistsError, match="not touched"):
@@ -255,7 +255,7 @@ class Notes(SilentProgress):
 
 
 def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, whole, monkeypatch):
-    def report(folder: Path, _tree: object = None) -> Path:
+    def report(folder: Path) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")
         return folder / "report.html"
 
@@ -311,7 +311,7 @@ def test_existing_folders_are_refused(whole, tmp_path, library_file):
     mine = tmp_path / "mine"
     mine.mkdir()
     thesis = written(mine, "important", name="thesis.txt")
-    for place, sentence in ((mine, "no run folder"), (thesis, "no folder")):
+    for place, sentence in ((mine, "not touched"), (thesis, "no folder")):
         with pytest.raises(RunFolderExistsError, match=sentence):
             fly(place, library_file, replace=True)
     assert thesis.read_text(encoding="utf-8") == "important"

@@ -17,7 +17,7 @@ from fmpy import read_model_description
 from fmpy.validation import validate_fmu
 
 from calibration.dynamics.records import read_records
-from calibration.dynamics.trials import Frequencies, fit_trials
+from calibration.dynamics.trials import average, fit_trials
 from calibration.geometry import published_lengths, read_lengths
 from calibration.joint.wing_table import weighed
 from calibration.result.record import STATE, Calibration
@@ -61,12 +61,12 @@ def test_a_laboratory_is_simulated_with_its_truth(tmp_path):
     assert read_weighed_mass(out).value == pytest.approx(0.47, abs=4e-3)
     records = read_records(out)
     assert len(records) == 5
-    trials = fit_trials(records, Frequencies.FITTED)
+    trials = fit_trials(records, free=True)
     modes = reduced_model().modes(
         young_modulus_factor=0.99, stiffness_loss=(0.0, 0.0), servo_mass=0.18, pitot_mass=0.11
     )
     for mode, (place, near) in enumerate(zip(modes.followed, (1e-3, 5e-3), strict=True)):
-        found = trials.average("frequency", mode).mean
+        found = average(trials, "frequency", mode).mean
         assert found == pytest.approx(modes.frequency[place], rel=near)
     said(*simulate(tmp_path / "again", *given))  # bit for bit
     for file in sorted(path for path in out.rglob("*") if path.is_file()):
@@ -262,7 +262,7 @@ def test_two_wings_are_two_fmus(wings, tmp_path):
 
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder, _: (folder / "report.html").touch())
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
 
 
 SHORT = ("steps = 50", "steps = 3")

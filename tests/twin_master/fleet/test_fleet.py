@@ -19,7 +19,7 @@ from twin_master.fleet import flight
 from twin_master.fleet.flight import group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Estimated, group_figures
-from twin_master.fleet.shard import Engine
+from twin_master.fleet.shard import Engine, unflown
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.store.writing import open_run
@@ -107,6 +107,8 @@ def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
     with pytest.raises(RunFolderExistsError, match="there is no folder"):
         open_fleet(tmp_path / "nowhere")
     with pytest.raises(RunFolderExistsError, match="not the folder of a fleet"):
+        open_fleet(tmp_path / "other")
+    with pytest.raises(RunFolderExistsError, match="not touched"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(other, folder, replace_old=True).twins == 3
 
@@ -179,7 +181,9 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
 
     monkeypatch.setattr(flight, "prepared", preparing)
     monkeypatch.setattr(flight, "_check", lambda _fleet: None)
-    monkeypatch.setattr("twin_master.fleet.shard.fly_shard", lambda _kit, members: "it was flown")
+    monkeypatch.setattr(
+        "twin_master.fleet.shard.fly_shard", lambda _kit, members: unflown(members[0], "it was flown")
+    )
     south = FLEET[FLEET.index('[[group]]\nname = "south"') :]
     fleet = changed(fleet_file, (south, ""), ("count = 3", 'fmus = "*.fmu"'))
     outcome = fly_fleet(fleet, fleet_file.parent / "out", Engine(0))

@@ -1,0 +1,99 @@
+"""Pages use the terms of the glossary, their links lead somewhere, the picture is what its script draws."""
+
+import ast
+import re
+import runpy
+from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
+FRONT = ROOT / "docs" / "site" / "index.md"
+"""Stands in the place of `docs/index.md` on the site."""
+CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
+
+
+@cache
+def places(page: Path) -> set[str]:
+    """Return the names of a page's headings, as code hosts make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    found: set[str] = set()
+    for heading in re.findall(r"^#+ (.*)$", text, re.MULTILINE):
+        plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").strip().lower()
+        name = re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
+        found.add(next(f"{name}{end}" for end in ("", "-1", "-2", "-3") if f"{name}{end}" not in found))
+    return found
+
+
+def broken(page: Path) -> list[str]:
+    """Return the links of a page that lead nowhere."""
+    text = CODE.sub("", page.read_text(encoding="utf-8"))
+    folder = ROOT / "docs" if page == FRONT else page.parent
+    lost = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        name, _, place = link.partition("#")
+        target = (folder / name).resolve() if name else page
+        if "://" not in link and not (target.exists() and (not place or place in places(target))):
+            lost.append(link)
+    return lost
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    assert broken(page) == []
+
+
+def test_a_broken_link_is_found(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# A `b` c, d\n[a](page.md#a-b-c-d) [b](#nowhere) [c](none.md) `[d](none.md)`\n")
+    assert broken(page) == ["#nowhere", "none.md"]
+
+
+PLAIN = re.compile(rf"{CODE.pattern}|\]\([^)]*\)", CODE.flags)
+TURNED = ("one sees", "the house", "that we know", "believes ours", "gone on with", "elements, please")
+"""Turns of other languages that were found once."""
+
+
+def test_pages_use_the_terms_of_the_glossary():
+    glossary = ROOT / "docs" / "glossary.md"
+    rows = re.findall(r"^\| (.+?) \| .+ \| (.+?) \|$", glossary.read_text(encoding="utf-8"), re.MULTILINE)
+    refused = [word for _, words in rows[2:] for word in words.split(", ")]
+    assert len(refused) > 30
+    other = re.compile(rf"\b({'|'.join(map(re.escape, [*refused, *TURNED]))})\b", re.IGNORECASE)
+    found = {
+        str(page.relative_to(ROOT)): words
+        for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))
+        if page != glossary and (words := {*other.findall(PLAIN.sub("", page.read_text(encoding="utf-8")))})
+    }
+    assert not found
+
+
+def test_what_people_read_spells_chi_square_in_one_way():
+    """Pages, and the texts of the code that are no docstrings, say χ² and χ²/dof."""
+    other = re.compile(r"chi\^2|chi2|chi²|χ² / dof|χ2|chi-square", re.IGNORECASE)
+    texts = [
+        page.read_text(encoding="utf-8")
+        for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))
+        if page.name != "glossary.md"  # which lists what is not to be written
+    ]
+    for package in ("calibration", "discrepancy", "uav_twin", "twin_master", "fe", "reporting"):
+        for file in (ROOT / package).rglob("*.py"):
+            tree = ast.parse(file.read_text(encoding="utf-8"))
+            aside = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
+            constants = [node for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+            told = [node.value for node in constants if isinstance(node.value, str) and id(node) not in aside]
+            texts += [" ".join(word for word in text.split() if not word.isidentifier()) for text in told]
+    assert len(texts) > 1000
+    assert [text for text in texts if other.search(text)] == []
+
+
+IMAGES = ROOT / "docs" / "images"
+
+
+def test_the_committed_picture_is_what_the_script_draws():
+    drawn = runpy.run_path(str(IMAGES / "draw_whole.py"))["draw"]()
+    ElementTree.fromstring(drawn)
+    assert (IMAGES / "whole.svg").read_text(encoding="utf-8") == drawn
