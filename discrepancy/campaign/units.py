@@ -2,16 +2,12 @@
 
 import re
 from contextlib import suppress
-from fractions import Fraction
 from functools import cache
-from math import isfinite
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
-from discrepancy.campaign.records import FloatArray, Quantity
+from discrepancy.campaign.records import Quantity
 from reporting.units import exact_meaning
 from reporting.words import listing
-
-_Value = TypeVar("_Value", float, FloatArray)
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2 in one g, exact by definition."""
@@ -63,36 +59,9 @@ UNITS = {
 """All that files, tables and figures know of a quantity: a new kind of sensor is one more row."""
 
 
-class Conversion(NamedTuple):
-    """What makes SI of a unit: a fraction, so that a power of ten rounds once."""
-
-    numerator: float = 1.0
-    denominator: float = 1.0
-
-    @property
-    def factor(self) -> float:
-        """What one of the unit is in SI."""
-        return self.numerator / self.denominator
-
-    def to_si(self, value: _Value) -> _Value:
-        """Return numbers of the unit in SI."""
-        return value * self.numerator / self.denominator
-
-    def si_text(self, number: str) -> str:
-        """Return the text of a printed number in SI, rounded once."""
-        value = float(number)
-        if value == 0.0 or not isfinite(value * self.factor):  # also what is too large or small for a number
-            return repr(value * self.factor)
-        return repr(float(Fraction(number) * Fraction(self.numerator) / Fraction(self.denominator)))
-
-    def from_si(self, value: _Value) -> _Value:
-        """Return numbers of SI in the unit."""
-        return value * self.denominator / self.numerator
-
-
 @cache
-def conversion(unit: str, si: str) -> Conversion:
-    """Return what makes a unit of SI of another; an angle is no number here, and a hertz no rad/s.
+def conversion(unit: str, si: str) -> float:
+    """Return what one of a unit is in a unit of SI; an angle is no number here, and a hertz no rad/s.
 
     Raises
     ------
@@ -100,20 +69,20 @@ def conversion(unit: str, si: str) -> Conversion:
         pint does not know the unit, or it is of another quantity.
     """
     if unit == si:
-        return Conversion()  # pint takes a third of a second to load
+        return 1.0  # pint takes a third of a second to load
     gravity = si == UNITS[Quantity.ACCELERATION].si
     (dimension, one, _), (wanted, other, _) = (exact_meaning(text, gravity=gravity) for text in (unit, si))
     if dimension != wanted:
         raise ValueError(f"{unit!r} cannot become {si}")
-    return Conversion(float((one / other).numerator), float((one / other).denominator))
+    return float(one / other)
 
 
 @cache
-def conversion_of(quantity: Quantity, unit: str) -> Conversion:
-    """Return what makes SI of a quantity's unit; raises ValueError with what is expected."""
+def conversion_of(quantity: Quantity, unit: str) -> float:
+    """Return what one of a quantity's unit is in SI; raises ValueError with what is expected."""
     try:
         if quantity is Quantity.TEMPERATURE and unit in _NEVER_CONVERTED:
-            return Conversion()
+            return 1.0
         if quantity is Quantity.TEMPERATURE:
             raise ValueError
         if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):
