@@ -12,10 +12,10 @@ from twin_master.errors import InvalidModelError
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors, quantiles_of
 from twin_master.learning.posterior import posterior_of_draws
-from twin_master.network.estimator import Carried, Estimate, Learnt
-from twin_master.network.graphical_model import GraphicalModel, worsening_table
+from twin_master.network.estimator import Learnt
+from twin_master.network.graphical_model import worsening_table
 from twin_master.network.rewards import RewardModel, RewardSettings
-from twin_master.network.sensor_model import GaussianSensorModel
+from uav_twin import Carried, Estimate, GaussianSensorModel, GraphicalModel
 
 Float = NDArray[np.float64]
 
