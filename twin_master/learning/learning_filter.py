@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, gammaln, logsumexp, ndtr
 
 from reporting.arrays import Float, Index
-from twin_master.errors import ImpossibleObservation, InvalidModelError
+from twin_master.errors import ImpossibleObservation
 from twin_master.learning.posterior import INTERVAL, posterior_of_draws
 from twin_master.learning.regression import GaugeRegression
 from twin_master.network.estimator import Carried, Estimate, Learnt
@@ -24,7 +24,6 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
-from twin_master.sentences import said
 
 _NEGLIGIBLE = 1e-9
 """Share of a belief below which a hypothesis tells nothing."""
@@ -125,10 +124,6 @@ class LearningFilter:
     name : str
         Name of the twin, for messages.
 
-    Raises
-    ------
-    InvalidModelError
-        The average over the draws stands inside the product over the sensors, or shapes do not fit.
     """
 
     def __init__(
@@ -139,8 +134,6 @@ class LearningFilter:
         transitions: Mapping[float, TransitionModel] | None = None,
         name: str = "twin",
     ) -> None:
-        if sensor_model.averages_inside:
-            raise InvalidModelError(said("learning.inside", what="learning"))
         moves = transitions or {1.0: model.transition}
         self.model, self.sensor_model, self._name = model, sensor_model, name
         self.priors, self._factors = priors, np.array([*moves])

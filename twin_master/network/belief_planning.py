@@ -12,8 +12,6 @@ import numpy as np
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
-from twin_master.errors import PlanningError
-from twin_master.network.distributions import expect_shape
 from twin_master.network.planner import BeliefPolicy, given_policy, value_iteration
 from twin_master.network.transition import TransitionModel
 
@@ -67,15 +65,6 @@ class DecisionProblem:
     likelihood: tuple[Float, ...]
     prior: Float
     moves_first: bool = False
-
-    def __post_init__(self) -> None:
-        controls, states, _ = self.transition.shape
-        expect_shape("rewards", self.reward.shape, states, controls, error=PlanningError)
-        expect_shape("likelihoods of controls", (len(self.likelihood),), controls, error=PlanningError)
-        for table in self.likelihood:
-            expect_shape("a likelihood", table.shape, "classes", states, error=PlanningError)
-        if any(np.any(np.abs(table.sum(axis=0) - 1.0) > 1e-9) for table in self.likelihood):
-            raise PlanningError("the observations of each state must have probabilities that sum to one")
 
     def following(self, belief: Float, control: int, observed: Index | None = None) -> Float:
         """Return the probabilities of observations times the beliefs behind them: (K, S).
