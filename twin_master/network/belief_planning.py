@@ -300,17 +300,11 @@ class BeliefPlan:
     lower, upper : float
         Bounds of the expected discounted return from the prior, of the best policy; that of the plan is the
         lower one at least.
-    beliefs : (B, S)
-        Visited.
-    trials : int
-        Descents from the prior.
     """
 
     policy: BeliefPolicy
     lower: float
     upper: float
-    beliefs: Float
-    trials: int
 
 
 def plan_on_belief(
@@ -333,7 +327,7 @@ def plan_on_belief(
         Beliefs to improve the bounds at, counted each time; if left out 180, or 1000 where there is too much
         for the bounds to settle.
     """
-    bounds, visited, trials, settled = _Bounds(problem), list[Float](), 0, _FIRST
+    bounds, visited, settled = _Bounds(problem), list[Float](), _FIRST
     lower, upper = bounds.at(problem.prior, first)
     most = most_beliefs or MOST_BELIEFS
     while upper - lower > gap * max(abs(lower), abs(upper)) and len(visited) < most:
@@ -342,7 +336,6 @@ def plan_on_belief(
             bounds.raise_at(belief)
             bounds.upper.improve(belief)
         visited += path
-        trials += 1
         most = most_beliefs or (MOST_BELIEFS if bounds.upper.settles() else MOST_UNSETTLED)
         if len(visited) >= min(settled, most):
             settled = int(_GROWTH * len(visited))
@@ -351,7 +344,7 @@ def plan_on_belief(
                 bounds.raise_at(belief)
         lower, upper = bounds.at(problem.prior, first)
     beliefs = np.unique(np.array(visited or [problem.prior]), axis=0)
-    return BeliefPlan(_policy(bounds, beliefs), lower, upper, beliefs, trials)
+    return BeliefPlan(_policy(bounds, beliefs), lower, upper)
 
 
 def _policy(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
