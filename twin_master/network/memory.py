@@ -40,6 +40,23 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
         raise InvalidModelError(said("network.memory", listed=listed, sizes=sizes, advice=advice))
 
 
+def scenario_bytes(scenario: Scenario) -> dict[str, float]:
+    """Return what the twin of a scenario keeps in memory, in words with its numbers, and its size [bytes]."""
+    states = prod(len(factor.levels) for factor in scenario.state)
+    controls, sensors = len(scenario.control), scenario.observation.count
+    steps, ahead = scenario.mission.steps, scenario.mission.prediction_steps
+    draws = 1 if scenario.calibration.source == "fixed" else scenario.calibration.draws
+    tables = sum(transition_bytes(len(factor.levels), controls) for factor in scenario.state)
+    belief = NUMBER * (states + sensors)
+    predictions = NUMBER * draws * states * controls * sensors
+    return {
+        f"the transitions of {len(scenario.state)} state factors under {controls} controls": TRANSITION_COPIES
+        * tables,
+        f"{draws} draws of {sensors} sensors in {states} states": _PREDICTION_COPIES * predictions,
+        f"the beliefs of {steps} steps and {ahead} ahead": _HISTORY_COPIES * belief * (steps + ahead),
+    }
+
+
 def check_scenario_fits(scenario: Scenario) -> None:
     """Check that the twin of a scenario fits in memory, before anything of it is built.
 
@@ -48,20 +65,7 @@ def check_scenario_fits(scenario: Scenario) -> None:
     InvalidModelError
         It does not.
     """
-    states = prod(len(factor.levels) for factor in scenario.state)
-    controls, sensors = len(scenario.control), scenario.observation.count
-    steps, ahead = scenario.mission.steps, scenario.mission.prediction_steps
-    draws = 1 if scenario.calibration.source == "fixed" else scenario.calibration.draws
-    tables = sum(transition_bytes(len(factor.levels), controls) for factor in scenario.state)
-    belief = NUMBER * (states + sensors)
-    predictions = NUMBER * draws * states * controls * sensors
-    parts = {
-        f"the transitions of {len(scenario.state)} state factors under {controls} controls": TRANSITION_COPIES
-        * tables,
-        f"{draws} draws of {sensors} sensors in {states} states": _PREDICTION_COPIES * predictions,
-        f"the beliefs of {steps} steps and {ahead} ahead": _HISTORY_COPIES * belief * (steps + ahead),
-    }
-    check_fits(parts, "take fewer levels, state factors, draws or steps")
+    check_fits(scenario_bytes(scenario), "take fewer levels, state factors, draws or steps")
 
 
 def transition_bytes(states: int, controls: int) -> float:

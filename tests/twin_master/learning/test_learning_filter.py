@@ -9,8 +9,12 @@ from scipy.optimize import brentq
 from scipy.stats import foldnorm, multivariate_normal, multivariate_t, norm
 
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import LearningFilter, LearntPriors, quantiles_of
-from twin_master.learning.posterior import posterior_of_draws
+from twin_master.learning.learning_filter import (
+    LearningFilter,
+    LearntPriors,
+    posterior_of_draws,
+    quantiles_of,
+)
 from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.rewards import RewardModel, RewardSettings

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.study_planning import PROBLEMS, tiger
-from twin_master.network.belief_planning import DecisionProblem, plan_on_belief
+from twin_master.network.belief_planning import DecisionProblem, plan_on_belief, simulated_returns
 from twin_master.network.planner import value_iteration
-from twin_master.network.simulated_return import simulated_returns
 from twin_master.network.transition import TransitionModel
 
 
