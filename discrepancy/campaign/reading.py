@@ -226,7 +226,7 @@ def _inputs(
 
 def _numbers(table: TextTable, item: InTables, user: str, *, empty_allowed: bool = False) -> FloatArray:
     numbers = table.numbers(item.table_column, user, empty_allowed=empty_allowed)
-    return conversion_of(item.quantity, item.unit).to_si(numbers)
+    return numbers * conversion_of(item.quantity, item.unit)
 
 
 def _times(section: schema.TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:

@@ -22,8 +22,7 @@ from calibration.paper.load_test import (
 from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
 from calibration.static.errors_in_variables import assess_fit, exact_posterior, pair_log_likelihoods
 from calibration.static.experiments import published_measurements
-from calibration.static.posterior import GaussianPrior
-from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
+from calibration.static.posterior import PUBLISHED_LINE, GaussianPrior, stiffness_curve_of, stiffness_line
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from tests.refusals import Inputs
 

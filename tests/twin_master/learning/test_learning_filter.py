@@ -15,10 +15,10 @@ from twin_master.learning.learning_filter import (
     posterior_of_draws,
     quantiles_of,
 )
-from twin_master.network.estimator import Carried, Estimate, Learnt
-from twin_master.network.graphical_model import GraphicalModel, worsening_table
+from twin_master.network.estimator import Learnt
+from twin_master.network.graphical_model import worsening_table
 from twin_master.network.rewards import RewardModel, RewardSettings
-from twin_master.network.sensor_model import GaussianSensorModel
+from uav_twin import Carried, Estimate, GaussianSensorModel, GraphicalModel
 
 Float = NDArray[np.float64]
 
