@@ -11,22 +11,19 @@ import pytest
 from benchmarks import command_page
 from fe.verification import wing_checks
 from fe.verification.wing_checks import Check
-from fe.wing.design import load_design
-from fe.wing.operators import assemble
 from reporting import terminal
 from scenarios import scenario_files
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
 from twin_master.errors import MissionInputError, ScenarioError
-from twin_master.scenario.reading import load_scenario
 from twin_master.scenario_check import check_scenario
-from uav_twin import cli
+from uav_twin import assemble, cli, load_design, load_scenario
 
 
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder, _: (folder / "report.html").touch())
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
 
 
 def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]:

@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from reporting import toml_file
 from reporting.toml_file import Fault as Fault
+from reporting.toml_file import NotNegative as NotNegative
+from reporting.toml_file import Number as Number
+from reporting.toml_file import Positive as Positive
 from reporting.toml_file import shown
 from twin_master.sentences import said
 
@@ -28,9 +30,6 @@ def _at_most(limit: int, why: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 PerSensor = Positive | tuple[Positive, ...]
 """One positive number for all sensors, or one for each."""
 Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
@@ -86,12 +85,10 @@ class Section(toml_file.Section):
         bases = {base for base, _ in given.values()}
         for key, (base, _) in given.items():
             if base not in known:
-                told = {"key": key, "told": ", ".join(known.values())}
-                raise PydanticCustomError("unknown_key", "unknown key {key}", told)
+                raise ValueError(f"unknown key `{key}`; the keys known there are {', '.join(known.values())}")
         for name in cls.units:
             if cls.model_fields[name].is_required() and name not in bases:
-                told = {"key": name, "told": known[name]}
-                raise PydanticCustomError("missing_key", "{told} is missing", told)
+                raise ValueError(f"`{known[name]}` is missing")
         converted: dict[object, object] = {}
         for (key, (base, unit)), value in zip(given.items(), table.values(), strict=True):
             if base in table and unit:
