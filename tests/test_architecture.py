@@ -49,7 +49,7 @@ ROOMS = {
     ),
     "twin_master": (
         "errors", "sentences", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library",
-        "mission", "store", "report", "viewer", "workflow", "watch", "scenario_check", "fleet", "environment",
+        "mission", "store", "report", "viewer", "workflow", "watch", "fleet", "environment",
         "command", "plan_command", "watch_command", "view_command", "__main__",
     ),
     "discrepancy": (
