@@ -207,7 +207,7 @@ def run() -> list[Measurement]:
     whole = median_seconds(whole_history, repeats=25, inner=20)
 
     def side_by_side() -> None:
-        found, _ = filter_many(model, many_controls, many, model.log_prior)
+        found, _ = filter_many(model.transition, many_controls, many, model.log_prior)
         smooth_many(model.transition, many_controls, found.filtered, found.log_filtered)
 
     batch = median_seconds(side_by_side, repeats=9)
