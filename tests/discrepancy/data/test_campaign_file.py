@@ -155,7 +155,8 @@ def test_inputs_come_out_in_si(tmp_path):
     assert "The trial 'first' is begun in a state that is fitted." in said
     assert "The trial 'second' is taken to begin at rest under what acts at the first sample (assumed" in said
     settled = (TOML, '"second.csv"', '"second.csv", begins = "settled"')
-    for changes, count in (((), 1), ((settled,), 2)):
+    held = (TOML, 'column = "x"', 'column = "x", hold = "linear", reference = true')
+    for changes, count in (((), 1), ((settled,), 2), ((held,), 1)):
         campaign = read_campaign(campaign_folder(tmp_path / "a", HEATED, *changes))
         again = write_campaign(campaign, tmp_path / "again")
         assert same(read_campaign(again), campaign)
@@ -368,8 +369,8 @@ def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
 @pytest.mark.parametrize("what", ["force", "load_factor", "temperature", "health", "noise_factor"])
 def test_a_trial_under_something_else_is_no_repeat(what):
     trial = Trial.plain("a", TrialKind.STATIC, ("w",), np.zeros(3), force=np.arange(3.0))
-    assert repeated([trial, trial], "w") == [[trial, trial]]
-    assert not repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")
+    assert [group for group, *_ in repeated([trial, trial], "w")] == [[trial, trial]]
+    assert not [*repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")]
 
 
 # ---------------------------------------------------------------- what is wrong
