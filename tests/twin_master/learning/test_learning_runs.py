@@ -19,9 +19,9 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, figures_of, journal, text_of, written
 from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.replay import gap_of
+from twin_master.mission.loop import gap_of
 from twin_master.mission.turns import History, Reading, Turn
-from twin_master.report.learnt import learnt_figure, sensor_rows
+from twin_master.report.model import learnt_figure, sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario

@@ -154,7 +154,7 @@ def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(each
     )
     scenario = each.scenario.model_copy(update={"reference": references})
     complete = replace(each, scenario=scenario, flight=replace(each.flight, turns=turns))
-    figures = summarise(complete, np.zeros((50, 3)))
+    figures = [*summarise(complete, np.zeros((50, 3)))]
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
