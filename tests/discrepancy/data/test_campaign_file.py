@@ -155,7 +155,8 @@ def test_inputs_come_out_in_si(tmp_path):
     assert "The trial 'first' is begun in a state that is fitted." in said
     assert "The trial 'second' is taken to begin at rest under what acts at the first sample (assumed" in said
     settled = (TOML, '"second.csv"', '"second.csv", begins = "settled"')
-    for changes, count in (((), 1), ((settled,), 2)):
+    held = (TOML, 'column = "x"', 'column = "x", hold = "linear", reference = true')
+    for changes, count in (((), 1), ((settled,), 2), ((held,), 1)):
         campaign = read_campaign(campaign_folder(tmp_path / "a", HEATED, *changes))
         again = write_campaign(campaign, tmp_path / "again")
         assert same(read_campaign(again), campaign)
