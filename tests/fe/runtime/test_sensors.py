@@ -1,6 +1,5 @@
 """Sensor primitives on arrays, against closed forms and independent integration, as a whole or by samples."""
 
-import tomllib
 from dataclasses import replace
 from itertools import pairwise
 
@@ -19,7 +18,7 @@ from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, check_
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
-CHANNELS_SEEN = tomllib.loads(INPUTS.text("channels.toml"))["row"]
+CHANNELS_SEEN = INPUTS.table("channels.toml")["row"]
 CHANNELS = (("tip", "displacement"), ("g0", "strain"), ("g1", "strain"))
 TIME = np.arange(200) * 0.01
 RECORD = SensorRecord(CHANNELS, "ringdown", TIME, 100.0, np.full(200, 5.0), "A", 0.05)
@@ -187,16 +186,7 @@ def test_a_high_pass_follows_uneven_stamps():
 # ---------------------------------------------------------------- sample by sample
 
 STREAMED = ModelPatch(
-    (
-        SensorGain("g0", 0.07),
-        HighPass("g0", 0.4, 4.0),
-        SensorDrift("*", 2e-5, 10.0, 0.5, "strain"),
-        HighPass("*", 0.9, 1.0, "strain"),
-        patch.ThermalStrain("*", 1.2e-5),
-        patch.Line("tip", 50.0, 1e-4, -2e-4),
-        patch.DecayingLine("*", 7.0, 0.02, 1e-3, 2e-3, "strain"),
-        SensorRotation("g1", 0.2),
-    )
+    tuple(patch.PRIMITIVES[kind](*given) for kind, *given in INPUTS.table("channels.toml")["streamed"])
 )
 
 
