@@ -32,8 +32,7 @@ from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.report.structure import design_of, planform_of
 from twin_master.store.writing import open_run
-from twin_master.viewer.flight import Belief, Flight
-from twin_master.viewer.messages import LATEST, Request, Teller
+from twin_master.viewer.flight import LATEST, Belief, Flight, Request, Teller
 from uav_twin import fly, load_design, load_scenario
 
 TURNS = 50
