@@ -17,7 +17,7 @@ from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.kernels import backward_pass, forward_pass, move
+from twin_master.network.kernels import backward_pass, forward_pass
 from twin_master.network.transition import TransitionModel
 
 
@@ -55,21 +55,22 @@ class Predicted:
     ----------
     predicted : (H, S)
         p(D_{t+h} | o_0..o_t), h = 1..H.
-    control_probability : (H, U)
-        p(U_{t+h} | o_0..o_t).
     joint : (H, S, U)
         p(D_{t+h}, U_{t+h} | o_0..o_t): quantities and rewards depend on both.
     """
 
     predicted: Float
-    control_probability: Float
     joint: Float
+
+    @property
+    def control_probability(self) -> Float:
+        """p(U_{t+h} | o_0..o_t): (H, U)."""
+        return np.asarray(self.joint.sum(axis=1))
 
     def mixed(self, share: float, control: Float) -> "Predicted":
         """Return it where with probability `share` the controls are p(U) (U,), whatever the state is."""
-        chosen = (1.0 - share) * self.control_probability + share * control
-        joint = (1.0 - share) * self.joint + share * self.predicted[..., None] * control
-        return Predicted(self.predicted, chosen, joint)
+        chosen = self.predicted[..., None] * control
+        return Predicted(self.predicted, (1.0 - share) * self.joint + share * chosen)
 
 
 def _checked(
@@ -87,22 +88,18 @@ def _checked(
     return control[None], rows[None]
 
 
-def log_forecast(transition: TransitionModel, control: ArrayLike, log_filtered: ArrayLike) -> Float:
-    """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
-    before = np.array(log_filtered, dtype=np.float64, order="C")
-    after = np.empty_like(before)
-    move(transition.forward_lists, np.array(control, dtype=np.int64), before, after)
-    return after
-
-
 def filter_many(
-    model: GraphicalModel, control: Index, rows: Float, log_before: Float, control_before: ArrayLike = -1
+    transition: TransitionModel,
+    control: Index,
+    rows: Float,
+    log_before: Float,
+    control_before: ArrayLike = -1,
 ) -> tuple[Filtered, Index]:
     """Filter B twins without any check.
 
     Parameters
     ----------
-    model : GraphicalModel
+    transition : TransitionModel
     control : (B, T)
     rows : (B, T, S)
         log p(o_t | D_t, u_t).
@@ -120,8 +117,15 @@ def filter_many(
     log_evidence, failed = np.empty(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
     found = forecast, filtered, log_filtered, log_evidence
     first = np.full((len(rows), rows.shape[2]), log_before), np.full(len(rows), control_before)
-    forward_pass(model.transition.forward_lists, control, *first, rows, *found, failed)
+    forward_pass(transition.forward_lists, control, *first, rows, *found, failed)
     return Filtered(*found), failed
+
+
+def log_forecast(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
+    """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
+    nothing = np.zeros_like(log_filtered)[:, None]
+    found, _ = filter_many(transition, control[:, None], nothing, log_filtered, control)
+    return np.asarray(found.log_filtered[:, 0] + found.log_evidence)
 
 
 def smooth_many(transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float) -> Float:
@@ -159,7 +163,7 @@ def filter_sequence(
         If shapes do not fit, or a log-likelihood is NaN or plus infinity.
     """
     control, rows = _checked(model, control_index, log_likelihood, what="log-likelihood")
-    found, failed = filter_many(model, control, rows, *(before or (model.log_prior,)))
+    found, failed = filter_many(model.transition, control, rows, *(before or (model.log_prior,)))
     if failed[0] >= 0:
         raise ImpossibleObservation("twin", int(failed[0]))
     return found[0]
@@ -211,15 +215,12 @@ def predict(
     InvalidModelError
         If shapes do not fit.
     """
-    size, controls = model.states.size, len(model.controls)
     belief = np.asarray(belief, dtype=np.float64)
     policy = np.asarray(policy, dtype=np.float64)
-    expect_shape("a belief", belief.shape, size)
-    expect_shape("a policy", policy.shape, size, controls)
-    expect_controls(control_index, controls)
+    expect_shape("a belief", belief.shape, model.states.size)
     if horizon < 0:
         raise InvalidModelError(f"expected a horizon of 0 or more steps, got {horizon}")
-    predicted, transition = np.empty((horizon, size)), model.transition
+    predicted, transition = np.empty((horizon, len(belief))), model.transition
     now: Float = belief
     closed_loop = None if transition.is_product else np.einsum("su,usn->sn", policy, transition.matrix)
     for h in range(horizon):
@@ -231,8 +232,7 @@ def predict(
             flows = enumerate((now[:, None] * policy).T)
             now = np.sum([transition.forward(u, flow) for u, flow in flows], axis=0)
         predicted[h] = now
-    joint = predicted[:, :, None] * policy
-    return Predicted(predicted=predicted, control_probability=joint.sum(axis=1), joint=joint)
+    return Predicted(predicted, predicted[:, :, None] * policy)
 
 
 def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: int) -> Float:

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, model_validator
 
+from reporting.toml_file import Fault, NotNegative, Number
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
-from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Count,
-    Fault,
     Name,
-    NotNegative,
-    Number,
+    ObservationSection,
     Probability,
     Section,
     Seed,
@@ -346,7 +344,7 @@ class Scenario(Section):
             told = {"key": f"{key}.standard_deviation", "given": given, "most": LARGEST_STRAIN_NOISE}
             yield absurd, said("scenario.strain_noise", **told)
         for fault in truth.sensor_faults:
-            last = 0 if fault.sensors == "all" else max(fault.sensors)
+            last = max(fault.places(count)) + 1
             yield last > count, said("scenario.faults", count=count, came=last)
 
     def _faults_of_modes(self) -> Iterator[Fault]:

@@ -7,18 +7,15 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
+from reporting.toml_file import Fault, NotNegative, Number, Positive
 from twin_master.scenario.asset import FileSection
-from twin_master.scenario.observation import RecordSection
 from twin_master.scenario.section import (
     Count,
-    Fault,
     Flag,
     Name,
-    NotNegative,
-    Number,
     PerSensor,
-    Positive,
     Probability,
+    RecordSection,
     Section,
     Step,
     incomplete,
@@ -116,6 +113,10 @@ class SensorFault(Span):
         yield from super().faults()
         drifts = self.kind == "drift"
         yield drifts != (self.rate is not None), said("scenario.rate")
+
+    def places(self, count: int) -> list[int]:
+        """Return the places of its sensors among so many, from 0."""
+        return list(range(count)) if self.sensors == "all" else [sensor - 1 for sensor in self.sensors]
 
 
 class TruthSection(Section):

@@ -1,11 +1,9 @@
 """Records that no sensor made, in the files of a campaign: held, copied, in another unit, not at rest."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from discrepancy.campaign.reading import read_campaign
@@ -19,8 +17,8 @@ from discrepancy.sources.examples import example_campaign, plan_for
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
-FloatArray = NDArray[np.float64]
-MODEL = Inputs(__file__).text("mass_on_a_spring.toml")
+INPUTS = Inputs(__file__)
+MODEL = INPUTS.text("mass_on_a_spring.toml")
 CHANNEL = """
 [[channel]]
 name = "{0}"
@@ -36,16 +34,16 @@ kind = "driven"
 file = "{0}.csv"
 begins = "unknown"
 """
-NOISE = '\n[noise]\nfile = "rest.csv"\n'
 TIME = 0.005 * np.arange(1600)
-Change = Callable[[FloatArray], None]
 
 
 def campaign_of(folder, ring=None, rest=None, digit=1e-6, trials=2):
     """Write rings of x and y [mm] and a rest, changed in place, and return them as read."""
     generator = np.random.default_rng(5)
     folder.mkdir(exist_ok=True)
-    text = 'format = 1\nname = "rings"\n' + NOISE + CHANNEL.format("x") + CHANNEL.format("y")
+    text = (
+        'format = 1\nname = "rings"\n[noise]\nfile = "rest.csv"\n' + CHANNEL.format("x") + CHANNEL.format("y")
+    )
     tables = {"rest": 0.02 * generator.standard_normal((800, 2))}
     if rest:
         rest(tables["rest"])
@@ -234,27 +232,10 @@ def test_what_moves_alike_is_no_copy(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "quantity", "stated", "drive", "pair"),
-    [
-        (1.0 / 25.0, Quantity.DISPLACEMENT, "mm", False, "inch given as mm"),
-        (38.0, Quantity.DISPLACEMENT, "m", False, "inch given as m"),
-        (-1e3, Quantity.DISPLACEMENT, "m", False, "mm given as m"),
-        (0.102, Quantity.FORCE, "N", False, "kgf given as N"),
-        (9.6, Quantity.FORCE, "N", True, "kgf given as N"),
-        (4.5, Quantity.FORCE, "N", True, "lbf given as N"),
-        (60.0, Quantity.ANGLE, "rad", False, "deg given as rad"),
-        (1.0 / 57.0, Quantity.ANGLE, "deg", False, "rad given as deg"),
-        (1.0 / 6.25, Quantity.ANGULAR_VELOCITY, "rad/s", False, "Hz given as rad/s"),
-        (9.4, Quantity.ANGULAR_VELOCITY, "rad/s", False, "rpm given as rad/s"),
-        (62.0, Quantity.FLOW, "l/s", False, "l/min given as l/s"),
-        (0.1, Quantity.ACCELERATION, "m/s2", False, "g given as m/s2"),
-        (1.5, Quantity.FORCE, "N", False, ""),
-        (3.0, Quantity.FORCE, "N", True, ""),
-        (30.0, Quantity.STRAIN, "microstrain", False, ""),
-    ],
+    ("scale", "quantity", "stated", "drive", "pair"), INPUTS.table("faults.toml")["slips"]
 )
 def test_a_factor_names_its_pair_of_units(scale, quantity, stated, drive, pair):
-    assert str(slip_between(scale, quantity, stated, drive=drive) or "").strip("(?)") == pair
+    assert str(slip_between(scale, Quantity(quantity), stated, drive=drive) or "").strip("(?)") == pair
 
 
 # ---------------------------------------------------------------- at rest

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
@@ -30,7 +29,6 @@ from tests.discrepancy.core.kit import problem_of
 from tests.discrepancy.rigs import chosen, fmu_rig, hiding
 from tests.refusals import Inputs
 
-FloatArray = NDArray[np.float64]
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES = 0, 5, 8, 12, 14
 """Campaigns of seed 1: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow."""
 INPUTS = Inputs(__file__)
@@ -164,14 +162,6 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
     if gain == 1.0:
         assert found.verdict.kind is VerdictKind.NOTHING_MISSING
     assert found.missing is None or (gain != 1.0 and not found.verdict.effects)
-
-
-def test_ports_move_the_same_at_finer_samples(tmp_path):
-    problem = blind(tmp_path, SERVO)
-    data, start = problem.trials[0], problem.start(Candidate())
-    conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(start.shared), start.local[0])
-    coarse, fine = (problem.model.port_motion(data.trial, conditions, parts)[0] for parts in (1, 4))
-    np.testing.assert_allclose(fine[::4], coarse, atol=1e-6 * np.ptp(coarse))
 
 
 STIFF = PowerStiffness("slide", 2.0, 3.0, 0, 0.02)

@@ -20,14 +20,13 @@ from fe.runtime.patch import (
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from tests.command_line import refused
 from tests.twin_master.runs import figures_of, text_of, written
-from twin_master.assets.reduced_model import check_model_patch
+from twin_master.assets.design_source import check_model_patch
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
-from twin_master.errors import MissionInputError, ScenarioError
-from twin_master.scenario.reading import load_scenario
+from twin_master.errors import MissionInputError
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import fly as new_run
+from uav_twin import load_scenario, resume
 
 TEXT = text_of("level_turns", ("steps = 50", "steps = 7"), ("draws = 100", "draws = 6"))
 DRIFT: tuple[Primitive, ...] = (SensorDrift("g5", 3e-5, 1.0), SensorGain("strain[9]", 0.1))
@@ -57,18 +56,9 @@ def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str
     )
 
 
-def test_combinations_that_mean_nothing_are_refused(tmp_path):
-    design = 'kind = "design"\ndesign = "uav_wing"'
-    for lines, old, new, key in (
-        (PATCH, design, 'kind = "fmu"\nfile = "w.fmu"', "asset"),
-        ("", f"[belief]\n{design}", f'[belief]\nkind = "asset"\n{PATCH}', "belief"),
-    ):
-        text = scenario_of(tmp_path, lines).read_text(encoding="utf-8")
-        with pytest.raises(ScenarioError, match=f"{key}: unknown key `patch`"):
-            load_scenario(written(tmp_path, text, (old, new)))
-    loaded = load_scenario(scenario_of(tmp_path, PATCH))  # a patch is not dropped where another FMU is flown
+def test_a_patch_is_not_dropped_where_another_fmu_is_flown(tmp_path):
     with pytest.raises(MissionInputError, match=r"`asset\.patch` goes into the FMU"):
-        resolve_scenario(loaded, Overrides(fmu=tmp_path / "other.fmu"))
+        resolve_scenario(load_scenario(scenario_of(tmp_path, PATCH)), Overrides(fmu=tmp_path / "other.fmu"))
 
 
 def test_what_changes_within_a_mission_is_no_model_of_the_twin(tmp_path):
@@ -135,7 +125,7 @@ def test_a_mission_with_a_hidden_drift(mission, tmp_path):
     assert config["scenario"]["asset"]["patch"] == "asset/patch.json"
     assert "patch" in config["inputs"]
     before = (folder / "run.nc").read_bytes()
-    resume_run(folder)
+    resume(folder)
     assert (folder / "run.nc").read_bytes() == before
 
 

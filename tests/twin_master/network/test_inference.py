@@ -11,21 +11,10 @@ from tests.twin_master.network.decision_oracles import (
     random_model,
 )
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.network.graphical_model import (
-    Factor,
-    GraphicalModel,
-    StateSpace,
-    deterministic_policy,
-    worsening_table,
-)
-from twin_master.network.inference import (
-    filter_many,
-    filter_sequence,
-    predict,
-    smooth,
-    smooth_many,
-)
+from twin_master.network.graphical_model import Factor, StateSpace, deterministic_policy, worsening_table
+from twin_master.network.inference import filter_many, predict, smooth, smooth_many
 from twin_master.network.transition import TransitionModel
+from uav_twin import GraphicalModel, filter_sequence
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 EXACT = {"rtol": 1e-10, "atol": 1e-12}
@@ -125,7 +114,7 @@ def test_many_twins_equal_one_by_one():
     rng = np.random.default_rng(6)
     control = rng.integers(0, 2, (7, 15))
     log_likelihood = rng.normal(size=(7, 15, 25)) * 100
-    filtered, failed = filter_many(MODEL, control, log_likelihood, MODEL.log_prior)
+    filtered, failed = filter_many(MODEL.transition, control, log_likelihood, MODEL.log_prior)
     smoothed = smooth_many(MODEL.transition, control, np.exp(filtered.log_filtered), filtered.log_filtered)
     np.testing.assert_array_equal(failed, -1)
     for twin in range(7):
@@ -142,7 +131,7 @@ def test_an_impossible_observation_names_its_step():
     with pytest.raises(ImpossibleObservation, match="step 3:"):
         filter_sequence(MODEL, [1] * 5, log_likelihood)
     many = np.stack([np.zeros((5, 25)), log_likelihood, log_likelihood])
-    _, failed = filter_many(MODEL, np.ones((3, 5), dtype=int), many, MODEL.log_prior)
+    _, failed = filter_many(MODEL.transition, np.ones((3, 5), dtype=int), many, MODEL.log_prior)
     np.testing.assert_array_equal(failed, [-1, 3, 3])
 
 

@@ -1,6 +1,6 @@
-"""Sensor primitives on arrays, against closed forms and independent integration, as a whole or by samples."""
+"""Patches: expressions, kinds, the digital state; sensors against closed forms, as a whole or by samples."""
 
-import tomllib
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,13 +13,105 @@ from scipy.special import hyp1f1
 
 from fe.high_pass import filtered_record, high_pass
 from fe.runtime import patch, sensors
-from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import Clock, HighPass, ModelPatch, RunOffset, SensorDrift, SensorGain, SensorRotation
+from fe.runtime.errors import InvalidPatchError, InvalidStateError
+from fe.runtime.expression import Expression
+from fe.runtime.modal_system import rayleigh_damping_ratio
+from fe.runtime.patch import (
+    PRIMITIVES,
+    Clock,
+    HighPass,
+    ModelPatch,
+    RunOffset,
+    SensorDrift,
+    SensorGain,
+    SensorRotation,
+)
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, check_channels
+from fe.runtime.state import DigitalState, Geometry, losses_of, region_names
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
-CHANNELS_SEEN = tomllib.loads(INPUTS.text("channels.toml"))["row"]
+numbers = st.floats(-1e3, 1e3)
+
+
+def expression(text: str) -> Expression:
+    return Expression(text, frozenset({"a", "b", "c"}), "Here")
+
+
+@given(numbers, numbers, st.floats(1e-3, 1e3))
+def test_arithmetic_is_that_of_python(a, b, c):
+    formula = expression("(a + 2*b)/c - -a**2 + sqrt(c)*min(a, b, 0) + abs(b)*exp(-c)")
+    wanted = (a + 2 * b) / c - -(a**2) + math.sqrt(c) * min(a, b, 0) + abs(b) * float(np.exp(-c))
+    assert formula.value({"a": a, "b": b, "c": c}) == wanted
+
+
+NO_EXPRESSIONS = [text for (text,) in INPUTS.refused("expressions")]
+
+
+@pytest.mark.parametrize("text", [*NO_EXPRESSIONS, "a" + "+a" * 400, "9" * 5000])
+def test_anything_else_is_refused_with_a_sentence(text):
+    with refused(InvalidPatchError, r"^Here\b"):
+        expression(text).value({"a": 1.0, "b": 1.0, "c": 1.0})
+
+
+@given(numbers, st.lists(st.floats(-10.0, 10.0), min_size=1, max_size=5))
+def test_a_course_has_the_values_of_its_times(a, times):
+    text = "a*max(0, time - 1, b) + step(time - 2)*sin(time)/(1 + abs(a))"
+    formula, given = Expression(text, {"a", "b", "time"}, "Here"), {"a": a, "b": -2.0}
+    single = [formula.value({**given, "time": time}) for time in times]
+    np.testing.assert_allclose(formula.course(np.array(times), given), single, rtol=1e-14, atol=1e-14)
+
+
+@given(numbers, numbers)
+def test_numbers_in_the_place_of_names_change_no_value(a, b):
+    formula = expression("a**2 - b**3 + c*a - -b")
+    filled = Expression(formula.with_numbers({"a": a, "b": b}), {"c"}, "Here")
+    assert filled.used() == {"c"}
+    with refused(InvalidPatchError, "needs 'c', which has no value"):
+        filled.value({})
+    assert filled.value({"c": 0.3}) == formula.value({"a": a, "b": b, "c": 0.3})
+
+
+def test_kinds_are_the_keys_of_patches_that_were_kept():
+    assert list(PRIMITIVES) == INPUTS.text("kinds.txt").split()
+
+
+# ---------------------------------------------------------------- the digital state
+
+
+def test_the_default_state_is_the_healthy_wing_as_built():
+    state = DigitalState()
+    assert (state.geometry, state.young_modulus_factor) == (Geometry(1.828, 0.433, 0.260), 1.0)
+    assert losses_of(state.stiffness_loss, region_names(2)) == (0.0, 0.0)
+    # Kapteyn et al. 2021, step 3
+    ratio = rayleigh_damping_ratio(state.damping_alpha, state.damping_beta, (5.6492, 29.9699))
+    assert ratio == pytest.approx((0.0281, 0.0717), rel=1e-3)
+
+
+@pytest.mark.parametrize(("changes", "place"), INPUTS.refused("states"))
+def test_impossible_states_are_refused_with_the_place(changes, place):
+    with refused(InvalidStateError, place):
+        (Geometry if place.startswith("geometry") else DigitalState)(**changes)
+
+
+def test_losses_stand_in_the_order_of_the_regions():
+    regions = ("root", "z2", "tip")
+    assert region_names(3) == ("z1", "z2", "z3")
+    for losses, wanted in (
+        ({"tip": 0.4, "root": 0.1}, (0.1, 0.0, 0.4)),
+        ([0.1, 0.2, 0.3],) * 2,
+        ((), (0.0,) * 3),
+    ):
+        assert losses_of(losses, regions) == tuple(wanted)
+    for losses, sentence in (
+        ({"z1": 0.1}, "no damage region 'z1'; the regions are root, z2, tip"),
+        ((0.1, 0.2), "3 fractions, one for each of root, z2, tip, but 2"),
+    ):
+        with pytest.raises(InvalidStateError, match=sentence):
+            losses_of(losses, regions)
+
+
+CHANNELS_SEEN = INPUTS.table("channels.toml")["row"]
 CHANNELS = (("tip", "displacement"), ("g0", "strain"), ("g1", "strain"))
 TIME = np.arange(200) * 0.01
 RECORD = SensorRecord(CHANNELS, "ringdown", TIME, 100.0, np.full(200, 5.0), "A", 0.05)
@@ -36,7 +128,7 @@ def shown(*primitives, record=RECORD, **more):
     return applied(ModelPatch(primitives), record, VALUES, RATES, **more)
 
 
-def test_nothing_without_sensors_touches_the_input() -> None:
+def test_nothing_without_sensors_touches_the_input():
     mass, clock = patch.PointMass(0.1, 0.2), Clock(0.1, 0.0)
     values, rates = shown(mass, clock)
     assert values is VALUES
@@ -44,7 +136,7 @@ def test_nothing_without_sensors_touches_the_input() -> None:
     assert sensors.clock_of(ModelPatch((Clock(0.1, 0.5), Clock(0.2, -0.1)))) == pytest.approx((0.3, 0.4))
 
 
-def test_order_of_sensors_matters() -> None:
+def test_order_of_sensors_matters():
     gain, drift = SensorGain("g0", 0.5), SensorDrift("g0", 2e-3, 100.0)
     added, (first, _), (last, rates) = 2e-3 * (100.0 + TIME) / 100.0, shown(gain, drift), shown(drift, gain)
     assert first[:, 1] == pytest.approx(1.5 * VALUES[:, 1] + added)
@@ -54,7 +146,7 @@ def test_order_of_sensors_matters() -> None:
 
 
 @pytest.mark.parametrize(("kind", "given", "trial", "changed"), CHANNELS_SEEN)
-def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, trial, changed) -> None:
+def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, trial, changed):
     item = patch.PRIMITIVES[kind](*given)
     values = shown(item, record=replace(RECORD, kind=trial))[0]
     assert np.flatnonzero(np.any(values != VALUES, axis=0)).tolist() == changed
@@ -62,7 +154,7 @@ def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, tri
         assert values[:, changed] == pytest.approx(VALUES[:, changed] + 1e-3)
 
 
-def test_drift_by_kind_of_trial_and_exponent() -> None:
+def test_drift_by_kind_of_trial_and_exponent():
     drifted = shown(SensorDrift("tip", 1.0, 50.0), record=replace(STATIC, time=100.0 * TIME))[0][:, 0]
     assert drifted == pytest.approx(VALUES[:, 0] + 2.0 * TIME)
     values, rates = shown(SensorDrift("tip", 1.0, 2.0, 0.5), record=replace(RECORD, start=0.0))
@@ -72,9 +164,7 @@ def test_drift_by_kind_of_trial_and_exponent() -> None:
 
 @given(st.floats(-1.5, 1.5), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 @settings(max_examples=60)
-def test_rotation_is_that_of_the_strain_tensor(
-    angle: float, along: float, across: float, gamma: float
-) -> None:
+def test_rotation_is_that_of_the_strain_tensor(angle, along, across, gamma):
     tensor = np.array([[along, gamma / 2.0], [gamma / 2.0, across]])
     direction = np.array([np.cos(angle), np.sin(angle)])
     record = SensorRecord((("g", "strain"),), "static", np.zeros(1), 0.0, np.zeros(1))
@@ -85,7 +175,7 @@ def test_rotation_is_that_of_the_strain_tensor(
     assert values[0, 0] == pytest.approx(2.0 * direction @ tensor @ direction, abs=1e-12)
 
 
-def test_rotation_needs_components_and_has_rates() -> None:
+def test_rotation_needs_components_and_has_rates():
     turn = SensorRotation("g0", 0.2)
     values, rates = shown(turn, transverse=-0.3 * VALUES, shear=0.1 * VALUES)
     factor = np.cos(0.2) ** 2 - 0.3 * np.sin(0.2) ** 2 + 0.1 * np.sin(0.2) * np.cos(0.2)
@@ -93,7 +183,7 @@ def test_rotation_needs_components_and_has_rates() -> None:
     assert rates[1:-1, 1] == pytest.approx(factor * RATES[1:-1, 1], abs=1e-6)
 
 
-def test_lines_run_with_the_trial() -> None:
+def test_lines_run_with_the_trial():
     wave = (0.3 + 0.4j) * np.exp(100j * np.pi * TIME)
     assert shown(patch.Line("tip", 50.0, 0.3, -0.4))[0][:, 0] - VALUES[:, 0] == pytest.approx(
         wave.real, abs=1e-12
@@ -107,7 +197,7 @@ def test_lines_run_with_the_trial() -> None:
 
 
 @pytest.mark.parametrize(("kind", "given", "sentence"), INPUTS.refused("sensors"))
-def test_what_cannot_be_is_refused_in_one_sentence(kind: str, given, sentence: str) -> None:
+def test_what_cannot_be_is_refused_in_one_sentence(kind, given, sentence):
     item = ModelPatch((patch.PRIMITIVES[kind](*given),))
     with refused(InvalidPatchError, sentence):
         check_channels(item, CHANNELS)
@@ -120,7 +210,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(kind: str, given, sentence: s
 
 @pytest.mark.parametrize("order", [1.0, 2.0, 3.0])
 @pytest.mark.parametrize("held", [None, 0.0])
-def test_high_pass_against_an_integrator(order: float, held: float | None) -> None:
+def test_high_pass_against_an_integrator(order, held):
     times, signal, tau = np.arange(60) * 0.02, np.random.default_rng(2).normal(size=60), 0.11
 
     def slope(t: float, low: np.ndarray) -> np.ndarray:
@@ -138,7 +228,7 @@ def test_high_pass_against_an_integrator(order: float, held: float | None) -> No
 
 @given(st.floats(0.0, 4.0), st.floats(1e-4, 50.0))
 @settings(max_examples=80, deadline=None)
-def test_step_response_of_any_order(order: float, ratio: float) -> None:
+def test_step_response_of_any_order(order, ratio):
     expected, shown = (
         hyp1f1(order, 1.0, -ratio * np.arange(80)),
         high_pass(np.ones(80), ratio, 1.0, order, 0.0),
@@ -149,7 +239,7 @@ def test_step_response_of_any_order(order: float, ratio: float) -> None:
     assert far == pytest.approx(before * (1417.0 / 1417.9) ** 0.01, rel=1e-8)  # there it falls by a power
 
 
-def test_limits_of_the_high_pass() -> None:
+def test_limits_of_the_high_pass():
     signal = np.random.default_rng(3).normal(size=(50, 2))
     assert high_pass(signal, 0.01, 0.3, 0.0, 0.0) == pytest.approx(signal, abs=1e-12)
     assert high_pass(signal, 1e-3, 1e9, 1.0, 0.0) == pytest.approx(signal, abs=1e-9)
@@ -163,7 +253,7 @@ def test_limits_of_the_high_pass() -> None:
 
 
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
-def test_rates_through_the_high_pass(order: float) -> None:
+def test_rates_through_the_high_pass(order):
     item = HighPass("*", 0.4, order)
     values, rates = shown(item)
     assert rates[1:-1] == pytest.approx((values[2:] - values[:-2]) / 0.02, abs=2e-3 if order != 1.5 else 2e-2)
@@ -173,7 +263,7 @@ def test_rates_through_the_high_pass(order: float) -> None:
     assert np.array_equal(settled, VALUES)
 
 
-def test_a_high_pass_follows_uneven_stamps() -> None:
+def test_a_high_pass_follows_uneven_stamps():
     time = 0.01 * (np.arange(400) + 0.6 * np.random.default_rng(1).uniform(-0.5, 0.5, 400))
     time = np.delete(time - time[0], slice(133, 140))  # and a gap
     wave = 2.0 * np.pi * 1.3
@@ -189,21 +279,12 @@ def test_a_high_pass_follows_uneven_stamps() -> None:
 # ---------------------------------------------------------------- sample by sample
 
 STREAMED = ModelPatch(
-    (
-        SensorGain("g0", 0.07),
-        HighPass("g0", 0.4, 4.0),
-        SensorDrift("*", 2e-5, 10.0, 0.5, "strain"),
-        HighPass("*", 0.9, 1.0, "strain"),
-        patch.ThermalStrain("*", 1.2e-5),
-        patch.Line("tip", 50.0, 1e-4, -2e-4),
-        patch.DecayingLine("*", 7.0, 0.02, 1e-3, 2e-3, "strain"),
-        SensorRotation("g1", 0.2),
-    )
+    tuple(patch.PRIMITIVES[kind](*given) for kind, *given in INPUTS.table("channels.toml")["streamed"])
 )
 
 
 @pytest.mark.parametrize("kind", ["ringdown", "flight"])
-def test_samples_are_the_rows_of_the_whole_record(kind: str) -> None:
+def test_samples_are_the_rows_of_the_whole_record(kind):
     generator, count, dynamic = np.random.default_rng(3), 60, kind == "ringdown"
     values, across, shear = (1e-4 * generator.normal(size=(count, 3)) for _ in range(3))
     time, temperature = 0.01 * np.arange(count) + 4.0 * (not dynamic), generator.normal(size=count)

@@ -1,4 +1,4 @@
-"""`uav-twin fmu simulate` as a user calls it."""
+"""`uav-twin fmu`, `library sample`, `ssp` and `run x.ssp` as a user calls them."""
 
 import csv
 import json
@@ -24,25 +24,18 @@ from tests.twin_master.runs import text_of, written
 
 INPUTS = Inputs(__file__)
 HISTORIES = INPUTS.table("histories.toml")["refused"]
-ROOM = INPUTS.text("room.toml")
+ROOM = INPUTS.folder / "room.toml"
 
 
-@pytest.fixture
-def room(tmp_path: Path) -> Path:
-    path = tmp_path / "room.toml"
-    path.write_text(ROOM, encoding="utf-8")
-    return path
-
-
-def test_histories_in_outputs_out(foreign_fmu, room, tmp_path):
+def test_histories_in_outputs_out(foreign_fmu, tmp_path):
     fmu, given = foreign_fmu("room2"), tmp_path / "inputs.csv"
     power, outside = [0.0, 3.0, 1.5, 0.25], [5.0, -3.5, 0.1, 20.0]
     lines = [f"{120.0 + 60.0 * i},{p},{o}" for i, (p, o) in enumerate(zip(power, outside, strict=True))]
     given.write_text("time, power, load.outside\n" + "\n".join(lines) + "\n\n", encoding="utf-8")
-    with FmiAsset(fmu, room, isolated=False) as asset:
+    with FmiAsset(fmu, ROOM, isolated=False) as asset:
         seen = [asset.step({"power": p}, load={"outside": o}) for p, o in zip(power, outside, strict=True)]
     for out, more in ((tmp_path / "out.csv", ()), (tmp_path / "out.nc", ("--in-process",))):
-        words = ("fmu", "simulate", fmu, "--binding", room, "--inputs", given, "--out", out)
+        words = ("fmu", "simulate", fmu, "--binding", ROOM, "--inputs", given, "--out", out)
         assert "4 steps to t = 360 s" in said(*words, *more)
     with (tmp_path / "out.csv").open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
@@ -125,13 +118,7 @@ def test_histories_of_an_array_of_another_size(foreign_fmu, tmp_path):
 
 def test_structural_parameters_of_a_binding(foreign_fmu):
     """They hold after every start, in a state and for an asset beside it; some cannot be taken."""
-    header = {"name": "r", "step_size": 1.0, "structural_parameters": {"n": 3}}
-    content = {
-        "binding": header,
-        "control": {"u": {"variable": "u", "unit": "1"}},
-        "parameter": {"w": {"variable": "w", "unit": "1"}, "one": {"variable": "w[2]", "unit": "1"}},
-        "observation": {"y": {"variables": "y", "unit": "1"}},
-    }
+    content = INPUTS.table("structural.toml")
     with closing(FmiAsset(foreign_fmu("resize3"), parse_binding(content))) as asset:
         for _ in range(2):
             asset.reset({"w": [1.0, 1.0, 4.0]}, control={"u": [1.0, 2.0, 3.0]})
@@ -142,14 +129,14 @@ def test_structural_parameters_of_a_binding(foreign_fmu):
             asset.reset({"one": 5.0}, control={"u": [1.0, 2.0, 3.0]})
         with pytest.raises(FmuFileError, match=r"'u' of .* has 3 elements but 2 start values"):
             asset.reset({})
-    content["binding"] = {**header, "structural_parameters": {"rows": 3}}
+    content["binding"]["structural_parameters"] = {"rows": 3}
     with pytest.raises(
         BindingError,
         match=r"structural_parameters\.rows of the binding r names 'rows', which is not a variable",
     ):
         FmiAsset(foreign_fmu("resize3"), parse_binding(content))
     huge = foreign_fmu.changed("resize3", "many", ('max="8"', ""))
-    content["binding"] = {**header, "structural_parameters": {"n": 1e9}}
+    content["binding"]["structural_parameters"] = {"n": 1e9}
     with pytest.raises(FmuInputError, match="'y' is an array of 1000000000 elements; 10000000 are the most"):
         FmiAsset(huge, parse_binding(content))
     states = '<UInt64 name="n" valueReference="100" causality="structuralParameter" start="2"/>'
@@ -170,30 +157,26 @@ def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu):
 
 
 @pytest.mark.parametrize(("content", "sentence"), HISTORIES)
-def test_files_that_are_refused(room, tmp_path, content, sentence):
+def test_files_that_are_refused(tmp_path, content, sentence):
     given = tmp_path / "inputs.csv"
     given.write_text(content, encoding="utf-8")
     with pytest.raises(FmuInputError, match=sentence):
-        read_histories(given, load_binding(room))
+        read_histories(given, load_binding(ROOM))
 
 
-def test_columns_of_arrays_in_any_order_and_time_alone(room, tmp_path):
+def test_columns_of_arrays_in_any_order_and_time_alone(tmp_path):
     given = tmp_path / "inputs.csv"
     given.write_text("power[2],time,power[1]\n1,120,2\n3,180,4\n", encoding="utf-8-sig")
-    steps, roles = read_histories(given, load_binding(room))
+    steps, roles = read_histories(given, load_binding(ROOM))
     assert steps == 2
     assert roles["control"]["power"].tolist() == [[2.0, 1.0], [4.0, 3.0]]
     given.write_text("time\n120\n180.00001\n240\n", encoding="utf-8")
-    assert read_histories(given, load_binding(room)) == (3, {})
+    assert read_histories(given, load_binding(ROOM)) == (3, {})
 
 
 def test_rows_that_are_joined_by_lines(foreign_fmu, tmp_path):
     """x' = u - x from rest under u = t: x = t - 1 + exp(-t); the first row is where the asset starts."""
-    given, bound, out = tmp_path / "u.csv", tmp_path / "follow.toml", tmp_path / "x.csv"
-    bound.write_text(
-        '[binding]\nname = "follow"\nstep_size = 0.5\n[load.u]\nvariable = "u"\nunit = "1"\n'
-        '[observation.x]\nvariables = "x"\nunit = "1"\n'
-    )
+    given, bound, out = tmp_path / "u.csv", INPUTS.folder / "follow.toml", tmp_path / "x.csv"
     given.write_text("time,u\n0,0\n0.5,0.5\n1,1\n")
     wanted = (foreign_fmu("follow2"), "--binding", bound, "--inputs", given, "--out", out, "--in-process")
     assert "2 steps to t = 1 s" in said("fmu", "simulate", *wanted, "--interpolation", "linear")
@@ -276,7 +259,7 @@ def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
 
 GRID = (
     "--grid",
-    "wear=0,0.3",
+    "health.wear=0,0.3",
     "--grid",
     "clogging=0,0.6",
     "--grid",
@@ -332,3 +315,119 @@ def test_a_run_of_the_pump_speaks_of_pumps(tmp_path):
     drawings = "".join(path.read_text(encoding="utf-8") for path in (folder / "figures").glob("*.svg"))
     assert "microstrain" not in drawings
     assert "Gauge" not in drawings
+
+
+END = "</ssm:ParameterMapping>"
+
+
+@pytest.fixture(scope="module")
+def scenario(heat_exchanger: Path) -> Path:
+    return heat_exchanger / "fouling.toml"
+
+
+@pytest.fixture(scope="module")
+def system(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The heat exchanger as an SSP file."""
+    place = tmp_path_factory.mktemp("system") / "x.ssp"
+    assert "x.ssp: " in said("ssp", "export", scenario, "--out", place)
+    return place
+
+
+def changed(system: Path, target: Path, **pairs: str) -> Path:
+    """Write a system with texts of its XML files replaced."""
+    with zipfile.ZipFile(system) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            for before, after in pairs.items() if not name.endswith(".fmu") else ():
+                content = content.replace(before.encode(), after.encode())
+            new.writestr(name, content)
+    return target
+
+
+def mapped(*entries: tuple[str, str]) -> dict[str, str]:
+    """What adds entries, sources and targets, to the mapping of parameters."""
+    texts = (f'<ssm:MappingEntry source="{one}" target="heat_exchanger.{other}" />' for one, other in entries)
+    return {END: "".join(texts) + END}
+
+
+def test_export_check_and_run(monkeypatch, scenario, system, tmp_path):
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
+    text, out = said("ssp", "check", system), tmp_path / "run"
+    assert "no problem found; 8 connections, 2 parameters" in text
+    assert "evaluated in the order heat_exchanger (HeatExchanger)" in text
+    exists = "exists: choose another --out or give --replace"
+    assert exists in refused("ssp", "export", scenario, "--out", system)
+    said("run", system, "--scenario", scenario, "--out", out, "--in-process", "-q")
+    assert (out / "asset" / "system.ssp").read_bytes() == system.read_bytes()
+    assert (out / "csv" / "observed.csv").is_file()
+
+
+def test_a_system_is_simulated_as_it_lies_there(system, tmp_path):
+    """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
+    table, picture = tmp_path / "x.csv", tmp_path / "x.svg"
+    simulate = ("ssp", "simulate", system, "--stop-time", "3", "--step-size", "1", "--in-process")
+    assert "3 steps to t = 3 s, every 1 s." in said(*simulate, "--out", table, "--plot", picture)
+    assert picture.read_text(encoding="utf-8").startswith("<?xml")
+    rows = np.genfromtxt(table, delimiter=",", names=True)
+    np.testing.assert_allclose(rows["time"], [0.0, 1.0, 2.0, 3.0])
+    assert rows["outlet"][-1] == pytest.approx(20.0 + 60.0 * -np.expm1(-6100.0 / 4186.0), rel=1e-14)
+    for number, name in enumerate(("conductance", "heat_exchanger.conductance")):
+        again = tmp_path / f"{number}.nc"
+        said(*simulate, "--set", "mass_flow=0.5", "--set", f"{name}=5000", "--out", again)
+        with xr.open_dataset(again, engine="h5netcdf") as data:
+            outlet = float(data["observation"].sel(observation_name="outlet")[-1])
+            assert data.attrs["fmu"] == "x.ssp"
+        assert outlet == pytest.approx(20.0 + 60.0 * -np.expm1(-5000.0 / (4186.0 * 0.5)), rel=1e-14)
+    assert "no parameter or input" in refused(*simulate, "--set", "heat_exchanger.outlet=1")
+    asked = "asks for linear interpolation of inputs, but no component"
+    assert asked in refused(*simulate, "--interpolation", "linear")
+
+
+def test_what_nothing_takes_is_a_warning_and_not_flown(scenario, system, tmp_path):
+    """The nearest name is said; what another entry gives is not missed."""
+    file = changed(system, tmp_path / "more.ssp", **mapped(("conductance", "baffle")))
+    named = f"{file} sets parameters that nothing takes: heat_exchanger.baffle; correct"
+    for words in (("check", file), ("simulate", file, "--stop-time", "1", "--in-process")):
+        assert f"warning: {named}" in " ".join(said("ssp", *words).split())
+    assert json.loads(said("ssp", "check", file, "--json"))["unused"] == ["heat_exchanger.baffle"]
+    more = mapped(("conductance", "conductanse"), ("cold", "wall_temperature"))
+    file = changed(system, tmp_path / "misspelt.ssp", **more)
+    meant = "heat_exchanger.conductanse (did you mean 'heat_exchanger.conductance'?)"
+    named = f"{file} sets parameters that nothing takes: {meant}"
+    assert f"warning: {named}" in " ".join(said("ssp", "check", file).split())
+    out = tmp_path / "run"
+    assert named in refused("run", file, "--scenario", scenario, "--out", out, "-q")
+    assert not out.exists()
+
+
+def test_the_words_of_ssp_2_are_read(system, tmp_path):
+    """The numbers of FMI 3, metadata and the version; what 1.0 has no word for is refused."""
+    meta, end = (
+        '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />',
+        "</ssd:SystemStructureDescription>",
+    )
+    words = {
+        'version="1.0" name=': 'version="2.0" name=',
+        "ssc:Real": "ssc:Float64",
+        "ssv:Real": "ssv:Float64",
+        end: f"{meta}{end}",
+    }
+    newer, tables = changed(system, tmp_path / "newer.ssp", **words), [tmp_path / "0.csv", tmp_path / "1.csv"]
+    for file, table in zip((system, newer), tables, strict=True):
+        said("ssp", "simulate", file, "--out", table, "--step-size", "0.25", "--in-process")
+    assert tables[0].read_bytes() == tables[1].read_bytes()
+    for what, by, sentence in (
+        ("<ssc:Float64 />", '<ssc:Float64 /><ssd:Dimension size="2" />', "has an array"),
+        ("<ssc:Float64 />", "<ssc:Clock />", "has a clock"),
+        ('kind="parameter"', 'kind="structuralParameter"', "a connector of the kind structuralParameter"),
+        (' source="resources/heat_exchanger.fmu"', "", "'heat_exchanger' without a source"),
+    ):
+        bad = changed(newer, tmp_path / "bad.ssp", **{what: by})
+        assert sentence in refused("ssp", "simulate", bad)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_the_wing_of_a_design(tmp_path):
+    said("ssp", "export", "uav_wing", "--out", tmp_path / "wing.ssp")
+    assert "evaluated in the order uav_wing (uav_wing)" in said("ssp", "check", tmp_path / "wing.ssp")
