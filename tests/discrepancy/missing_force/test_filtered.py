@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from benchmarks.event_moments import found_in as found_in_series
@@ -37,7 +36,6 @@ def evidence(filtered):
     return -0.5 * found.products[0, 0] - found.log_determinant
 
 
-FloatArray = NDArray[np.float64]
 FREQUENCY, RATIO, PARTS = 9.0, 0.05, 8
 PROCESS = Process(2.0, 0.15)
 
