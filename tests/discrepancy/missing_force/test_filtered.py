@@ -31,8 +31,8 @@ def gaussian(covariance, readings):
 
 def evidence(filtered):
     """Return the log evidence of a trial's residuals."""
-    residual = filtered.trial.residual
-    found = regression([filtered], [residual], [np.zeros((0, *residual.shape))])
+    trial = filtered.trial
+    found = regression([filtered], [np.concatenate((trial.residual[None], trial.local))])
     return -0.5 * found.products[0, 0] - found.log_determinant
 
 
