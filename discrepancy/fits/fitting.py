@@ -14,7 +14,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.sentences import said
 
-from .candidate import Candidate, Linearisation, Point, Remainder, State
+from .candidate import Candidate, Linearisation, Point, Remainder, State, Term
 from .normal_equations import finite, normal_equations, solved, upper_factor
 from .problem import Problem
 
@@ -22,15 +22,10 @@ LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
-STALLED = 1
-"""So do more than this many steps in a row that gain less, whatever they promised."""
 WHOLE_STEP, LARGEST_DAMPING = 1e-2, 1.0
 """Damping below which a step is nearly that of Gauss and Newton, and above which it is a mere trial."""
 STEP_SHARES = (1.0, 0.3)
 """Shares of a step that are tried before the damping grows."""
-CREEPING, NEAR_END = 0.2, 30.0
-"""Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
-the one before it promised: close to the end, promises should fall fast."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,21 +125,10 @@ def fit(
     if not np.isfinite(state.objective):
         names = candidate.identifiers or "no effect"
         raise FitError(said("models.not_finite", names=names))
-    converged, fresh, before, stalled = False, known is None, np.inf, 0
+    converged, fresh = False, known is None
     for _ in range(iterations):
         step, promised = descent.step(state, damping)
-        if not fresh and CREEPING * before < promised < NEAR_END:
-            # old derivatives turn a long valley into a row of short steps, each of which keeps its promise
-            state, fresh = descent.state(state.point), True
-            step, promised = descent.step(state, damping)
-        before = promised
-        if promised < CONVERGED and fresh:
-            converged = damping < LARGEST_DAMPING  # else only short steps are left to promise little
-            break
-        if promised < CONVERGED:
-            state, fresh = descent.state(state.point), True
-            continue
-        following = descent.following(state, step, damping)
+        following = None if promised < CONVERGED else descent.following(state, step)
         if following is not None:
             gain = state.objective - following.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
@@ -153,12 +137,11 @@ def fit(
                 state, fresh = descent.state(state.point), True
             if give_up is not None and damping < WHOLE_STEP and state.objective - 2.0 * promised > give_up:
                 break
-            stalled = stalled + 1 if gain < CONVERGED and damping < WHOLE_STEP else 0
-            if stalled > STALLED and fresh:
-                converged = True
-                break
         elif not fresh:
             state, fresh = descent.state(state.point), True
+        elif promised < CONVERGED:
+            converged = damping < LARGEST_DAMPING  # else only short steps are left to promise little
+            break
         else:
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e6:
@@ -238,23 +221,12 @@ class _Descent:
         local = tuple(step[a:b] for a, b in pairwise(ends.tolist()))
         return Point(step[:first], local, step[first:own]), 0.5 * float(found.gradient @ step)
 
-    def following(self, state: State, step: Point, damping: float) -> State | None:
-        """Return the state after a step, or None if none better was found.
-
-        Where the phases of a record bend the valley that the step follows, its end lies on the slope; a
-        second step with the same derivatives by the nuisances leads back to the bottom (the second-order
-        correction of Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
-        """
+    def following(self, state: State, step: Point) -> State | None:
+        """Return the state after a step, or None if none better was found."""
         for share in STEP_SHARES:
             try:
                 ahead = _ahead(self.candidate, state.point, step, share)
-                proposal = self.state(ahead, derivatives=False)
-                bent = not proposal.objective < state.objective and np.isfinite(proposal.objective)
-                if bent and share == 1.0:
-                    correction, _ = self.step(self.state(ahead, known=state.linearisations), damping)
-                    ahead = _ahead(self.candidate, ahead, correction)
-                    proposal = self.state(ahead, derivatives=False)
-                if proposal.objective < state.objective:
+                if self.state(ahead, derivatives=False).objective < state.objective:
                     return self.state(ahead, known=state.linearisations)
             except DiscrepancyError:  # outside what the structure can carry: a shorter step
                 continue
@@ -282,7 +254,7 @@ def _finished(
     )  # fmt: skip
 
 
-def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
+def _ahead(candidate: Candidate, point: Point, step: Point, share: float) -> Point:
     """Return the point a share of a step ahead."""
     parameters = [item for term in candidate.terms for item in term.parameters]
     effect = [
@@ -301,3 +273,30 @@ def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) 
 
 def _bounded(point: Point) -> Point:
     return replace(point, effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))
+
+
+def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateFit | None:
+    """Fit the family of one effect of a fit: its shape free, from the canonical one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the fit.
+    named : CandidateFit
+        With canonical shapes.
+    number : int
+        Of the effect among its terms.
+
+    Returns
+    -------
+    CandidateFit or None
+        None where no shape is to free, or the structure cannot follow.
+    """
+    terms, parts = list(named.candidate.terms), list(named.candidate.parts(named.point.effect))
+    effect = terms[number].effect
+    if not effect.shape:
+        return None
+    terms[number] = Term(effect, terms[number].place, free_shape=True)
+    parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
+    start = replace(named.point, effect=np.concatenate(parts))
+    return attempt(problem, Candidate(tuple(terms)), start)

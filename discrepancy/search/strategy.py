@@ -12,16 +12,15 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, attempt, fit
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
-from discrepancy.fits.other_optima import around, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
-from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, slips, starts, tried
+from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, starts, tried
 
 
 @dataclass
@@ -238,10 +237,9 @@ class Search:
         """Search: simple causes before others.
 
         One effect, one law of free shape, more effects, any two. The best candidate is computed finely
-        before what rests on its evidence: finely divided, a joint may have the shape of the name in place of
-        one that is free.
+        before what rests on its evidence.
         """
-        self.singles()
+        self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
         self.settle()
         self.families()
         self.settle()
@@ -285,17 +283,17 @@ class Search:
         return not absolute_gate(self.problem, self.best()).passed
 
     def settle(self) -> None:
-        """Compute the best candidate finely enough that its evidence is its own, not that of the steps."""
-        self._settle_joints()
-        self._settle_steps()
-
-    def singles(self) -> None:
-        """Fit each effect alone, and the best of them beside their optimum too."""
-        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
-        for rank, item in enumerate(ranked[: SEARCH.ridges]):
-            misses = absolute_gate(self.problem, item).passed is False
-            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
-                self.keep(around(self.problem, item), exact=True)
+        """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
+        while (
+            self.problem.refinement < SEARCH.finest
+            and solver_share(self.problem, self.best()) > SEARCH.solver_share
+        ):
+            self.problem.refinement *= 2
+            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[: SEARCH.refitted]
+            for item in ranked:
+                again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
+                if again is not None:  # else the rough one stands
+                    self.exact[item.candidate.key] = again
 
     def longer(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
@@ -320,11 +318,9 @@ class Search:
             singles = [item for item in fitting if self.score(item) > close]
             if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
                 return
-        # a rival that fits is followed to its end; one that does not has to promise more than the best
-        give_up = None if fitting else self.best().objective
         kept: dict[tuple[str, str], CandidateFit] = {}
         for named in singles:
-            family = free_shape(self.problem, named, 0, give_up=give_up)
+            family = free_shape(self.problem, named, 0)
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
@@ -334,34 +330,6 @@ class Search:
                 kept[key] = family
         for family in kept.values():
             self.keep(family, exact=True)
-
-    def _settle_steps(self) -> None:
-        """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
-        while (
-            self.problem.refinement < SEARCH.finest
-            and solver_share(self.problem, self.best()) > SEARCH.solver_share
-        ):
-            self.problem.refinement *= 2
-            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[: SEARCH.refitted]
-            self._fit_again([item for item in ranked if item.candidate.terms])
-
-    def _settle_joints(self) -> None:
-        """Divide a joint that slips more finely where the best candidate has one; fit the best ones again."""
-        setting = self.problem.setting
-        if setting.joint_elements >= SEARCH.fine_joint or not slips(self.problem, self.best()):
-            return
-        ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
-        self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
-        self._fit_again([item for item in ranked if slips(self.problem, item)][: SEARCH.refitted])
-        if slips(self.problem, self.best()):
-            self.keep(around(self.problem, self.best()), exact=True)
-
-    def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
-        """Replace exact fits by those of the finer model from where they stand."""
-        for item in rough:
-            again = attempt(self.problem, item.candidate, item.point)
-            if again is not None:  # else the rough one stands
-                self.exact[item.candidate.key] = again
 
     def _extended(self, current: CandidateFit) -> CandidateFit | None:
         """Return a better set with one more effect, or None."""
