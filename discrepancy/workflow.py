@@ -256,10 +256,10 @@ def without_wrong_ends(problem: Problem) -> Problem:
 
     The model as it is need not fit: see `outliers.wrong_ends`.
     """
-    none = fit_to(problem, Candidate(), problem.start(Candidate()), evidence=False)
+    none = fit_to(problem, Candidate(), problem.start(Candidate()))
     fits = [(problem, none)]
     if problem.campaign.held_out:
-        fits.append(held_out_fit(problem, none, evidence=False))
+        fits.append(held_out_fit(problem, none))
     trials = {trial.name: trial for trial in problem.campaign.trials}
     remarks = list(problem.campaign.remarks)
     for part, fitted in fits:

@@ -47,7 +47,7 @@ def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     known, weights = len(problem.shared.parameter_mean), np.ones(len(problem.channel_names))
-    found = fit(problem, Candidate(), begun(problem), iterations=0, evidence=False)
+    found = fit(problem, Candidate(), begun(problem), iterations=0)
     matrix = normal_equations(problem, found, Candidate(), weights).matrix
     left = np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True))[:known])
     return {

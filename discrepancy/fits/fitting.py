@@ -88,7 +88,6 @@ def fit(
     *,
     known: tuple[Linearisation, ...] | None = None,
     iterations: int = 60,
-    evidence: bool = True,
     local_only: bool = False,
     give_up: float | None = None,
 ) -> CandidateFit:
@@ -106,8 +105,6 @@ def fit(
         Derivatives by shared and local unknowns that are near enough to begin with.
     iterations : int
         Largest number of steps.
-    evidence : bool
-        Whether covariance, evidence and spent degrees of freedom are wanted.
     local_only : bool
         Shared unknowns and effects stay: only the trials' own nuisances are fitted (held-out trials).
     give_up : float, optional
@@ -118,8 +115,7 @@ def fit(
     FitError
         If the model gives numbers that are not finite at the start, or none of which a curvature can be made.
     """
-    # without evidence the step needs a direction only: one side is half the work
-    descent = _Descent(problem, candidate, local_only, central=evidence)
+    descent = _Descent(problem, candidate, local_only)
     damping = 1e-3
     state = descent.state(_bounded(start), known=known)
     if not np.isfinite(state.objective):
@@ -146,9 +142,9 @@ def fit(
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e6:
                 break
-    if not fresh and evidence:
+    if not fresh:
         state = descent.state(state.point)
-    return _finished(problem, candidate, state, converged, evidence)
+    return _finished(problem, candidate, state, converged)
 
 
 def attempt(problem: Problem, candidate: Candidate, start: Point, **options: Any) -> CandidateFit | None:
@@ -178,7 +174,6 @@ class _Descent:
     problem: Problem
     candidate: Candidate
     local_only: bool
-    central: bool = True
     deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
 
     def state(
@@ -192,7 +187,6 @@ class _Descent:
             part = problem.linearise(
                 number, point, self.candidate, derivatives=derivatives,
                 known=None if known is None else known[number], effect_steps=self.deviation,
-                central=self.central,
             )  # fmt: skip
             parts.append(part)
             residuals.append(problem.residual(number, point, part.response))
@@ -233,24 +227,17 @@ class _Descent:
         return None
 
 
-def _finished(
-    problem: Problem, candidate: Candidate, state: State, converged: bool, evidence: bool
-) -> CandidateFit:
+def _finished(problem: Problem, candidate: Candidate, state: State, converged: bool) -> CandidateFit:
     size = problem.shared.size + candidate.size
-    covariance, log_evidence = np.zeros((size, size)), -state.objective
-    spent = np.zeros(len(problem.channel_names))
-    if evidence:
-        equations = normal_equations(problem, state, candidate, problem.precisions(state.sums))
-        factor = upper_factor(equations.matrix)
-        whole = solved(factor, np.eye(len(factor)))
-        covariance = whole[:size, :size]
-        log_evidence -= float(np.log(np.diag(factor)).sum())
-        for data, (item, place) in zip(problem.trials, equations.trials, strict=True):
-            leverage = ((whole[np.ix_(place, place)] @ item.rows) * item.rows).sum(axis=0)
-            np.add.at(spent, data.groups, leverage.reshape(data.weight.shape).sum(axis=0))
+    equations = normal_equations(problem, state, candidate, problem.precisions(state.sums))
+    factor = upper_factor(equations.matrix)
+    whole, spent = solved(factor, np.eye(len(factor))), np.zeros(len(problem.channel_names))
+    for data, (item, place) in zip(problem.trials, equations.trials, strict=True):
+        leverage = ((whole[np.ix_(place, place)] @ item.rows) * item.rows).sum(axis=0)
+        np.add.at(spent, data.groups, leverage.reshape(data.weight.shape).sum(axis=0))
     return CandidateFit(
-        **vars(state), candidate=candidate, log_evidence=log_evidence, covariance=covariance, spent=spent,
-        converged=converged,
+        **vars(state), candidate=candidate, covariance=whole[:size, :size], spent=spent, converged=converged,
+        log_evidence=-state.objective - float(np.log(np.diag(factor)).sum()),
     )  # fmt: skip
 
 

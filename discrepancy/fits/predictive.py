@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -45,11 +44,11 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     )
 
 
-def held_out_fit(problem: Problem, found: CandidateFit, **options: Any) -> tuple[Problem, CandidateFit]:
+def held_out_fit(problem: Problem, found: CandidateFit) -> tuple[Problem, CandidateFit]:
     """Return the trials that are held out, and a fit with their own nuisances; what is shared stays."""
     there = problem.with_trials(problem.campaign.held_out)
     start = replace(there.start(found.candidate), shared=found.point.shared, effect=found.point.effect)
-    return there, fit(there, found.candidate, start, local_only=True, **options)
+    return there, fit(there, found.candidate, start, local_only=True)
 
 
 def _predicted(

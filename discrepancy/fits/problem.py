@@ -177,7 +177,6 @@ class Problem:
         derivatives: bool = True,
         known: Linearisation | None = None,
         effect_steps: FloatArray | None = None,
-        central: bool = True,
     ) -> Linearisation:
         """Return response and derivatives of a trial.
 
@@ -197,8 +196,6 @@ class Problem:
             Deviations of the effect parameters. Differences over one of them, at most a hundredth of the
             prior's, average over the kinks of friction and hysteresis and do not reach beyond where the
             parameters may lie.
-        central : bool
-            Whether derivatives by effect parameters are central differences.
 
         Notes
         -----
@@ -224,11 +221,10 @@ class Problem:
         for k in range(candidate.size):
             if kind in candidate.acting(k):
                 ends = []
-                for side in (1.0, -1.0) if central else (1.0,):
-                    patched = candidate.patch(self.setting, moved(point.effect, k, side * steps[k]))
+                for step in (steps[k], -steps[k]):
+                    patched = candidate.patch(self.setting, moved(point.effect, k, step))
                     ends.append(self.response(number, shared, local, patched)[0])
-                other, width = (ends[1], 2.0) if central else (response, 1.0)
-                effect[k] = (ends[0] - other) / (width * steps[k])
+                effect[k] = (ends[0] - ends[1]) / (2.0 * steps[k])
         return Linearisation(response, parameters, by_local, effect)
 
     def _by_nuisances(

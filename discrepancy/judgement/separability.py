@@ -131,7 +131,7 @@ def begun(problem: Problem) -> Point:
     if not any(unknown):
         return start
     # parameters follow: beside a frequency that is off, what begins would fade out of the record
-    found = fit(problem, Candidate(), start, evidence=False).point.local
+    found = fit(problem, Candidate(), start).point.local
     chosen = zip(unknown, found, start.local, strict=True)
     return replace(start, local=tuple(own if free else kept for free, own, kept in chosen))
 

@@ -15,7 +15,7 @@ from discrepancy.fits.candidate import Candidate, Key
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.fits.screening import Screen, rescaled
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
@@ -125,17 +125,6 @@ class Search:
             self.tell(f"the missing force cannot be seen: {cause}")
             return None
 
-    def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
-        """Return for each effect its most promising changes, best first, at different places or values."""
-        screen, found = Screen(self.problem, base), {}
-        for effect in each(self.tell, tuple(effects), lambda one: f"screening {one.identifier}"):
-            found[effect.identifier] = starts(screen, effect)
-        if not base.candidate.terms:
-            self.promised |= {
-                name: max((change.gain for change in changes), default=0.0) for name, changes in found.items()
-            }
-        return found
-
     def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
         """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
 
@@ -169,16 +158,18 @@ class Search:
         """Whether much is left by a fit."""
         return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
 
-    def _scan_near(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
-        """Fit effects from where a screen at a base leads."""
+    def _scan_near(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
+        """Fit effects from where a screen at a base leads, the most promising first."""
         least = SEARCH.worth_adding if base.candidate.terms else SEARCH.worth_fitting
-        ranked = [
-            chosen for changes in self.screened(base, effects).values()
-            if (chosen := [change for change in changes if change.gain >= least])
-        ]  # fmt: skip
-        ranked.sort(key=lambda changes: -max(change.gain for change in changes))
-        starts = [[beside(base, change.term, rescaled(change)) for change in row] for row in ranked]
-        return self._best_of(starts, base, least if base.candidate.terms else 0.0)
+        screen, rows = Screen(self.problem, base), []
+        for effect in each(self.tell, effects, lambda one: f"screening {one.identifier}"):
+            changes = starts(screen, effect)
+            if not base.candidate.terms:
+                self.promised[effect.identifier] = max((change.gain for change in changes), default=0.0)
+            rows.append([change for change in changes if change.gain >= least])
+        rows.sort(key=lambda row: -max((change.gain for change in row), default=0.0))
+        begun = [[beside(base, change.term, rescaled(change)) for change in row] for row in rows if row]
+        return self._best_of(begun, base, least if base.candidate.terms else 0.0)
 
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
         """Return a base with its nuisances where they are beside a missing force."""
@@ -243,16 +234,12 @@ class Search:
         self.settle()
         self.families()
         self.settle()
-        if self._open:
+        # beside a law whose shape is free further effects would be anything
+        if not self.best().candidate.is_family:
             self.longer()
-        if self._open and len(self.effects) > 1 and self.unexplained():
+        if not self.best().candidate.is_family and self.unexplained():
             self.fit_pairs()
         self.settle()
-
-    @property
-    def _open(self) -> bool:
-        """Whether further effects are looked for: beside a law whose shape is free they would be anything."""
-        return not self.best().candidate.is_family
 
     @property
     def _moves(self) -> bool:
@@ -265,13 +252,14 @@ class Search:
         if force is None:
             return False
         self.forces = force.name(self.effects)
-        # beside another law a shape of its own would imitate nearly anything
-        able = [one for one in self.forces if len(one.candidate.terms) == 1 or not one.candidate.is_family]
-        able = [one for one in able if one.candidate.terms]
-        scores = [force.score(one, len(self.effects)) for one in able]
-        near = zip(able, scores, strict=True)
-        close = [one for one, score in near if score > max(scores) - SEARCH.followed][: SEARCH.far_fits]
-        for item in each(self.tell, close, lambda one: f"fitting {one.candidate.words} to the end"):
+        able = [
+            one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
+            if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
+        ]  # fmt: skip
+        close = [one for one in able if self.score(one) > self.score(able[0]) - SEARCH.followed]
+        for item in each(
+            self.tell, close[: SEARCH.far_fits], lambda one: f"fitting {one.candidate.words} to the end"
+        ):
             found = attempt(self.problem, item.candidate, force.whole_point(item))
             if found is not None:
                 self.keep(found, exact=True)
@@ -297,11 +285,16 @@ class Search:
 
     def longer(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
-        current: CandidateFit | None = self.best()
-        while current is not None and current.candidate.terms:
+        current = self.best()
+        while 0 < len(current.candidate.terms) < SEARCH.largest_set:
             if len(current.candidate.terms) > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do
-            current = self._extended(current)
+            before, there = self.score(current), {term.effect.identifier for term in current.candidate.terms}
+            others = [effect for effect in self.effects if effect.identifier not in there]
+            fitted = self.refine(self.scan(current, others), before - SEARCH.hopeless_longer)
+            if not fitted or self.score(fitted[0]) <= before:
+                break
+            current = fitted[0]
 
     def families(self) -> None:
         """Fit the free-shape families of single effects that come close, and keep those that fit.
@@ -331,23 +324,12 @@ class Search:
         for family in kept.values():
             self.keep(family, exact=True)
 
-    def _extended(self, current: CandidateFit) -> CandidateFit | None:
-        """Return a better set with one more effect, or None."""
-        if len(current.candidate.terms) >= SEARCH.largest_set:
-            return None
-        before = self.score(current)
-        there = {term.effect.identifier for term in current.candidate.terms}
-        others = [effect for effect in self.effects if effect.identifier not in there]
-        fitted = self.refine(self.scan(current, others), before - SEARCH.hopeless_longer)
-        return fitted[0] if fitted and self.score(fitted[0]) > before else None
-
     def fit_pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
         screen = Screen(self.problem, self.none)
-        changes = {effect.identifier: starts(screen, effect) for effect in self.effects}
-        ranked = sorted(pairs(changes, screen.sign), key=lambda item: item[0])[: SEARCH.pairs_fitted]
+        changes = [change for effect in self.effects for change in starts(screen, effect)]
         begun = []
-        for _, first, second in ranked:
+        for _, first, second in pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
             candidate = Candidate((first.term, second.term))
             effect = np.concatenate((rescaled(first), rescaled(second)))
             if candidate.key not in self.exact:

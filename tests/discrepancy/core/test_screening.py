@@ -63,13 +63,13 @@ def test_change_is_the_projected_one(screened):
 
 def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
     problem, none, screen, terms, changes = screened
-    options = {change.term.effect.identifier: [change] for change in changes}
-    ((misfit, first, second),) = list(pairs(options, screen.sign))
+    ((misfit, first, second),) = pairs(changes, screen.sign)
     found = kit.fitted(problem, *terms)
     assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
     start = np.concatenate((rescaled(first), rescaled(second)))
     np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
-    assert not list(pairs({"one": [changes[0]], "other": [changes[0]]}, screen.sign))
+    same = replace(changes[0], term=terms[1])
+    assert pairs([changes[0], changes[0]], screen.sign) == pairs([changes[0], same], screen.sign) == []
 
 
 def test_gain_is_what_a_fit_achieves(screened):
