@@ -4,6 +4,7 @@ The derivatives by what all hypotheses share change little with an effect: a fit
 fit that it extends.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -117,7 +118,7 @@ def fit(
     """
     descent = _Descent(problem, candidate, local_only)
     damping = 1e-3
-    state = descent.state(_bounded(start), known=known)
+    state = descent.state(_bounded(start), known)
     if not np.isfinite(state.objective):
         names = candidate.identifiers or "no effect"
         raise FitError(said("models.not_finite", names=names))
@@ -164,7 +165,21 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
     ModelError
         If the structure cannot carry the effects.
     """
-    return _Descent(problem, candidate, False).state(_bounded(point), derivatives=False).objective
+    point = _bounded(point)
+    responses = [problem.answer(number, point, candidate) for number in range(len(problem.trials))]
+    return _compared(problem, point, responses)[0]
+
+
+def _compared(
+    problem: Problem, point: Point, responses: Sequence[FloatArray]
+) -> tuple[float, tuple[FloatArray, ...], FloatArray]:
+    """Return -ln posterior, residuals of each trial, and their sums of squares by channel."""
+    residuals = tuple(problem.residual(number, point, one) for number, one in enumerate(responses))
+    sums = problem.group_sums(residuals)
+    prior = float(problem.shared.precision @ point.shared**2 + point.effect @ point.effect)
+    prior += sum(float(d.unknowns.precision @ u**2) for d, u in zip(problem.trials, point.local, strict=True))
+    value = problem.misfit(sums) + 0.5 * prior
+    return value if np.isfinite(value) else np.inf, residuals, sums
 
 
 @dataclass
@@ -176,28 +191,14 @@ class _Descent:
     local_only: bool
     deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
 
-    def state(
-        self, point: Point, *, derivatives: bool = True, known: tuple[Linearisation, ...] | None = None
-    ) -> State:
+    def state(self, point: Point, known: tuple[Linearisation, ...] | None = None) -> State:
         """Return objective and derivatives at a point; `known` are derivatives by nuisances, near enough."""
-        problem = self.problem
-        parts: list[Linearisation] = []
-        residuals = []
-        for number in range(len(problem.trials)):
-            part = problem.linearise(
-                number, point, self.candidate, derivatives=derivatives,
-                known=None if known is None else known[number], effect_steps=self.deviation,
-            )  # fmt: skip
-            parts.append(part)
-            residuals.append(problem.residual(number, point, part.response))
-        sums = problem.group_sums(residuals)
-        prior = 0.5 * float(problem.shared.precision @ point.shared**2)
-        prior += 0.5 * float(point.effect @ point.effect)
-        for data, u in zip(problem.trials, point.local, strict=True):
-            prior += 0.5 * float(data.unknowns.precision @ u**2)
-        objective = problem.misfit(sums) + prior
-        objective = objective if np.isfinite(objective) else np.inf
-        return State(point, objective, tuple(residuals), sums, tuple(parts))
+        parts = tuple(
+            self.problem.linearise(number, point, self.candidate, known=near, effect_steps=self.deviation)
+            for number, near in enumerate(known or [None] * len(self.problem.trials))
+        )
+        compared = _compared(self.problem, point, [part.response for part in parts])
+        return State(point, *compared, parts)
 
     def step(self, state: State, damping: float) -> tuple[Point, float]:
         """Return the step and the decrease it promises [nat], and keep the deviations of the effects."""
@@ -220,8 +221,8 @@ class _Descent:
         for share in STEP_SHARES:
             try:
                 ahead = _ahead(self.candidate, state.point, step, share)
-                if self.state(ahead, derivatives=False).objective < state.objective:
-                    return self.state(ahead, known=state.linearisations)
+                if objective(self.problem, self.candidate, ahead) < state.objective:
+                    return self.state(ahead, state.linearisations)
             except DiscrepancyError:  # outside what the structure can carry: a shorter step
                 continue
         return None

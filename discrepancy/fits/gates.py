@@ -6,9 +6,7 @@ from scipy.stats import chi2
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.verdict import Gate
-from fe.runtime.patch import ModelPatch
 
-from .candidate import Candidate
 from .fitting import CandidateFit
 from .problem import Problem
 
@@ -140,9 +138,7 @@ def solver_share(problem: Problem, fit: CandidateFit) -> float:
     for number, data in enumerate(problem.trials):
         if not data.trial.is_dynamic:
             continue
-        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
-        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
-        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, finer=2)
+        finer = problem.answer(number, fit.point, fit.candidate, finer=2)
         change = (finer - fit.responses[number]) / data.deviation
         largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
     return largest

@@ -32,9 +32,6 @@ QUIETEST = 1e-12
 """Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
 
 
-_NOTHING = np.empty((0, 0, 0))
-
-
 def misfits(freedom: FloatArray, counts: FloatArray, sums: FloatArray) -> FloatArray:
     """Return -ln L of each channel [nat], its noise variance marginalised, up to a constant.
 
@@ -154,6 +151,12 @@ class Problem:
 
         return self._responses.get((number, patch.primitives, conditions.key), answer)
 
+    def answer(self, number: int, point: Point, candidate: Candidate, finer: int = 1) -> FloatArray:
+        """Return the response (N, C) of a trial beside the effects of a candidate, as `response` does."""
+        acts = self.trials[number].trial.kind in candidate.acts_on
+        patch = candidate.patch(self.setting, point.effect) if acts else ModelPatch()
+        return self.response(number, point.shared, point.local[number], patch, finer)[0]
+
     def prediction(self, number: int, point: Point, response: FloatArray) -> FloatArray:
         """Return the prediction (N, C) with gains and zeros."""
         data = self.trials[number]
@@ -174,7 +177,6 @@ class Problem:
         point: Point,
         candidate: Candidate,
         *,
-        derivatives: bool = True,
         known: Linearisation | None = None,
         effect_steps: FloatArray | None = None,
     ) -> Linearisation:
@@ -188,8 +190,6 @@ class Problem:
             Where.
         candidate : Candidate
             Effects that act.
-        derivatives : bool
-            False: the response only.
         known : Linearisation, optional
             Derivatives by shared and local unknowns that are near enough.
         effect_steps : (E,) ndarray, optional
@@ -203,36 +203,28 @@ class Problem:
         ten-thousandth where the effect moves frequencies. The curvature in a one-sided difference is more
         than that, and would count as information.
         """
-        data = self.trials[number]
-        kind = data.trial.kind
-        patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
-        shared, local = point.shared, point.local[number]
-        response, _ = self.response(number, shared, local, patch)
+        kind, response = self.trials[number].trial.kind, self.answer(number, point, candidate)
         if known is not None:
             parameters, by_local = known.parameters, known.local
-        elif derivatives:
-            parameters, by_local = self._by_nuisances(number, shared, local, patch)
-        if not derivatives:
-            return Linearisation(response, _NOTHING, _NOTHING, _NOTHING)
+        else:
+            parameters, by_local = self._by_nuisances(number, point, candidate)
         effect = np.zeros((candidate.size, *response.shape))
         steps = np.full(candidate.size, PARAMETER_STEP)
         if effect_steps is not None:
             steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
-        for k in range(candidate.size):
+        for k, step in enumerate(steps.tolist()):
             if kind in candidate.acting(k):
-                ends = []
-                for step in (steps[k], -steps[k]):
-                    patched = candidate.patch(self.setting, moved(point.effect, k, step))
-                    ends.append(self.response(number, shared, local, patched)[0])
-                effect[k] = (ends[0] - ends[1]) / (2.0 * steps[k])
+                ends = [replace(point, effect=moved(point.effect, k, side * step)) for side in (1.0, -1.0)]
+                above, below = (self.answer(number, end, candidate) for end in ends)
+                effect[k] = (above - below) / (2.0 * step)
         return Linearisation(response, parameters, by_local, effect)
 
-    def _by_nuisances(
-        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch
-    ) -> tuple[FloatArray, FloatArray]:
+    def _by_nuisances(self, number: int, point: Point, candidate: Candidate) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives by the calibrated parameters and by the trial's own unknowns but zeros."""
+        data, shared, local = self.trials[number], point.shared, point.local[number]
+        acts = data.trial.kind in candidate.acts_on
+        patch = candidate.patch(self.setting, point.effect) if acts else ModelPatch()
         response, rates = self.response(number, shared, local, patch)
-        data = self.trials[number]
         unknowns = data.unknowns
         first, _, last, at = unknowns.ends
 

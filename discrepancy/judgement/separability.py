@@ -100,9 +100,7 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     trials: list[Trial] = []
     predicted = {}
     for number, data in enumerate(problem.trials):
-        response, _ = problem.response(
-            number, point.shared, point.local[number], Candidate().patch(setting, point.effect)
-        )
+        response = problem.answer(number, point, Candidate())
         predicted[data.trial.name] = problem.prediction(number, point, response)
     for trial in campaign.trials:
         values = predicted.get(trial.name)
