@@ -81,8 +81,8 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
     slips at nothing is a soft one. An effect's size may be what it will. Conservative: estimates scatter less
     than the prior.
     """
-    count = len(problem.shared.parameter_mean)
-    proper = problem.shared.gain_precision > 0.0
+    count = problem.shared.count
+    proper = problem.shared.precision[count:] > 0.0
     groups = {
         "calibrated parameters beside their priors": fit.point.shared[:count],
         "gains beside their priors": fit.point.shared[count:][proper],

@@ -232,8 +232,7 @@ class Problem:
             return (self.response(number, by_shared, by_local, patch)[0] - response) / step
 
         parameters = [
-            slope(moved(shared, k, SHARED_STEP), local, SHARED_STEP)
-            for k in range(len(self.shared.parameter_mean))
+            slope(moved(shared, k, SHARED_STEP), local, SHARED_STEP) for k in range(self.shared.count)
         ]
         columns = [slope(shared, moved(local, k)) for k in range(first, last)]
         if unknowns.has_time_zero:
@@ -282,10 +281,11 @@ class Problem:
         shape = parts.response.shape
         zeros, of_gains = np.zeros((unknowns.zeros, *shape)), np.zeros((len(known), *shape))
         zeros[np.arange(len(zeros)), :, unknowns.zero_columns] = unknowns.scale[: len(zeros), np.newaxis]
-        of_gains[np.arange(len(known)), :, column] = (parts.response[:, column] * shared.gain_scale[known]).T
+        of_gains[np.arange(len(known)), :, column] = (
+            parts.response[:, column] * shared.scale[shared.count + known]
+        ).T
         found = (zeros, parts.local * gains, parts.parameters * gains, of_gains, parts.effect[acting] * gains)
-        count = len(parts.parameters)
-        index = np.concatenate((np.arange(count), count + known, shared.size + acting))
+        index = np.concatenate((np.arange(shared.count), shared.count + known, shared.size + acting))
         return np.concatenate(found), index
 
     # -------------------------------------------------------------------------- likelihood

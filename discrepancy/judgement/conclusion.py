@@ -156,7 +156,8 @@ def calibrated_parameters(problem: Problem, found: Hypothetic) -> tuple[Calibrat
     """Return the calibrated parameters of the model as a hypothesis has them, within the model's range."""
     layout = problem.shared
     values = layout.parameters(found.shared)
-    spread = layout.parameter_scale * np.sqrt(np.maximum(np.diag(found.covariance)[: len(values)], 0.0))
+    variance = np.diag(found.covariance)[: layout.count]
+    spread = layout.scale[: layout.count] * np.sqrt(np.maximum(variance, 0.0))
     return tuple(
         CalibratedParameter(item.name, float(value), float(deviation), item.unit)
         for item, value, deviation in zip(problem.model.parameters, values, spread, strict=True)

@@ -188,7 +188,7 @@ class Court:
             return said("against.where_fitted", part=part(inside))
         if self.has_held_out and not self._survives(item, self.least_end):
             return said("against.not_fitted", part=part(self.share(item, held_out=True)))
-        count = len(item.shared) - len(self.problem.shared.gain_channels)
+        count = self.problem.shared.count
         proper = self.problem.shared.precision > 0.0
         for what, own in (("calibrated parameters", slice(count)), ("gains", slice(count, None))):
             u = item.shared[own][proper[own]]
