@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from calibration.dynamics.trials import Frequencies, fit_trials
+from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError
 from calibration.joint.measurement import measured_modes
 from calibration.joint.posterior import joint_posterior
@@ -55,7 +55,7 @@ class Wing:
     readings: tuple[Reading, ...]
 
 
-def measure(model: ReducedModel, seed: int, model_error: tuple[float, float], procedure: Frequencies) -> Wing:
+def measure(model: ReducedModel, seed: int, model_error: tuple[float, float], *, free: bool) -> Wing:
     generator = np.random.default_rng([2021, seed])
     truth = prior_samples(wing_priors(model.validity, **DAMPING), 1, int(generator.integers(2**32)))[0]
     state = DigitalState(Geometry(), *truth.tolist())
@@ -65,7 +65,7 @@ def measure(model: ReducedModel, seed: int, model_error: tuple[float, float], pr
     return Wing(
         truth,
         measure_load_test(bench, seed),
-        (weigh(state, seed), *measured_modes(fit_trials(records, procedure))),
+        (weigh(state, seed), *measured_modes(fit_trials(records, free=free))),
     )
 
 
@@ -91,14 +91,13 @@ def main() -> int:
     priors = wing_priors(model.validity, **DAMPING)
     of_wings = (0.0, 0.0) if given.exact_model else MODEL_ERROR
     assumed = (0.0, 0.0) if given.trusting else MODEL_ERROR
-    procedure = Frequencies.PEAKS if given.peaks else Frequencies.FITTED
     held, held_paper, widths, ratios = [], [], [], []
     not_seen = refused = refused_paper = 0
     seconds = dict.fromkeys(("measuring and fitting", "joint posterior", "paper's procedure"), 0.0)
     for seed in range(given.first_seed, given.first_seed + given.wings):
         begin = time.perf_counter()
         try:
-            wing = measure(model, seed, of_wings, procedure)
+            wing = measure(model, seed, of_wings, free=not given.peaks)
         except ExperimentDataError:
             not_seen += 1
             continue
@@ -114,7 +113,7 @@ def main() -> int:
             continue
         seconds["joint posterior"] += time.perf_counter() - begin
         tail = 0.5 * (1.0 - PROBABILITY)
-        lower, upper = np.quantile(result.samples, [tail, 1.0 - tail], axis=0)
+        lower, upper = np.quantile(result, [tail, 1.0 - tail], axis=0)
         held.append((lower <= wing.truth) & (wing.truth <= upper))
         widths.append(upper - lower)
         begin = time.perf_counter()

@@ -2,11 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from calibration.sentences import said
 from reporting.table_file import TableErrors, TextTable, read_table
 
 from .errors import ExperimentDataError, ExperimentFileError
@@ -16,29 +12,6 @@ LAB_ERRORS = TableErrors(layout=ExperimentFileError, value=ExperimentDataError)
 
 # Where the folders of the steps lie in the authors' repository, seen from what a user may call its folder.
 _FOLDERS_OF_STEPS = (Path(), Path("datafiles"), Path("src") / "datafiles")
-
-
-def keep_vectors(record: Any, *names: str) -> None:
-    """Make fields of a frozen record vectors that cannot be written, of one length and finite.
-
-    Raises
-    ------
-    ExperimentDataError
-        If one is not; the sentence begins with the record's `source`.
-    """
-    for name in names:
-        column = np.array(getattr(record, name), dtype=np.float64)
-        column.setflags(write=False)
-        object.__setattr__(record, name, column)
-        beside = getattr(record, names[0]).shape
-        if column.ndim != 1 or column.shape != beside:
-            all_of_them, shapes = " and ".join(names), (str(column.shape), str(beside))
-            of = {"record": record, "names": all_of_them, "name": name}
-            raise ExperimentDataError(said("readings.shapes", **of, shapes=shapes))
-        wrong = np.flatnonzero(~np.isfinite(column))
-        if wrong.size:
-            found = wrong[0] + 1, column[wrong[0]]
-            raise ExperimentDataError(said("readings.lost", record=record, name=name, found=found))
 
 
 def places_of(folder: Path, name: Path) -> Iterator[Path]:

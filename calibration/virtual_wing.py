@@ -21,7 +21,7 @@ from calibration.static.experiments import (
     LoadDisplacementData,
     published_measurements,
 )
-from calibration.static.posterior import MOST_SAMPLES, Seed, child_seed
+from calibration.static.posterior import Seed, child_seed
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState, Geometry
@@ -37,6 +37,9 @@ SENSITIVITY = 50.0
 RECORDED_GAUGE = 23
 """The gauge whose strain is recorded, counted from 1: a released tip moves mode 2 by a quarter of mode
 1 there, the higher modes hardly; nearer to the root mode 2 is lost behind mode 1."""
+
+MOST_SAMPLES = 10_000_000
+"""Most samples of all records: beyond, they need gigabytes and tell nothing more."""
 
 _PURPOSES = {"load": 31, "ring_down": 32, "geometry": 33, "weighing": 34}
 

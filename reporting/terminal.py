@@ -22,6 +22,7 @@ import reporting.progress
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from reporting.page import Words
     from reporting.progress import Progress
 
 INTERRUPTED = 130
@@ -97,10 +98,34 @@ def console() -> "Console":
     return Console(highlight=False, markup=False, width=width, quiet=loudness.quiet)
 
 
-def say(text: str, *, bold: bool | None = None) -> None:
-    """Print a line of the result, unless `--quiet`."""
+def say(text: str, **look: Any) -> None:
+    """Print a line of the result, unless `--quiet`; it may be `bold`, or have a colour `fg`."""
     if not loudness.quiet:
-        typer.secho(text, bold=bold)
+        typer.secho(text, **look)
+
+
+def show(command: str, words: "Words", **values: Any) -> None:
+    """Print what a command found as `[printed]` of a file of words says.
+
+    It lists blocks as `Words.told` takes them. A row of a table with `colours` has that of its first cell of
+    which they hold one.
+    """
+    for kind, what in words.told(words.content["printed"][command], **values):
+        if kind == "table":
+            name, table = what
+            colours = words.content["tables"][name].get("colours", {})
+            styles = [next((colours[cell] for cell in row if cell in colours), "") for row in table.rows]
+            print_table([column.name for column in table.columns], table.rows, styles)
+        else:
+            say(what, fg="yellow" if kind == "notice" else None)
+
+
+def answer(command: str, words: "Words", record: Mapping[str, Any], *, json: bool, **values: Any) -> None:
+    """Print a record as JSON, or as `show` does."""
+    if json:
+        print_json(record)
+    else:
+        show(command, words, record=record, **values)
 
 
 def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], colours: Iterable[str] = ()) -> None:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.xdist_group("wing")
 
 
 @pytest.mark.long
-def test_the_error_reward_with_and_without_the_load_factor() -> None:
+def test_the_error_reward_with_and_without_the_load_factor():
     scenario = load_scenario("paper_level_turns").scenario
     source = ReducedModelSource(scenario, reduced_model())
     known = prepare_knowledge(scenario, source, scenario.mission.seed)
@@ -39,7 +39,7 @@ def test_the_error_reward_with_and_without_the_load_factor() -> None:
     assert mean(load_factor[flight.control_index]) == pytest.approx(divided, abs=5e-4)
 
 
-def test_the_largest_strain_error_and_what_it_does_to_the_nearest_state(published_library: Path) -> None:
+def test_the_largest_strain_error_and_what_it_does_to_the_nearest_state(published_library):
     library = load_strain_library(published_library)
     states = library.states.coordinates
     sharp = library.controls.index("3g")

@@ -263,9 +263,7 @@ def calibrated_wing(
     "name",
     [pytest.param(page, marks=pytest.mark.long if page in MINUTES else ()) for page in sorted(WITH_PYTHON)],
 )
-def test_the_blocks_of_a_page_run_as_printed(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_the_blocks_of_a_page_run_as_printed(name, tmp_path, monkeypatch, request):
     for prepare in READER_HAS.get(name, ()):
         prepare(tmp_path)
     if name in MADE_ONCE:

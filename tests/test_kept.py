@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -27,33 +26,34 @@ def once(source: Path, inputs: object = None) -> tuple[str, bool]:
     return shared.kept("text", build, (source.parents[1],), inputs), bool(made)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda source: source.write_text("two", encoding="utf-8"),
-        lambda source: (source.parent / "further.txt").touch(),
-        lambda source: (
-            source.rename(source.with_name("other.txt")) and source.write_text("", encoding="utf-8")
-        ),
-    ],
-)
-def test_a_changed_source_never_meets_what_was_kept(source: Path, change: Callable[[Path], object]) -> None:
+def moved(source, monkeypatch):
+    source.rename(source.with_name("other.txt"))
+    source.write_text("", encoding="utf-8")
+
+
+def torn(source, monkeypatch):
+    for file in shared.FOLDER.glob("*.pickle"):
+        file.write_bytes(file.read_bytes()[:5])
+
+
+CHANGES = [
+    lambda source, _: source.write_text("two", encoding="utf-8"),
+    lambda source, _: (source.parent / "further.txt").touch(),
+    moved,
+    torn,
+    lambda _, monkeypatch: monkeypatch.setattr(shared, "_surroundings", lambda: b"another numpy"),
+]
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_was_kept_is_met_until_something_changes(source, monkeypatch, change):
     assert once(source) == ("one", True)
     assert once(source) == ("one", False)
     assert once(source, inputs=1.5) == ("one", True)
-    change(source)
+    change(source, monkeypatch)
     assert once(source) == (source.read_text(encoding="utf-8"), True)
 
 
-def test_other_packages_or_a_torn_file_make_it_anew(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert once(source) == ("one", True)
-    for file in shared.FOLDER.glob("*.pickle"):
-        file.write_bytes(file.read_bytes()[:5])
-    assert once(source) == ("one", True)
-    monkeypatch.setattr(shared, "_surroundings", lambda: b"another numpy")
-    assert once(source) == ("one", True)
-
-
-def test_of_several_processes_one_makes_it(source: Path) -> None:
+def test_of_several_processes_one_makes_it(source):
     with get_context("fork").Pool(4) as pool:
         assert sorted(pool.map(once, [source] * 8)) == [("one", False)] * 7 + [("one", True)]

@@ -117,38 +117,21 @@ def _interruptible(fly: "Callable[[], RunOutcome]", folder: Path) -> "RunOutcome
 
 def show_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
-    console = terminal.console()
-    referred = any(figure.reference is not None for figure in outcome.figures)
+    from reporting.page import Words
+
     rows: list[list[str]] = []
     sources: dict[str, int] = {}
     for figure in outcome.figures:
         reference = _shown(figure.reference, figure.unit)
         if figure.reference_source:
             reference += f" ({sources.setdefault(figure.reference_source, len(sources) + 1)})"
-        rows.append([figure.title, _shown(figure.value, figure.unit, "none"), *[reference] * referred])
+        rows.append([figure.title, _shown(figure.value, figure.unit, "none"), reference])
     for part in ("asset", "twin", "checkpoint"):
-        entry = outcome.timing.get(f"{part}_seconds")
-        if entry:
-            median, largest = 1e3 * entry["median"], 1e3 * entry["largest"]
-            rows.append([f"{part}, per {outcome.step_name}", f"{median:.3g} ms (largest {largest:.3g} ms)"])
-    rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s"])
-    terminal.print_table(["figure", "this run", *["reference"] * referred], rows)
-    console.print(f"The twin {outcome.control}.", soft_wrap=True)
-    if outcome.origin.differ:
-        console.print(
-            f"Asset and twin's model differ: flown was the {outcome.origin.asset}, and the twin believes the "
-            f"{outcome.origin.model}.",
-            soft_wrap=True,
-        )
-    for sentence in outcome.notices:
-        said = sentence.replace(" DIR", f" {outcome.folder}")
-        console.print(said, soft_wrap=True, markup=False, highlight=False, style="yellow")
-    for source, number in sources.items():
-        console.print(f"  ({number}) {source}", soft_wrap=True)
-    if outcome.report is None:
-        console.print(f"Run: {outcome.folder}", soft_wrap=True)
-    else:
-        console.print(f"Report: {outcome.report}", soft_wrap=True)
+        if entry := outcome.timing.get(f"{part}_seconds"):
+            taken = f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)"
+            rows.append([f"{part}, per {outcome.step_name}", taken, ""])
+    rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s", ""])
+    terminal.show("run", Words("twin_master"), outcome=outcome, rows=rows, sources=sources)
 
 
 def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str:

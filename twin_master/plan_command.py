@@ -35,6 +35,7 @@ def plan(
 ) -> None:
     """Plan on the belief: expected return with its bounds, beside simpler rules."""
     from reporting.files import atomic_write_bytes
+    from reporting.page import Words
     from twin_master.mission.planning import compared, policy_file, risk_of
     from twin_master.report.plan import plan_figure
 
@@ -59,10 +60,7 @@ def plan(
         rows.append(replace(without, name=f"planned without {value_of}"))
         record["value"] = {"of": value_of, "mean": worth.mean, "half_width": worth.half_width}
     record["rules"] = {row.name: [row.mean, row.half_width] for row in rows}
-    if json:
-        terminal.print_json(record)
-        return
-    _show(record, rows)
+    terminal.answer("plan", Words("twin_master"), record, json=json)
 
 
 def _knowledge(
@@ -143,17 +141,6 @@ def _draw(path: Path, figure: "Figure") -> None:
     atomic_write_bytes(path, to_png(figure) if path.suffix.lower() == ".png" else to_svg(figure))
 
 
-def _show(record: Mapping[str, Any], rows: "list[ComparedPolicy]") -> None:
-    told = [(row.name, f"{row.mean:.4g}", f"{row.half_width:.2g}") for row in rows]
-    terminal.print_table(("rule", "expected return", "± (95 %)"), told)
-    lower, upper = record["lower"], record["upper"]
-    terminal.say(f"Bounds of the return: {lower:.5g} to {upper:.5g}, a gap of {upper - lower:.2g}.")
-    terminal.say(f"Beyond a health limit: {100.0 * record['beyond_limit']:.2g} % of the turns, discounted.")
-    if "value" in record:
-        value = record["value"]
-        terminal.say(f"{value['of']} is worth {value['mean']:.3g} ± {value['half_width']:.2g} (95 %).")
-
-
 def design(
     scenario: str,
     *,
@@ -167,6 +154,7 @@ def design(
     json: bool = False,
 ) -> None:
     """Choose the sensors that tell most of the state, and name what none of them separates."""
+    from reporting.page import Words
     from twin_master.mission.sensor_design import chosen_sensors, drawn_readings, separations
 
     knowledge, places = _knowledge(scenario, None, calibration, candidates)
@@ -191,16 +179,7 @@ def design(
         compared = {"chosen": few, "all": every, "all beyond chosen": every.beyond(few)}
         record["worth"] = {what: [one.mean, one.half_width] for what, one in compared.items()}
     _draw_design(picture, vtu, places, record, found.sensors)
-    if json:
-        terminal.print_json(record)
-        return
-    for name, told in zip(names, found.information, strict=True):
-        terminal.say(f"{name}: {told:.3f} bit with those before it.")
-    terminal.say(f"All {len(pool)} candidates: {found.of_all:.3f} bit.")
-    for pair in record["not_separated"]:
-        terminal.say(f"No gauge separates {pair}: less than one standard deviation by all candidates.")
-    for what, (mean, half) in record.get("worth", {}).items():
-        terminal.say(f"Expected return, {what}: {mean:.4g} ± {half:.2g} (95 %).")
+    terminal.answer("design", Words("twin_master"), record, json=json, candidates=len(pool))
 
 
 def _between(knowledge: "Knowledge", name: str, level: int) -> str:

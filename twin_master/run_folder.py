@@ -39,13 +39,13 @@ def to_json(record: Mapping[str, Any]) -> str:
     return json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def is_run_folder(folder: Path) -> bool:
-    """Return whether a folder holds a run."""
+def folder_config(folder: Path, *kinds: str) -> dict[str, Any] | None:
+    """Return the configuration of a folder of one of some kinds, by default a run; None where it is none."""
     try:
         record = read_json(folder / CONFIG_NAME, NotResumableError)
     except NotResumableError:
-        return False
-    return isinstance(record, dict) and record.get("kind") == KIND
+        return None
+    return record if isinstance(record, dict) and record.get("kind") in (kinds or (KIND,)) else None
 
 
 @contextmanager
@@ -56,7 +56,7 @@ def create_run_folder(
     *,
     replace: bool = False,
 ) -> Iterator[None]:
-    """Make a run folder that holds its configuration and copies of what is flown, in one step, and hold it.
+    """Make a folder that holds its configuration and copies of what is flown, in one step, and hold it.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def create_run_folder(
     files
         Further files: path inside the folder, content.
     replace
-        Put the new folder in the place of an existing run folder. Anything else is never replaced.
+        Put the new folder in the place of an existing one of its kind. Anything else is never replaced.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def create_run_folder(
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
     occupied = folder.is_dir() and any(folder.iterdir())
-    if occupied and not is_run_folder(folder):
+    if occupied and folder_config(folder, config["kind"]) is None:
         raise RunFolderExistsError(said("run_folder.foreign", folder=folder))
     if occupied and not replace:
         raise RunFolderExistsError(said("run_folder.there", folder=folder))
@@ -104,9 +104,9 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     if not folder.is_dir():
         raise NotResumableError(said("run_folder.none", folder=folder))
-    if not is_run_folder(folder):
+    config = folder_config(folder)
+    if config is None:
         raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
-    config: dict[str, Any] = read_json(folder / CONFIG_NAME, NotResumableError)
     for name in ("scenario", "scenario_file", "provenance", "inputs"):
         if not isinstance(config.get(name, {} if name == "inputs" else None), dict):
             raise NotResumableError(said("run_folder.damaged", path=folder / CONFIG_NAME, name=name))

@@ -110,11 +110,10 @@ def calibrate_wing(
     if out is not None:
         parts.check_folder(out, name, wing=True)
     targets: Literal["measured", "published"] = "measured" if measured else "published"
-    frequencies = parts.Frequencies.FITTED if fitted else parts.Frequencies.PEAKS
     if data is None:
         lab = parts.published_data()
     else:
-        lab = parts.read_lab_folder(data, None if measured is None else targets, frequencies)
+        lab = parts.read_lab_folder(data, None if measured is None else targets, free=fitted)
     if not json:
         for origin in lab.origins:
             terminal.say(f"Step {origin.step}: {origin.text}.")
@@ -137,9 +136,8 @@ def calibrate_ringdown(
     start: float | None = None,
 ) -> None:
     """Natural frequencies and damping ratios of two modes from ring-down records."""
-    procedure = parts.Frequencies.FITTED if fitted else parts.Frequencies.PEAKS
     start = parts.FIRST_PEAK if start is None else start
-    trials = parts.fit_trials(parts.read_records(data), procedure, start=start)
+    trials = parts.fit_trials(parts.read_records(data), free=fitted, start=start)
     if extremes:
         trials = parts.refine_by_extremes(trials)
     frequencies, ratios = parts.PUBLISHED_FREQUENCIES, parts.PUBLISHED_DAMPING_RATIOS
@@ -150,10 +148,15 @@ def calibrate_ringdown(
             (
                 f"mode {mode + 1}, natural frequency",
                 "Hz",
-                *trials.average("frequency", mode),
+                *parts.average(trials, "frequency", mode),
                 frequencies[mode],
             ),
-            (f"mode {mode + 1}, damping ratio", "1", *trials.average("damping_ratio", mode), ratios[mode]),
+            (
+                f"mode {mode + 1}, damping ratio",
+                "1",
+                *parts.average(trials, "damping_ratio", mode),
+                ratios[mode],
+            ),
         )
     ]
     headings = ("figure", "unit", "found", "between trials", "standard error", "paper")

@@ -11,30 +11,17 @@ if TYPE_CHECKING:
 
 
 def show(command: str, *, words: "Words | None" = None, **values: Any) -> None:
-    """Print what a command found as `[printed]` of a file of words says, by default `words.toml` here.
-
-    It lists blocks as `Words.told` takes them. A row of a table with `colours` has that of its first cell of
-    which they hold one.
-    """
+    """Print what a command found, see `terminal.show`; by default in the words of this package."""
     from reporting.page import Words
 
-    words = words or Words("uav_twin")
-    for kind, what in words.told(words.content["printed"][command], **values):
-        if kind == "table":
-            name, table = what
-            colours = words.content["tables"][name].get("colours", {})
-            styles = [next((colours[cell] for cell in row if cell in colours), "") for row in table.rows]
-            terminal.print_table([column.name for column in table.columns], table.rows, styles)
-        else:
-            terminal.say(what)
+    terminal.show(command, words or Words("uav_twin"), **values)
 
 
 def answer(command: str, record: dict[str, Any], *, json: bool, **values: Any) -> None:
     """Print a record as JSON, or as `show` does."""
-    if json:
-        terminal.print_json(record)
-    else:
-        show(command, record=record, **values)
+    from reporting.page import Words
+
+    terminal.answer(command, Words("uav_twin"), record, json=json, **values)
 
 
 def refused(text: str) -> typer.Exit:

@@ -5,7 +5,7 @@ from calibration.dynamics.records import read_records as read_records
 from calibration.dynamics.trials import FIRST_PEAK as FIRST_PEAK
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS as PUBLISHED_DAMPING_RATIOS
 from calibration.dynamics.trials import PUBLISHED_FREQUENCIES as PUBLISHED_FREQUENCIES
-from calibration.dynamics.trials import Frequencies as Frequencies
+from calibration.dynamics.trials import average as average
 from calibration.dynamics.trials import fit_trials as fit_trials
 from calibration.dynamics.trials import refine_by_extremes as refine_by_extremes
 from calibration.result.file import check_folder as check_folder

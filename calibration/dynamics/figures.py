@@ -7,16 +7,16 @@ from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from reporting.figures import OBSERVED, PAST, PREDICTION, PRESENT, panel_label, panels, publication_style
 
-from .trials import ModalFigure, RingDownFit, RingDownTrials, amplitude_dependence, spectrum
+from .trials import Fits, ModalFigure, RingDownFit, amplitude_dependence, average, spectrum
 
 
 @publication_style()
-def ring_down_figure(trials: RingDownTrials) -> Figure:
+def ring_down_figure(trials: Fits) -> Figure:
     """Draw the first trial with its two modes, all spectra, and the first mode over its amplitude."""
     figure, ((record, spectra), lower) = panels(2, 2, 4.8, 0.29, 0.43, left=0.075, wspace=0.26, hspace=0.48)
-    _draw_record(record, trials.fits[0])
+    _draw_record(record, trials[0])
     _draw_spectra(spectra, trials)
-    points = [point for fit in trials.fits for point in amplitude_dependence(fit)]
+    points = [point for fit in trials for point in amplitude_dependence(fit)]
     amplitude = [point.amplitude * 1e3 for point in points]
     shown: tuple[tuple[Axes, ModalFigure, float, str, str, str], ...] = (
         (lower[0], "frequency", 1.0, "natural frequency (Hz)", "c", "First mode within windows of 0.8 s"),
@@ -26,7 +26,7 @@ def ring_down_figure(trials: RingDownTrials) -> Figure:
         axes.semilogx(
             amplitude, [scale * getattr(point, name) for point in points], "o", color=OBSERVED, ms=2.4
         )
-        axes.axhline(scale * trials.average(name, 0).mean, color=PAST, lw=1.0, label="whole record")
+        axes.axhline(scale * average(trials, name, 0).mean, color=PAST, lw=1.0, label="whole record")
         axes.set(xlabel="amplitude of the first mode (mV)", ylabel=ylabel)
         axes.xaxis.set_major_formatter(ScalarFormatter())
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -49,14 +49,14 @@ def _draw_record(axes: Axes, fit: RingDownFit) -> None:
     panel_label(axes, "a", "First trial")
 
 
-def _draw_spectra(axes: Axes, trials: RingDownTrials) -> None:
-    spectra = [spectrum(fit.record) for fit in trials.fits]
+def _draw_spectra(axes: Axes, trials: Fits) -> None:
+    spectra = [spectrum(fit.record) for fit in trials]
     for number, (frequency, amplitude) in enumerate(spectra):
         label = f"{len(spectra)} trials" if number == 0 else None
         axes.semilogy(frequency, amplitude * 1e3, color=OBSERVED, lw=0.5, alpha=0.6, label=label)
     for mode, name, style in ((0, "first", "--"), (1, "second", ":")):
         axes.axvline(
-            trials.average("frequency", mode).mean, color=PAST, lw=0.8, ls=style, label=f"{name} mode"
+            average(trials, "frequency", mode).mean, color=PAST, lw=0.8, ls=style, label=f"{name} mode"
         )
     top = 1e3 * max(float(amplitude.max()) for _, amplitude in spectra)
     axes.set(xlim=(0.0, float(spectra[-1][0][-1])), ylim=(2e-4 * top, 2.0 * top))

@@ -186,58 +186,55 @@ _Found = tuple[_Poles, Callable[[list[int]], list[FloatArray]]]
 """Poles, and what gives the covariances of the values of some of them."""
 
 
+def _hankel(correlation: FloatArray) -> FloatArray:
+    """Return the block Hankel matrix (L C, L C) of correlations (2 L, C, C) from lag one on, C channels."""
+    lags, count = len(correlation) // 2, correlation.shape[1]
+    place = np.arange(lags)[:, None] + np.arange(lags)
+    return np.asarray(correlation[place].transpose(0, 2, 1, 3).reshape(lags * count, lags * count))
+
+
 class _Subspace:
-    """Singular vectors of the block Hankel matrix of correlations (2 L, C, C) from lag one on, C channels."""
+    """What the correlations of a record (2 L, C, C) say of systems of any order."""
 
     def __init__(self, correlation: FloatArray, rate: float) -> None:
         self._correlation, self._rate = correlation, rate
-        self._left, self._singular, right = np.linalg.svd(self._hankel(correlation))
-        self._right = right.T
+        _, self._singular, self._right = np.linalg.svd(_hankel(correlation))
 
-    @staticmethod
-    def _hankel(correlation: FloatArray) -> FloatArray:
-        lags, count = len(correlation) // 2, correlation.shape[1]
-        place = np.arange(lags)[:, None] + np.arange(lags)
-        return np.asarray(correlation[place].transpose(0, 2, 1, 3).reshape(lags * count, lags * count))
-
-    def _modal(self, left: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Return eigenvalues (n,), their vectors (n, n) and shapes (C, n), of a basis (L C, n)."""
-        count = self._correlation.shape[1]
-        observability = left * np.sqrt(self._singular[: left.shape[1]])
+    def _modal(self, correlation: FloatArray, basis: FloatArray) -> tuple[ComplexArray, ...]:
+        """Return poles (n,) [1/s], eigenvectors (n, n) and shapes (C, n) as seen on a basis (L C, n)."""
+        count = correlation.shape[1]
+        observability = _hankel(correlation) @ basis
         transition = np.linalg.lstsq(observability[:-count], observability[count:], rcond=None)[0]
         eigenvalue, vector = np.linalg.eig(transition.astype(np.complex128))
-        return eigenvalue, vector, observability[:count] @ vector
+        return np.log(eigenvalue) * self._rate, vector, observability[:count] @ vector
+
+    def _basis(self, order: int) -> FloatArray:
+        """Return right singular vectors over the roots of their values (L C, order)."""
+        return np.asarray(self._right[:order].T / np.sqrt(self._singular[:order]))
 
     def poles(self, order: int, variance: FloatArray | float = 1.0) -> tuple[_Poles, float]:
         """Return the poles of the system of an order, and its mean square misfit over the variance.
 
         `variance` (2 L, C, C) is that of the correlations; without it nothing tells poles from noise.
         """
-        eigenvalue, vector, shape = self._modal(self._left[:, :order])
-        count = self._correlation.shape[1]
-        control = np.sqrt(self._singular[:order])[:, None] * self._right[:count, :order].T
-        part = np.linalg.solve(vector, control.astype(np.complex128))
-        powers = eigenvalue ** np.arange(len(self._correlation))[:, None]
+        basis, count = self._basis(order), self._correlation.shape[1]
+        pole, vector, shape = self._modal(self._correlation, basis)
+        part = np.linalg.solve(vector, (basis[:count] * self._singular[:order]).T.astype(np.complex128))
+        powers = np.exp(np.multiply.outer(np.arange(len(self._correlation)) / self._rate, pole))
         each = np.einsum("cn,ln,nd->nlcd", shape, powers, part)
-        inside = eigenvalue.imag > 0.0
+        inside = pole.imag > 0.0
         left, alone = self._correlation - each.sum(axis=0).real, 2.0 * each[inside].real
         seen = np.sum(((left + alone) ** 2 - left**2) / variance, axis=(1, 2, 3))
         share = np.sqrt(np.sum(np.abs(each[inside]) ** 2, axis=(1, 2, 3)))
-        pole = np.asarray(np.log(eigenvalue[inside]) * self._rate, dtype=np.complex128)
-        found = _Poles(pole, shape.T[inside], share, seen, len(self._correlation))
+        found = _Poles(pole[inside], shape.T[inside], share, seen, len(self._correlation))
         return found, float(np.mean(left**2 / variance))
 
     def moved(self, change: FloatArray, order: int, poles: ComplexArray) -> _Poles:
-        """Return poles under a small change of the correlations; singular vectors to first order."""
-        within, beyond = slice(None, order), slice(order, None)
-        turned = self._left.T @ self._hankel(change) @ self._right
-        s, rest = self._singular[within], self._singular[beyond, None]
-        mixed = (turned[beyond, within] * s + rest * turned[within, beyond].T) / (s**2 - rest**2)
-        eigenvalue, _, shape = self._modal(self._left[:, within] + self._left[:, beyond] @ mixed)
-        pole = np.log(eigenvalue) * self._rate
+        """Return poles under a small change of the correlations, seen on the same basis."""
+        pole, _, shape = self._modal(self._correlation + change, self._basis(order))
         nearest = np.argmin(np.abs(pole - poles[:, None]), axis=1)
         ones = np.ones(len(poles))
-        return _Poles(np.asarray(pole[nearest], dtype=np.complex128), shape.T[nearest], ones, ones, 1)
+        return _Poles(pole[nearest], shape.T[nearest], ones, ones, 1)
 
 
 def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.lab_folder import LAB_ERRORS, keep_vectors, places_of
+from calibration.lab_folder import LAB_ERRORS, places_of
 from calibration.sentences import said
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
@@ -52,8 +52,8 @@ class RingDownRecord:
     Raises
     ------
     ExperimentDataError
-        If values are lost or not finite, the record is shorter than `MINIMUM_COUNT`, time does not run
-        evenly upwards, or the signal stands still at an extreme for 3 ms, as a clipped one does.
+        If the record is shorter than `MINIMUM_COUNT`, time does not run evenly upwards, or the signal stands
+        still at an extreme for 3 ms, as a clipped one does.
     """
 
     time: NDArray[np.float64]
@@ -64,8 +64,6 @@ class RingDownRecord:
     source: str = "unnamed record"
 
     def __post_init__(self) -> None:
-        names = ("time", "signal", "lowest", "highest")
-        keep_vectors(self, *(name for name in names if getattr(self, name) is not None))
         if self.count < MINIMUM_COUNT:
             raise ExperimentDataError(said("record.samples", self=self, least=MINIMUM_COUNT))
         step = np.diff(self.time)

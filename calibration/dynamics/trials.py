@@ -13,7 +13,6 @@ import cmath
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -47,17 +46,6 @@ _STARTING_RATIOS = (0.01, 0.03, 0.08)
 _STEADY_SHARE = 0.7  # rms of the last third over the first; above it nothing decays
 
 
-class Frequencies(Enum):
-    """How the damped frequencies are found.
-
-    `PEAKS` is the authors' procedure: the two highest peaks of the spectrum, held fixed while amplitudes,
-    decay rates and phases are fitted. `FITTED` fits the frequencies along with them.
-    """
-
-    PEAKS = "peaks"
-    FITTED = "fitted"
-
-
 @dataclass(frozen=True, eq=False)
 class RingDownFit:
     """Two modes of one record.
@@ -72,19 +60,23 @@ class RingDownFit:
         The fitted signal [V].
     residual_deviation : float
         Standard deviation of the residuals [V].
-    procedure : Frequencies
-        How the frequencies were found.
+    free : bool
+        Whether the frequencies were fitted, too; else they are those of spectral peaks.
     """
 
     modes: tuple[RingDownMode, RingDownMode]
     record: RingDownRecord
     fitted: NDArray[np.float64]
     residual_deviation: float
-    procedure: Frequencies
+    free: bool
 
 
-def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDownRecord:
-    """Decimate a fast record to about 2 kHz and crop it to begin at `start` [s] (None: as it is).
+Fits = tuple[RingDownFit, ...]
+"""The trials of one wing."""
+
+
+def prepare(record: RingDownRecord, start: float = FIRST_PEAK) -> RingDownRecord:
+    """Decimate a fast record to about 2 kHz and crop it to begin after `start` [s].
 
     Decimation runs forwards and backwards through a low-pass in stages of at most 10, so that it shifts no
     phase. Drift is not taken out here but fitted along with the modes, which biases neither.
@@ -101,14 +93,11 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
         length = record.time[-1] - record.time[0]
         raise ExperimentDataError(said("ringdown.short", record=record, length=length))
     while factor > 1:
-        stage = max(divisor for divisor in range(1, 11) if factor % divisor == 0)
-        if stage == 1:
-            factor -= 1
-            continue
+        stage = min(factor, 10)
         time, signal = time[::stage], np.asarray(decimate(signal, stage, zero_phase=True))
         lowest = highest = None
         factor //= stage
-    after = time > start if start is not None else np.ones(time.shape, dtype=bool)
+    after = time > start
     if np.count_nonzero(after) < 0.25 * time.size:
         left = np.count_nonzero(after), time.size
         raise ExperimentDataError(said("ringdown.cropped", record=record, start=start, left=left))
@@ -174,15 +163,11 @@ def _peaks(record: RingDownRecord, decay: float) -> list[float]:
     return [float(frequency[places[place]]) for place in np.argsort(found["prominences"])[::-1]]
 
 
-def fit_ring_down(
-    record: RingDownRecord,
-    procedure: Frequencies = Frequencies.PEAKS,
-    *,
-    start: float | None = FIRST_PEAK,
-) -> RingDownFit:
+def fit_ring_down(record: RingDownRecord, *, free: bool = False, start: float = FIRST_PEAK) -> RingDownFit:
     """Fit two damped cosines, an offset and a drift to one record by Levenberg-Marquardt.
 
-    Decay rates (and, for `Frequencies.FITTED`, damped frequencies) are the unknowns of the iteration; the
+    The authors hold the damped frequencies fixed at the two highest peaks of the spectrum. Decay rates (and
+    damped frequencies, if they are free) are the unknowns of the iteration; the
     cosine and sine amplitudes, offset and drift are eliminated by linear least squares at each step. Where a
     record holds averages over intervals, the model is averaged over them too, exactly.
 
@@ -190,10 +175,10 @@ def fit_ring_down(
     ----------
     record : RingDownRecord
         One trial, as read.
-    procedure : Frequencies
-        How the frequencies are found.
-    start : float, optional
-        Where the record is cropped [s]; None if it begins at the release already.
+    free : bool
+        Whether the frequencies are fitted along with the rest.
+    start : float
+        Where the record is cropped [s].
 
     Raises
     ------
@@ -204,12 +189,11 @@ def fit_ring_down(
     _refuse_steady(record)
     omega = 2.0 * math.pi * np.array(spectral_peaks(record))
     model = DampedCosines(record.time, record.signal, record.averaging_width)
-    free = procedure is Frequencies.FITTED
     searches = [model.fit((1j - ratio) * omega, frequencies_fitted=free) for ratio in _STARTING_RATIOS]
     found = min(searches, key=lambda search: float(search.deviation[0]))
     first, second = sorted(found.modes, key=lambda mode: mode.pole.imag)
     refuse_growing((first, second), record.source)
-    return RingDownFit((first, second), record, found.fitted[:, 0], float(found.deviation[0]), procedure)
+    return RingDownFit((first, second), record, found.fitted[:, 0], float(found.deviation[0]), free)
 
 
 def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
@@ -246,34 +230,17 @@ class Averaged(NamedTuple):
     standard_error: float
 
 
-@dataclass(frozen=True, eq=False)
-class RingDownTrials:
-    """The trials of one wing.
-
-    Attributes
-    ----------
-    fits : tuple of RingDownFit
-        One for each trial.
-    """
-
-    fits: tuple[RingDownFit, ...]
-
-    def average(self, name: ModalFigure, mode: int) -> Averaged:
-        """Return the natural frequency [Hz] or the damping ratio [1] of mode 0 or 1."""
-        values = [float(getattr(fit.modes[mode], name)) for fit in self.fits]
-        mean = float(np.mean(values))
-        if len(values) == 1:
-            return Averaged(mean, math.nan, self.fits[0].modes[mode].standard_error[name])
-        deviation = float(np.std(values, ddof=1))
-        return Averaged(mean, deviation, deviation / math.sqrt(len(values)))
+def average(trials: Fits, name: ModalFigure, mode: int) -> Averaged:
+    """Return the natural frequency [Hz] or the damping ratio [1] of mode 0 or 1."""
+    values = [float(getattr(fit.modes[mode], name)) for fit in trials]
+    mean = float(np.mean(values))
+    if len(values) == 1:
+        return Averaged(mean, math.nan, trials[0].modes[mode].standard_error[name])
+    deviation = float(np.std(values, ddof=1))
+    return Averaged(mean, deviation, deviation / math.sqrt(len(values)))
 
 
-def fit_trials(
-    records: Sequence[RingDownRecord],
-    procedure: Frequencies = Frequencies.PEAKS,
-    *,
-    start: float | None = FIRST_PEAK,
-) -> RingDownTrials:
+def fit_trials(records: Sequence[RingDownRecord], *, free: bool = False, start: float = FIRST_PEAK) -> Fits:
     """Fit every record, see `fit_ring_down`.
 
     Raises
@@ -283,12 +250,14 @@ def fit_trials(
     """
     if not records:
         raise ExperimentDataError("there is no ring-down record; at least one is needed.")
-    return RingDownTrials(tuple(fit_ring_down(record, procedure, start=start) for record in records))
+    return tuple(fit_ring_down(record, free=free, start=start) for record in records)
 
 
-def amplitude_dependence(
-    fit: RingDownFit, *, window: float = 0.8, step: float = 0.4, first: float = 0.4
-) -> tuple[RingDownMode, ...]:
+WINDOW, STEP, FIRST = 0.8, 0.4, 0.4
+"""Length of a window, shift between two, start of the first, when mode 2 has died away [s]."""
+
+
+def amplitude_dependence(fit: RingDownFit) -> tuple[RingDownMode, ...]:
     """Fit the first mode alone within windows that slide over the record; amplitudes are those in the middle.
 
     A linear wing gives the same frequency and damping ratio in each. Windows in which the mode no longer
@@ -298,28 +267,24 @@ def amplitude_dependence(
     ----------
     fit : RingDownFit
         A fitted record; its first mode is the start of each window.
-    window, step, first : float
-        Length of a window, shift between two, start of the first, when mode 2 has died away [s].
     """
     points = []
     record = fit.record
-    begin = float(record.time[0]) + first
-    while begin + window <= float(record.time[-1]):
-        inside = (record.time >= begin) & (record.time < begin + window)
+    for begin in np.arange(record.time[0] + FIRST, record.time[-1] - WINDOW, STEP).tolist():
+        inside = (record.time >= begin) & (record.time < begin + WINDOW)
         model = DampedCosines(record.time[inside], record.signal[inside], record.averaging_width)
         solution = model.fit(np.array([fit.modes[0].pole]))
         (seen,) = solution.modes
-        seen = seen._replace(wave=seen.wave * cmath.exp(seen.pole * 0.5 * window))
+        seen = seen._replace(wave=seen.wave * cmath.exp(seen.pole * 0.5 * WINDOW))
         if seen.amplitude > 4.0 * float(solution.deviation[0]):
             points.append(seen)
-        begin += step
     return tuple(points)
 
 
 _POINTS = 17  # instants within a column at which the model is evaluated
 
 
-def refine_by_extremes(trials: RingDownTrials) -> RingDownTrials:
+def refine_by_extremes(trials: Fits) -> Fits:
     """Fit amplitudes, phases and decay rates anew to the extremes; damped frequencies stay as found.
 
     Raises
@@ -327,7 +292,7 @@ def refine_by_extremes(trials: RingDownTrials) -> RingDownTrials:
     ExperimentDataError
         If a record has no extremes, or a mode no longer decays.
     """
-    return RingDownTrials(tuple(_refine(fit) for fit in trials.fits))
+    return tuple(map(_refine, trials))
 
 
 def _refine(fit: RingDownFit) -> RingDownFit:

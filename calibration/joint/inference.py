@@ -5,19 +5,18 @@ parameters: a number that was measured of an output (its deviation holds what th
 of a test. Nothing here knows what was measured, or of what.
 """
 
-import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.special import gammaln
+from scipy.special import softmax
+from scipy.stats import multivariate_t
 
 from calibration.errors import PosteriorError
 from calibration.result.record import ParameterPrior
 from calibration.sentences import said
-from calibration.static.posterior import Seed, check_count, child_seed
+from calibration.static.posterior import Seed, child_seed
 
 FloatArray = NDArray[np.float64]
 
@@ -29,48 +28,19 @@ LEAST_EFFECTIVE_SAMPLE_SIZE = 200.0
 
 _FREEDOM = 10.0  # of the Student-t proposals: tails heavier than those of the posterior, a cut-off Gaussian
 _INFLATION = 1.05  # of the proposal's covariance over the posterior's
-_STARTS = 4  # of the search for the optimum: the prior's mean, and draws of it
-_STEP = 1e-7  # of a scaled parameter, for slopes
-_ROUNDS, _MOST_ROUNDS, _ADAPTATION_COUNT = 3, 60, 1000
-_TEMPERED_SHARE = 0.1
-_PROPOSALS_PER_SAMPLE, _FEWEST_PROPOSALS = 20, 4_000
-_MOST_SAMPLES = 100_000  # the proposals of more do not fit into memory
+_PILOT_COUNT, _PROPOSALS_PER_SAMPLE, _FEWEST_PROPOSALS = 2_000, 20, 4_000
+_INSIDE = 0.1  # prior deviations from an end of the range at which the search begins at least
 _PURPOSE = 22  # of the seed
-
-
-class Draws(NamedTuple):
-    """A posterior as samples.
-
-    Attributes
-    ----------
-    samples : (N, P) array
-        Equally weighted samples of the parameters, in no order [their units].
-    mean, standard_deviation : (P,) array
-        Of all weighted draws, closer to the posterior's than those of the samples.
-    proposals : int
-        Weighted draws from which the samples were taken.
-    effective : float
-        (sum w)^2 / sum w^2 of their weights.
-    log_evidence : float
-        Log of the probability density of all readings under the priors.
-    """
-
-    samples: FloatArray
-    mean: FloatArray
-    standard_deviation: FloatArray
-    proposals: int
-    effective: float
-    log_evidence: float
 
 
 def infer(
     priors: tuple[ParameterPrior, ...], compare: Comparison, *, seed: Seed = 0, count: int = 1000
-) -> Draws:
-    """Return the posterior of parameters under everything that was read.
+) -> FloatArray:
+    """Return equally weighted samples (count, P) of the posterior under everything that was read [units].
 
-    The search begins at the most probable parameters; proposals are Student-t densities in coordinates in
-    which the posterior there is round, so that parameters of which the readings tell next to one combination
-    alone are sampled as well as others.
+    Proposals are Student-t densities in coordinates in which the posterior at its optimum is round, so that
+    parameters of which the readings tell next to one combination alone are sampled as well as others. The
+    first draws tell the moments for those that are kept.
 
     Parameters
     ----------
@@ -86,129 +56,43 @@ def infer(
     Raises
     ------
     PosteriorError
-        If `count` is not 1 to 100,000, a prior lies outside its range, or the readings contradict each other
-        so much that no posterior is found.
+        If the readings contradict each other so much that no posterior is found.
     """
-    check_count(count, PosteriorError, most=_MOST_SAMPLES)
-    normaliser = sum(prior.log_share_inside for prior in priors)
     generator = np.random.default_rng(child_seed(seed, _PURPOSE))
-    density = _Density(priors, compare, generator)
-    centre: FloatArray = np.zeros(len(priors))
-    factor: FloatArray = np.eye(len(priors))
-    good, least = 0, _TEMPERED_SHARE * _ADAPTATION_COUNT
-    for _ in range(_MOST_ROUNDS):
-        points, log_weight = density.weighted(centre, factor, _ADAPTATION_COUNT, generator)
-        if np.count_nonzero(np.isfinite(log_weight)) <= least:
-            factor = 0.5 * factor  # most draws lie outside the range
-            continue
-        weight, tempered = _normalised(log_weight), False
-        while _effective(weight) < least:  # they say too little: the next round begins closer
-            log_weight, tempered = 0.5 * log_weight, True
-            weight = _normalised(log_weight)
-        centre = weight @ points
-        deviation = points - centre
-        covariance = (deviation * weight[:, None]).T @ deviation
-        factor = np.asarray(np.linalg.cholesky(_INFLATION * covariance), dtype=np.float64)
-        good += not tempered
-        if good == _ROUNDS:
-            break
-    proposals = max(_FEWEST_PROPOSALS, _PROPOSALS_PER_SAMPLE * count)
-    points, log_weight = density.weighted(centre, factor, proposals, generator)
-    weight = _normalised(log_weight)
-    largest = float(log_weight.max())
-    effective = _effective(weight) if math.isfinite(largest) else 0.0
-    if effective < LEAST_EFFECTIVE_SAMPLE_SIZE:
-        raise PosteriorError(said("joint.effective", effective=effective, proposals=proposals))
-    values = density.values(points)
-    mean = weight @ values
-    chosen = np.searchsorted(np.cumsum(weight), (np.arange(count) + generator.random()) / count)
-    return Draws(
-        samples=values[generator.permutation(np.minimum(chosen, proposals - 1))],
-        mean=mean,
-        standard_deviation=np.sqrt(weight @ (values - mean) ** 2),
-        proposals=proposals,
-        effective=effective,
-        log_evidence=largest + math.log(np.mean(np.exp(log_weight - largest))) + density.scale - normaliser,
-    )
+    mean, deviation, low, high = np.array(
+        [(item.mean, item.deviation, item.low, item.high) for item in priors]
+    ).T
+    ends = (low - mean) / deviation, (high - mean) / deviation
 
-
-class _Density:
-    """The posterior up to its normaliser over z, in which it is round where it is greatest.
-
-    Parameters are mean + deviation u with the prior's moments, and u = optimum + stretch z. `scale` is the
-    log of the volume of u for that of z.
-    """
-
-    def __init__(
-        self, priors: tuple[ParameterPrior, ...], compare: Comparison, generator: np.random.Generator
-    ) -> None:
-        self._compare = compare
-        self._mean, self._deviation, low, high = np.array(
-            [(prior.mean, prior.deviation, prior.low, prior.high) for prior in priors]
-        ).T
-        self._ends = low, high
-        self._low, self._high = (low - self._mean) / self._deviation, (high - self._mean) / self._deviation
-        starts = [np.zeros(len(priors)), *generator.standard_normal((_STARTS - 1, len(priors)))]
-        width = self._high - self._low
-        inside = [np.clip(start, self._low + 1e-6 * width, self._high - 1e-6 * width) for start in starts]
-        limits = self._low, self._high
-        found = [
-            least_squares(lambda u: self._residuals(u[None])[0], start, self._jacobian, limits, x_scale="jac")
-            for start in inside
-        ]
-        best = max(found, key=lambda item: float(self._log_density(item.x[None])[0]))
-        _, singular, rows = np.linalg.svd(best.jac, full_matrices=False)
-        self._optimum, self._stretch = best.x, rows.T / singular
-        self.scale = -float(np.log(singular).sum())
-
-    def values(self, points: FloatArray) -> FloatArray:
-        """Return the parameters of points z (N, P) [their units]."""
-        return self._at(self._optimum + points @ self._stretch.T)
-
-    def _at(self, u: FloatArray) -> FloatArray:
+    def values(u: FloatArray) -> FloatArray:
         # within the range to the last digit, whatever rounding does
-        return np.asarray(np.clip(self._mean + self._deviation * u, *self._ends))
+        return np.asarray(np.clip(mean + deviation * u, low, high))
 
-    def weighted(
-        self, centre: FloatArray, factor: FloatArray, count: int, generator: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return draws z (N, P) of a Student-t density and the logs of their weights; -inf outside."""
-        size = len(centre)
-        standard = generator.standard_normal((count, size))
-        standard /= np.sqrt(generator.chisquare(_FREEDOM, count) / _FREEDOM)[:, None]
-        constant = gammaln(0.5 * (_FREEDOM + size)) - gammaln(0.5 * _FREEDOM)
-        constant -= 0.5 * size * math.log(_FREEDOM * math.pi) + float(np.log(np.diag(factor)).sum())
-        square = np.sum(standard**2, axis=1)
-        log_proposal = constant - 0.5 * (_FREEDOM + size) * np.log1p(square / _FREEDOM)
-        points = centre + standard @ factor.T
-        return points, self._log_density(self._optimum + points @ self._stretch.T) - log_proposal
+    def energy(u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what is squared (N, R + P), and logs of scale (N,), at scaled parameters (N, P)."""
+        difference, spread = compare(values(u))
+        return np.hstack([difference / spread, u]), np.log(spread).sum(axis=1)
 
-    def _log_density(self, u: FloatArray) -> FloatArray:
-        inside = np.all((u >= self._low) & (u <= self._high), axis=1)
-        value = np.full(len(u), -np.inf)
-        if inside.any():
-            difference, deviation = self._compare(self._at(u[inside]))
-            terms = -0.5 * (difference / deviation) ** 2 - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
-            prior = -0.5 * np.sum(u[inside] ** 2, axis=1) - 0.5 * u.shape[1] * math.log(2.0 * math.pi)
-            value[inside] = prior + terms.sum(axis=1)
-        return value
+    start = np.clip(0.0, ends[0] + _INSIDE, ends[1] - _INSIDE)
+    best = least_squares(lambda u: energy(u[None])[0][0], start, bounds=ends, x_scale="jac")
+    _, singular, rows = np.linalg.svd(best.jac, full_matrices=False)
+    stretch = rows / singular[:, None]
 
-    def _residuals(self, u: FloatArray) -> FloatArray:
-        difference, deviation = self._compare(self._at(u))
-        return np.hstack([difference / deviation, u])
+    def drawn(centre: FloatArray, covariance: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
+        """Return draws in round coordinates (N, P) and their weights (N,)."""
+        proposal = multivariate_t(centre, covariance, _FREEDOM)
+        points = proposal.rvs(size, generator).reshape(size, -1)
+        u = best.x + points @ stretch
+        squared, scale = energy(u)
+        log_weight = -0.5 * np.sum(squared**2, axis=1) - scale - proposal.logpdf(points)
+        return points, softmax(np.where(np.all((u >= ends[0]) & (u <= ends[1]), axis=1), log_weight, -np.inf))
 
-    def _jacobian(self, u: FloatArray) -> FloatArray:
-        step = np.where(u + _STEP < self._high, _STEP, -_STEP)
-        residuals = self._residuals(np.vstack([u, u + np.diag(step)]))
-        return np.asarray((residuals[1:] - residuals[0]).T / step)
-
-
-def _normalised(log_weight: FloatArray) -> FloatArray:
-    """Return weights of sum one; all alike where no draw has one."""
-    largest = float(log_weight.max())
-    weight = np.exp(log_weight - largest) if math.isfinite(largest) else np.ones(len(log_weight))
-    return np.asarray(weight / weight.sum())
-
-
-def _effective(weight: FloatArray) -> float:
-    return float(1.0 / np.sum(weight**2))
+    points, weight = drawn(np.zeros(len(priors)), np.eye(len(priors)), _PILOT_COUNT)
+    covariance = _INFLATION * np.cov(points.T, aweights=weight)
+    proposals = max(_FEWEST_PROPOSALS, _PROPOSALS_PER_SAMPLE * count)
+    points, weight = drawn(weight @ points, covariance, proposals)
+    effective = 1.0 / float(np.sum(weight**2))
+    if not effective >= LEAST_EFFECTIVE_SAMPLE_SIZE:
+        raise PosteriorError(said("joint.effective", effective=effective, proposals=proposals))
+    chosen = np.searchsorted(np.cumsum(weight), (np.arange(count) + generator.random()) / count)
+    return values(best.x + points[generator.permutation(np.minimum(chosen, proposals - 1))] @ stretch)

@@ -10,9 +10,8 @@ from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode
 from calibration.dynamics.trials import (
     PUBLISHED_DAMPING_RATIOS,
     PUBLISHED_FREQUENCIES,
-    Frequencies,
+    Fits,
     RingDownFit,
-    RingDownTrials,
     amplitude_dependence,
 )
 from calibration.errors import ExperimentDataError
@@ -31,34 +30,21 @@ _SAME_MODE = 0.2  # relative change of its frequency beyond which a fit has foun
 _VISIBLE = 1.0  # amplitude of the second mode at the later start, over the residuals
 
 
-def check_readings(readings: Sequence[Reading]) -> tuple[Reading, ...]:
-    """Return the readings of a wing.
+def modal_readings(values: Sequence[float], deviations: Sequence[float]) -> tuple[Reading, ...]:
+    """Return readings of f1, f2 [Hz], zeta1 and zeta2 [1].
 
     Raises
     ------
     ExperimentDataError
-        If one or its standard deviation is not positive and finite, a damping ratio is 1 or more, or the
-        first frequency is not the lower one.
+        If an uncertainty comes out as zero, as for a drawn record without noise.
     """
-    for item in readings:
-        if not all(math.isfinite(value) and value > 0.0 for value in (item.value, item.deviation)):
-            raise ExperimentDataError(said("joint.positive", item=item))
-        if item.name.startswith("damping_ratio") and not item.value < 1.0:
-            raise ExperimentDataError(said("joint.ratio", item=item))
-    first, second = ([item.value for item in readings if item.name == f"frequency_{mode}"] for mode in (1, 2))
-    if first and second and not first[0] < second[0]:
-        raise ExperimentDataError(said("joint.order", first=first[0], second=second[0]))
-    return tuple(readings)
+    for name, value, deviation in zip(MODAL, values, deviations, strict=True):
+        if not deviation > 0.0:
+            raise ExperimentDataError(said("joint.positive", name=name, value=value))
+    return tuple(map(Reading, MODAL, ["ring-down"] * 4, values, deviations))
 
 
-def modal_readings(values: Sequence[float], deviations: Sequence[float]) -> tuple[Reading, ...]:
-    """Return readings of f1, f2 [Hz], zeta1 and zeta2 [1]; errors as `check_readings`."""
-    return check_readings(
-        [Reading(*given) for given in zip(MODAL, ["ring-down"] * 4, values, deviations, strict=True)]
-    )
-
-
-def measured_modes(trials: RingDownTrials) -> tuple[Reading, ...]:
+def measured_modes(trials: Fits) -> tuple[Reading, ...]:
     """Return mean frequencies and damping ratios of fitted trials, statistical and systematic uncertainty.
 
     *Statistical*: the standard error of the mean over the trials, from the least-squares fits; where the
@@ -76,15 +62,15 @@ def measured_modes(trials: RingDownTrials) -> tuple[Reading, ...]:
 
     Parameters
     ----------
-    trials : RingDownTrials
+    trials : Fits
         Fitted records, by `calibration.dynamics.trials.fit_trials`.
 
     Raises
     ------
     ExperimentDataError
-        If an uncertainty comes out as zero, as for a drawn record without noise.
+        As `modal_readings`.
     """
-    means = [_mean_of([fit.modes[mode] for fit in trials.fits], name) for name in _NAMES for mode in (0, 1)]
+    means = [_mean_of([fit.modes[mode] for fit in trials], name) for name in _NAMES for mode in (0, 1)]
     softening = _amplitude_terms(trials)
     choice = _choice_terms(trials, means[1][0], means[3][0])
     systematic = softening[0], choice[0], softening[1], choice[1]
@@ -106,9 +92,9 @@ def _mean_of(modes: Sequence[RingDownMode], name: str) -> tuple[float, float]:
     return mean, math.sqrt(expected / count)
 
 
-def _amplitude_terms(trials: RingDownTrials) -> tuple[float, float]:
+def _amplitude_terms(trials: Fits) -> tuple[float, float]:
     """Return what the amplitude does to frequency [Hz] and damping ratio [1] of the first mode."""
-    points = [point for fit in trials.fits for point in amplitude_dependence(fit)]
+    points = [point for fit in trials for point in amplitude_dependence(fit)]
     if len(points) < _FEWEST_WINDOWS:
         return 0.0, 0.0
     logarithm = np.log([point.amplitude for point in points])
@@ -127,13 +113,13 @@ def _amplitude_terms(trials: RingDownTrials) -> tuple[float, float]:
     return terms[0], terms[1]
 
 
-def _choice_terms(trials: RingDownTrials, frequency: float, ratio: float) -> tuple[float, float]:
+def _choice_terms(trials: Fits, frequency: float, ratio: float) -> tuple[float, float]:
     """Return what the choice of the fit does to frequency [Hz] and damping ratio [1] of the second mode."""
-    delays = (*((0.0,) if trials.fits[0].procedure is Frequencies.PEAKS else ()), *_LATER_STARTS)
+    delays = (*(() if trials[0].free else (0.0,)), *_LATER_STARTS)
     terms = []
     for delay in delays:
-        found = [refitted for fit in trials.fits if (refitted := _refit(fit, delay)) is not None]
-        if len(found) < len(trials.fits):
+        found = [refitted for fit in trials if (refitted := _refit(fit, delay)) is not None]
+        if len(found) < len(trials):
             continue  # the mode has died away by then
         others = [_mean_of(found, name) for name in _NAMES]
         pairs = zip(others, (frequency, ratio), strict=True)

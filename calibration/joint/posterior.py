@@ -24,8 +24,7 @@ from calibration.static.errors_in_variables import exact_posterior, residual_var
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior
 
-from .inference import Draws, FloatArray, infer
-from .measurement import check_readings
+from .inference import FloatArray, infer
 from .wing_table import MODEL_ERROR, QUANTITIES, WingTable, wing_priors
 
 _LIMIT_MARGIN = 0.01  # of the range of e
@@ -42,8 +41,8 @@ def joint_posterior(
     model_error: tuple[float, float] = MODEL_ERROR,
     seed: int = 0,
     count: int = 1000,
-) -> Draws:
-    """Return the posterior of e, masses and Rayleigh coefficients, given all measurements at once.
+) -> FloatArray:
+    """Return samples (count, 5) of e, masses and Rayleigh coefficients, given all measurements at once.
 
     Parameters
     ----------
@@ -65,18 +64,14 @@ def joint_posterior(
     Raises
     ------
     ExperimentDataError
-        If a reading or the model error makes no sense, no masses within the model's range keep the weighed
-        total, or the damping ratios need negative coefficients.
+        If no masses within the model's range keep the weighed total, or the damping ratios need negative
+        coefficients.
     OutsideValidityError
         If the load test alone puts e outside the model, or all measurements together press it against the
         end of the model's range.
     PosteriorError
         See `infer`.
     """
-    check_readings(readings)
-    if not all(math.isfinite(value) and 0.0 <= value < 1.0 for value in model_error):
-        given = " and ".join(f"{value:g}" for value in model_error)
-        raise ExperimentDataError(said("joint.model_error", given=given))
     priors = wing_priors(wing.validity) if priors is None else priors
     errors = {"frequency_1": model_error[0], "frequency_2": model_error[1]}
     columns = {figure.name: at for at, figure in enumerate(QUANTITIES[1:], start=1)}
@@ -95,13 +90,13 @@ def joint_posterior(
         scatter = np.broadcast_to(np.sqrt(residual_variance(static, stiffness)), pairs.shape)
         return np.hstack([pairs, read - shown]), np.hstack([scatter, np.hypot(spread, relative * shown)])
 
-    found = infer(priors, compare, seed=seed, count=count)
+    samples = infer(priors, compare, seed=seed, count=count)
     limits = priors[0].low, priors[0].high
     for limit in limits:
-        share = float(np.mean(np.abs(found.samples[:, 0] - limit) < _LIMIT_MARGIN * (limits[1] - limits[0])))
+        share = float(np.mean(np.abs(samples[:, 0] - limit) < _LIMIT_MARGIN * (limits[1] - limits[0])))
         if share > _LARGEST_SHARE_AT_LIMIT:
             raise OutsideValidityError(said("joint.limit", share=share, limit=limit))
-    return found
+    return samples
 
 
 def _refuse_negative(readings: Mapping[str, Reading]) -> None:

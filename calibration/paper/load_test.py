@@ -12,19 +12,19 @@ from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.sentences import said
 from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
 from calibration.static.experiments import LoadDisplacementData, published_measurements
-from calibration.static.posterior import GaussianPrior, ScalarPosterior, Seed, check_count, child_seed
+from calibration.static.posterior import GaussianPrior, ScalarPosterior, Seed, child_seed
 from calibration.static.stiffness_curve import PUBLISHED_LINE, StiffnessCurve
 
 DEFAULT_PARTICLE_COUNT = 1_000_000
 """Particles, and samples of each measured pair, in the authors' script."""
 
-CELLS_PER_BANDWIDTH = 16
-"""Cells of a kernel density within one bandwidth; binning raises the kernel's variance by less than 0.1 %."""
+CELLS_PER_BANDWIDTH, KEPT = 128, 32
+"""Cells of a kernel density within one bandwidth, so many that few samples are less than 0.1 % off; one of
+so many is kept of a posterior."""
 
 _KERNEL_REACH = 8.0  # bandwidths; the kernel beyond holds 1e-15
 _MEDIAN_DEVIATION_OF_GAUSSIAN = 0.6745  # of a standard Gaussian, as rounded in the rule
 _PURPOSE_PAIRS, _PURPOSE_PARTICLES = 0, 1
-_FEWEST_PARTICLES = 100
 _FEWEST_EFFECTIVE_PARTICLES = 10.0
 
 FloatArray = NDArray[np.float64]
@@ -39,10 +39,6 @@ class ParticlePosterior(ScalarPosterior):
 
     Attributes
     ----------
-    effective_sample_size : (n_pairs,) array
-        1 / sum of squared weights after each pair; the last is that of the posterior.
-    particle_count : int
-        Number of particles.
     likelihood_grid : (N,) array
         Values of e at which the likelihoods are kept.
     likelihood : (n_pairs, N) array
@@ -51,8 +47,6 @@ class ParticlePosterior(ScalarPosterior):
         The particles' tip stiffness k(e) [N/m], in the same way.
     """
 
-    effective_sample_size: FloatArray
-    particle_count: int
     likelihood_grid: FloatArray
     likelihood: FloatArray
     stiffness: ScalarPosterior
@@ -68,15 +62,8 @@ def normal_reference_bandwidth(samples: FloatArray) -> float:
 
     sigma_robust is the median absolute deviation from the median over 0.6745. This is the default of
     MATLAB's `fitdist(samples, 'kernel')`, which the authors used (Bowman and Azzalini 1997).
-
-    Raises
-    ------
-    PosteriorError
-        If the samples (n,) have no spread.
     """
     sigma = float(np.median(np.abs(samples - np.median(samples)))) / _MEDIAN_DEVIATION_OF_GAUSSIAN
-    if not (math.isfinite(sigma) and sigma > 0.0):
-        raise PosteriorError("a kernel density needs finite samples with some spread, but there is none.")
     return sigma * reference_bandwidth_factor(samples.size)
 
 
@@ -86,25 +73,15 @@ def kernel_density(
     window: tuple[float, float],
     weights: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return grid (N,) and Gaussian kernel density (N,) of samples (n,) over a window.
-
-    A sample is shared by the grid points beside it: counted at one, few samples would be 2 % off.
-    """
+    """Return grid (N,) and Gaussian kernel density (N,) of samples (n,) over a window."""
     reach = _KERNEL_REACH * bandwidth
-    low, spacing = window[0] - reach, bandwidth / CELLS_PER_BANDWIDTH
-    count = math.ceil((window[1] + reach - low) / spacing) + 1
-    shares = np.full(samples.size, 1.0 / samples.size) if weights is None else weights / weights.sum()
-    place = (samples - low) / spacing
-    near = (place >= 0.0) & (place < count - 1)
-    place, shares = place[near], shares[near]
-    cell = place.astype(np.int64)
-    right = np.bincount(cell, (place - cell) * shares, count)
-    mass = np.bincount(cell, shares, count) - right
-    mass[1:] += right[:-1]
-    density = gaussian_filter1d(
-        np.maximum(mass, 0.0) / spacing, CELLS_PER_BANDWIDTH, mode="constant", truncate=_KERNEL_REACH
-    )
-    return low + spacing * np.arange(count, dtype=np.float64), density
+    ends = window[0] - reach, window[1] + reach
+    spacing = bandwidth / CELLS_PER_BANDWIDTH
+    mass, edges = np.histogram(samples, math.ceil((ends[1] - ends[0]) / spacing), ends, weights=weights)
+    whole = samples.size if weights is None else weights.sum()
+    density = mass / (whole * (edges[1] - edges[0]))
+    smooth = gaussian_filter1d(density, CELLS_PER_BANDWIDTH, mode="constant", truncate=_KERNEL_REACH)
+    return 0.5 * (edges[1:] + edges[:-1]), smooth
 
 
 def particle_filter(
@@ -139,20 +116,17 @@ def particle_filter(
     Raises
     ------
     PosteriorError
-        If fewer than ten effective particles remain (prior and measurements contradict each other, or there
-        are too few particles), or fewer than a hundred are asked for, or more than `MOST_SAMPLES`.
+        If fewer than ten effective particles remain: prior and measurements contradict each other, or there
+        are too few particles.
     """
     prior = prior or GaussianPrior()
-    if particle_count < _FEWEST_PARTICLES:
-        raise PosteriorError(said("particles.few", least=_FEWEST_PARTICLES, given=particle_count))
-    check_count(particle_count, PosteriorError)
     generator = np.random.default_rng(child_seed(seed, _PURPOSE_PARTICLES))
     of_pairs = np.random.default_rng(child_seed(seed, _PURPOSE_PAIRS))
     particles = prior.mean + prior.standard_deviation * generator.standard_normal(particle_count)
     kept_at = prior.mean + prior.standard_deviation * np.linspace(-8.0, 8.0, 801)
     window = float(kept_at[0]), float(kept_at[-1])
     log_weight, weight = np.zeros(particle_count), np.empty(0)
-    effective, likelihood = np.zeros(data.count), np.zeros((data.count, kept_at.size))
+    likelihood = np.zeros((data.count, kept_at.size))
     for pair, (load, displacement) in enumerate(zip(data.load, data.displacement, strict=True)):
         loads = load + data.load_standard_deviation * of_pairs.standard_normal(particle_count)
         scatter = data.displacement_standard_deviation * of_pairs.standard_normal(particle_count)
@@ -167,23 +141,21 @@ def particle_filter(
             raise PosteriorError(said("particles.unexplained", given=given, data=data, prior=prior))
         weight = np.exp(log_weight - largest)
         weight /= weight.sum()
-        effective[pair] = 1.0 / float(np.sum(weight**2))
-    if effective[-1] < _FEWEST_EFFECTIVE_PARTICLES:
-        left = effective[-1], particle_count
+    effective = 1.0 / float(np.sum(weight**2))
+    if effective < _FEWEST_EFFECTIVE_PARTICLES:
+        left = effective, particle_count
         raise PosteriorError(said("particles.effective", left=left, data=data))
     mean, standard_deviation = _moments(weight, particles)
     # The spread of the weighted particles, in the rule's place of the median deviation.
-    bandwidth = standard_deviation * reference_bandwidth_factor(float(effective[-1]))
+    bandwidth = standard_deviation * reference_bandwidth_factor(effective)
     grid, density = kernel_density(particles, bandwidth, window, weight)
-    smooth = ScalarPosterior(grid[::4], density[::4])
+    smooth = ScalarPosterior(grid[::KEPT], density[::KEPT])
     pushed = push_forward(smooth, curve)
     return ParticlePosterior(
         grid=smooth.grid,
         density=smooth.density,
         mean=mean,
         standard_deviation=standard_deviation,
-        effective_sample_size=effective,
-        particle_count=particle_count,
         likelihood_grid=kept_at,
         likelihood=likelihood,
         stiffness=ScalarPosterior(pushed.grid, pushed.density, *_moments(weight, curve.stiffness(particles))),

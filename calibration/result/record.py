@@ -3,7 +3,6 @@
 A wing's from the folder of its laboratory and any model's from a campaign are of this one class.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -13,10 +12,10 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from calibration.errors import CalibrationRecordError, PosteriorError
+from calibration.errors import CalibrationRecordError
 from calibration.sentences import said
 from calibration.static.experiments import HALF_WIDTH_95
-from calibration.static.posterior import Seed, check_count, child_seed, stratified
+from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.words import brief
@@ -86,26 +85,6 @@ class ParameterPrior:
     def figure(self) -> CalibratedFigure:
         """The parameter as a calibrated figure."""
         return CalibratedFigure(self.name, self.unit, self.title or self.name.replace("_", " "))
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Distribution function of the uncut normal distribution at the ends of the range [1]."""
-        low, high = (ndtr((end - self.mean) / self.deviation) for end in (self.low, self.high))
-        return float(low), float(high)
-
-    @property
-    def log_share_inside(self) -> float:
-        """Log of the share of the uncut normal distribution that lies within the range.
-
-        Raises
-        ------
-        PosteriorError
-            If it is less than 1e-6.
-        """
-        low, high = self.ends
-        if not high - low > 1e-6:
-            raise PosteriorError(said("posterior.prior_outside", self=self))
-        return math.log(high - low)
 
 
 @dataclass(frozen=True)
@@ -332,10 +311,9 @@ class Calibration:
         Raises
         ------
         CalibrationRecordError
-            If the calibration has no figure of this name, or `count` is not 1 to `MOST_SAMPLES`.
+            If the calibration has no figure of this name.
         """
         values = np.sort(self.draws_of(name))
-        check_count(count, CalibrationRecordError)
         generator = np.random.default_rng(child_seed(seed, 0))
         place = (stratified(generator, count) * len(values)).astype(np.int64)
         return values[np.minimum(place, len(values) - 1)]
@@ -391,7 +369,7 @@ def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> 
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     columns = []
     for prior in priors:
-        low, high = prior.ends
+        low, high = ndtr((np.array((prior.low, prior.high)) - prior.mean) / prior.deviation)
         u = ndtri(low + (high - low) * stratified(generator, count))
         columns.append(np.clip(prior.mean + prior.deviation * u, prior.low, prior.high))
     return np.column_stack(columns)

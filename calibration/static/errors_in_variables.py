@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf
 
-from calibration.errors import OutsideValidityError, PosteriorError
+from calibration.errors import OutsideValidityError
 from calibration.sentences import said
 
 from .experiments import LoadDisplacementData
@@ -116,15 +116,9 @@ def log_likelihood(
     curve, data, young_modulus_factor, measure
         As in `pair_log_likelihoods`.
     zero_offset_standard_deviation : float
-        Standard deviation of the zero offset of the displacement that a loading run shares [m].
-
-    Raises
-    ------
-    PosteriorError
-        If "ratio" is asked for together with a zero offset.
+        Standard deviation of the zero offset of the displacement that a loading run shares [m]; of the ratio
+        there is no likelihood with one.
     """
-    if measure == "ratio" and zero_offset_standard_deviation:
-        raise PosteriorError("the ratio of load and displacement has no likelihood with a zero offset.")
     total = pair_log_likelihoods(curve, data, young_modulus_factor, measure).sum(axis=0)
     k = curve.stiffness(np.atleast_1d(young_modulus_factor))
     variance = residual_variance(data, k)
@@ -144,7 +138,6 @@ def exact_posterior(
     prior: GaussianPrior | None = None,
     measure: Measure = "displacement",
     zero_offset_standard_deviation: float = 0.0,
-    grid_size: int = GRID_SIZE,
 ) -> ScalarPosterior:
     """Return p(e | measured pairs) by quadrature on a grid that follows the posterior.
 
@@ -157,15 +150,11 @@ def exact_posterior(
         As in `log_likelihood`.
     prior : GaussianPrior, optional
         Prior of e; the paper's by default.
-    grid_size : int
-        Points of the grid.
 
     Raises
     ------
     OutsideValidityError
         If more than 1e-4 of the posterior lies beyond the range of `curve`.
-    PosteriorError
-        As in `log_likelihood`.
     """
     prior = prior or GaussianPrior()
     # the first window holds the prior and the estimate of each pair alone, where k(e) > 0
@@ -178,12 +167,12 @@ def exact_posterior(
     lower, upper = min(prior.mean - beyond, alone.min()), max(prior.mean + beyond, alone.max())
     floor = lower = max(lower, curve.young_modulus_factor(1e-3 * ratio.min()))
     for _ in range(60):
-        grid = np.linspace(lower, upper, grid_size)
+        grid = np.linspace(lower, upper, GRID_SIZE)
         log_density = prior.log_density(grid) + log_likelihood(
             curve, data, grid, measure=measure, zero_offset_standard_deviation=zero_offset_standard_deviation
         )
         posterior = ScalarPosterior(grid, np.exp(log_density - log_density.max()))
-        spacing = (upper - lower) / (grid_size - 1)
+        spacing = (upper - lower) / (GRID_SIZE - 1)
         reach = _REACH * max(posterior.standard_deviation, spacing)
         narrower = max(posterior.mean - reach, floor), posterior.mean + reach
         if narrower[1] - narrower[0] > 0.99 * (upper - lower):

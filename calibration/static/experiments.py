@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError
-from calibration.lab_folder import keep_vectors, lab_table
+from calibration.lab_folder import lab_table
 from calibration.sentences import said
 from reporting.provenance import hash_record
 
@@ -62,8 +62,7 @@ class LoadDisplacementData:
     Raises
     ------
     ExperimentDataError
-        If the arrays are empty or of unequal length, hold values that are not positive and finite, or
-        the standard deviations are negative, not finite or both zero.
+        If a load or a displacement is not positive.
     """
 
     load: NDArray[np.float64]
@@ -74,19 +73,11 @@ class LoadDisplacementData:
     source: str = "unnamed measurements"
 
     def __post_init__(self) -> None:
-        keep_vectors(self, "load", "displacement", "run")
-        object.__setattr__(self, "run", self.run.astype(np.int64))
-        self.run.setflags(write=False)
-        if self.load.size == 0:
-            raise ExperimentDataError(f"{self.source}: there is no measurement; at least one pair is needed.")
         for name in ("load", "displacement"):
             column = getattr(self, name)
             for wrong in np.flatnonzero(column <= 0.0):
                 found = wrong + 1, column[wrong]
                 raise ExperimentDataError(said("load_test.positive", self=self, name=name, found=found))
-        deviations = (self.load_standard_deviation, self.displacement_standard_deviation)
-        if not all(math.isfinite(value) and value >= 0.0 for value in deviations) or not any(deviations):
-            raise ExperimentDataError(said("load_test.deviations", self=self, given=deviations))
 
     @property
     def count(self) -> int:

@@ -28,23 +28,10 @@ class StiffnessCurve:
         that tails of a sampled density can be mapped, but no posterior may rest there.
     name : str
         What the curve is, for reports.
-
-    Raises
-    ------
-    PosteriorError
-        If the curve is not finite, positive and rising over its range.
     """
 
     polynomial: Chebyshev
     name: str
-
-    def __post_init__(self) -> None:
-        stiffnesses, factors = self._table()
-        rise = np.diff(stiffnesses)
-        if not (np.all(np.isfinite(stiffnesses)) and stiffnesses[0] > 0.0 and np.all(rise > 0.0)):
-            worst = int(np.argmin(rise))
-            between = stiffnesses[worst : worst + 2], factors[worst : worst + 2]
-            raise PosteriorError(said("load_test.rising", self=self, between=between))
 
     @property
     def lower(self) -> float:
@@ -55,10 +42,6 @@ class StiffnessCurve:
     def upper(self) -> float:
         """Largest e of the range."""
         return float(self.polynomial.domain[1])
-
-    def _table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        factors = np.linspace(self.lower, self.upper, _INVERSE_TABLE_SIZE)
-        return np.asarray(self.polynomial(factors)), factors
 
     def stiffness(self, young_modulus_factor: ArrayLike) -> NDArray[np.float64]:
         """Return k(e) [N/m], elementwise."""
@@ -73,7 +56,8 @@ class StiffnessCurve:
     def young_modulus_factor(self, stiffness: ArrayLike) -> NDArray[np.float64]:
         """Return the inverse e(k), elementwise; `stiffness` in N/m."""
         value = np.asarray(stiffness, dtype=float)
-        stiffnesses, factors = self._table()
+        factors = np.linspace(self.lower, self.upper, _INVERSE_TABLE_SIZE)
+        stiffnesses = self.polynomial(factors)
         inside = np.clip(value, stiffnesses[0], stiffnesses[-1])
         end_slope = np.where(value < inside, *self.slope([self.lower, self.upper]))
         return np.asarray(np.interp(inside, stiffnesses, factors) + (value - inside) / end_slope)
@@ -110,7 +94,7 @@ def stiffness_curve_of(
     Raises
     ------
     PosteriorError
-        If the curve is not positive and rising, or too rough for a polynomial.
+        If the curve is too rough for a polynomial.
     """
     stiffness = np.vectorize(tip_stiffness, otypes=[float])
     polynomial = Chebyshev.interpolate(stiffness, _DEGREE, domain=limits)

@@ -193,7 +193,7 @@ def calibrate(
         )
         return replace(found, findings=tuple(disagreements(found, lab, static.quality)))
 
-    ways = record("joint", joint.samples), record("paper", paper.samples)
+    ways = record("joint", joint), record("paper", paper.samples)
     return WingCalibration(*ways, procedure, lab, model, static, published)
 
 

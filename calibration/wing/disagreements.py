@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence
+from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence, average
 from calibration.result.record import Calibration
 from calibration.static.errors_in_variables import FitQuality
 from calibration.static.experiments import published_measurements
@@ -51,7 +51,7 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
     if trials is None:
         return []
     found = []
-    second = trials.average("damping_ratio", 1).mean
+    second = average(trials, "damping_ratio", 1).mean
     published = PUBLISHED_DAMPING_RATIOS[1]
     if the_papers and abs(second / published - 1.0) > 0.1:
         found.append(
@@ -60,7 +60,7 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
             "where a record begins, see the documentation."
         )
     points = sorted(
-        (point for fit in trials.fits for point in amplitude_dependence(fit)),
+        (point for fit in trials for point in amplitude_dependence(fit)),
         key=lambda point: point.amplitude,
     )
     if len(points) >= 6:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_records, read_records
-from calibration.dynamics.trials import Frequencies, RingDownTrials, fit_trials, refine_by_extremes
+from calibration.dynamics.trials import Fits, fit_trials, refine_by_extremes
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths, published_lengths, read_lengths
 from calibration.joint.measurement import PUBLISHED_MODES, measured_modes
@@ -136,7 +136,7 @@ class LabData:
         Step 2.
     readings : tuple of Reading
         Weighed mass of two servos and the pitot tube, frequencies and damping ratios.
-    trials : RingDownTrials or None
+    trials : Fits or None
         Step 3, fitted; None where the published frequencies and damping ratios stand in.
     authors : PaperSamples or None
         The authors' own results of step 3, to be drawn beside ours.
@@ -151,7 +151,7 @@ class LabData:
     readings: tuple[Reading, ...]
     origins: tuple[StepOrigin, ...]
     input_hashes: dict[str, str]
-    trials: RingDownTrials | None = None
+    trials: Fits | None = None
     authors: PaperSamples | None = None
 
 
@@ -167,9 +167,7 @@ def published_data() -> LabData:
     )
 
 
-def read_lab_folder(
-    path: Path, targets: Targets | None = None, frequencies: Frequencies = Frequencies.PEAKS
-) -> LabData:
+def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = False) -> LabData:
     """Read a lab folder in the authors' layout; a step that is not there is taken as published.
 
     Parameters
@@ -179,8 +177,9 @@ def read_lab_folder(
         authors' repository). Ring-down records may also lie in the folder itself.
     targets : {"measured", "published"}, optional
         Whether step 3 aims at the ring-down records; by default where there are any.
-    frequencies : Frequencies
-        How the frequencies of a record are found: from its spectrum as the authors do, or fitted.
+    free : bool
+        Whether the frequencies of a record are fitted; else they are those of its spectrum, as the authors
+        do.
 
     Raises
     ------
@@ -213,8 +212,8 @@ def read_lab_folder(
         hashes["load_test"] = pairs.sha256
         origins[2] = StepOrigin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
     if records and targets != "published":
-        trials = fit_trials(read_records(path), frequencies)
-        if all(fit.record.lowest is not None for fit in trials.fits):
+        trials = fit_trials(read_records(path), free=free)
+        if all(fit.record.lowest is not None for fit in trials):
             # extremes are averages of the signal; the middle of the ink is none
             trials = refine_by_extremes(trials)
         found["trials"] = trials

@@ -6,7 +6,7 @@ Unknowns that act in proportion follow from what whitened readings and columns s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -67,6 +67,10 @@ class Passed(NamedTuple):
     sizes: FloatArray
 
 
+Covered = tuple[Passed, FloatArray, FloatArray]
+"""What the other passes take, and predicted and filtered covariances (S, n, n) by slot."""
+
+
 @dataclass(frozen=True, eq=False)
 class Filtered:
     """A trial with missing forces at ports.
@@ -77,10 +81,13 @@ class Filtered:
         Which.
     processes : sequence of (int, Process)
         Forces, each with the number of its port; there may be several at one.
+    passes : dict
+        Passes over covariances by what they depend on: trials of one system and grid share theirs.
     """
 
     trial: SeenTrial
     processes: Sequence[tuple[int, Process]]
+    passes: dict[tuple[bytes, ...], Covered] = field(default_factory=dict)
 
     @cached_property
     def _scale(self) -> FloatArray:
@@ -143,15 +150,15 @@ class Filtered:
         return kernels.discretised(*self.system[:2], lengths)
 
     @cached_property
-    def _passed(self) -> tuple[Passed, FloatArray, FloatArray]:
-        """What the other passes take, and predicted and filtered covariances (S, n, n) by slot."""
-        lengths, which = self.trial.steps
-        moves, noises = self._steps(lengths)
-        rows, start = self.system[2:]
-        used = self.trial.used
-        covers = kernels.covariances(moves, noises, which, rows, used, start)
-        slot, gains, sizes, predicted, filtered = covers
-        return Passed(moves, which, rows, used, slot, gains, sizes), predicted, filtered
+    def _passed(self) -> Covered:
+        (lengths, which), used = self.trial.steps, self.trial.used
+        key = tuple(item.tobytes() for item in (*self.system, lengths, which, used))
+        if key not in self.passes:
+            moves, noises = self._steps(lengths)
+            rows, start = self.system[2:]
+            covers = kernels.covariances(moves, noises, which, rows, used, start)
+            self.passes[key] = Passed(moves, which, rows, used, *covers[:3]), *covers[3:]
+        return self.passes[key]
 
     @property
     def is_sound(self) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 
-from .filtered import LEAST_PRECISION, Filtered, Process, Regression, Solution, regression
+from .filtered import LEAST_PRECISION, Covered, Filtered, Process, Regression, Solution, regression
 from .trial import Part, SeenTrial
 
 Processes = Mapping[int, Process]
@@ -161,7 +161,8 @@ class View:
 
     def filtered(self, processes: Processes) -> list[Filtered]:
         """Return the filters of missing forces."""
-        return [Filtered(trial, tuple(processes.items())) for trial in self.trials]
+        passes: dict[tuple[bytes, ...], Covered] = {}
+        return [Filtered(trial, tuple(processes.items()), passes) for trial in self.trials]
 
     def products(self, processes: Processes) -> Regression:
         """Return the products of all columns beside missing forces."""

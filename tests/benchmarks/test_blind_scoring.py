@@ -1,7 +1,6 @@
 """What verdicts are worth."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -48,15 +47,15 @@ def _said(kind: str, *identifiers: str, **more: Any) -> dict[str, Any]:
         (_truth("a", kind="trap", accepted=["unexplained"]), _said("named", "a"), Outcome.RIGHT),
     ],
 )
-def test_outcomes(truth: dict[str, Any], verdict: dict[str, Any], wanted: Outcome) -> None:
+def test_outcomes(truth, verdict, wanted):
     assert outcome(truth, verdict) is wanted
 
 
-def test_every_effect_has_a_family() -> None:
+def test_every_effect_has_a_family():
     assert set(FAMILIES) == set(DRAWS)
 
 
-def test_interval_is_compared_at_the_port_where_the_effect_was_named() -> None:
+def test_interval_is_compared_at_the_port_where_the_effect_was_named():
     truth = _truth("quadratic_damping", places={"quadratic_damping": "planform"})
     truth["truth"] = {
         "quadratic_damping.coefficient@planform": 3.0,
@@ -81,13 +80,13 @@ def test_interval_is_compared_at_the_port_where_the_effect_was_named() -> None:
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 10), (10, 10), (97, 100), (1, 3)])
-def test_interval_of_a_share(hits: int, count: int) -> None:
+def test_interval_of_a_share(hits, count):
     wanted = binomtest(hits, count).proportion_ci(method="wilson")
     assert wilson(hits, count) == pytest.approx((wanted.low, wanted.high), abs=1e-6)
 
 
 @pytest.mark.long
-def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line(tmp_path, capsys):
     out = ["--out", str(tmp_path)]
     sizes = ["--count-per-effect", "0", "--nulls", "4", "--pairs", "0", "--outside", "0", "--traps", "0"]
     assert main(["generate", *out, *sizes, "--seed", "7", "--rigs", "lumped", "--jobs", "1"]) == 0

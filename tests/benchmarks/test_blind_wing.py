@@ -38,7 +38,7 @@ def _trial(work: Workbench, name: str) -> TrialPlan:
     return next(trial for trial in work.plan.trials if trial.name == name)
 
 
-def test_projected_wing_is_the_full_model(work: Workbench, rig: WingRig) -> None:
+def test_projected_wing_is_the_full_model(work, rig):
     operators = rig.store.operators
     structure = rig.structure(STATE, Changes())
     tip, _ = rig.respond(structure, Changes(), _trial(work, "tip 1"))
@@ -56,7 +56,7 @@ def test_projected_wing_is_the_full_model(work: Workbench, rig: WingRig) -> None
     np.testing.assert_allclose(structure.angular_frequency[:6] / (2.0 * np.pi), modes.frequency, rtol=2e-6)
 
 
-def test_root_compliance_turns_the_wing_as_a_rigid_body(work: Workbench, rig: WingRig) -> None:
+def test_root_compliance_turns_the_wing_as_a_rigid_body(work, rig):
     compliance = 2e-5
     changes = Changes(root_compliance=compliance)
     trial = _trial(work, "tip 1")
@@ -68,7 +68,7 @@ def test_root_compliance_turns_the_wing_as_a_rigid_body(work: Workbench, rig: Wi
     np.testing.assert_allclose(after[:, :24], before[:, :24], atol=1e-9)
 
 
-def test_point_mass_lowers_the_frequency_as_rayleigh_says(rig: WingRig) -> None:
+def test_point_mass_lowers_the_frequency_as_rayleigh_says(rig):
     mass, station = 2e-4, 1.5
     plain = rig.structure(STATE, Changes())
     heavy = rig.structure(STATE, Changes(mass=mass, mass_station=station))
@@ -80,7 +80,7 @@ def test_point_mass_lowers_the_frequency_as_rayleigh_says(rig: WingRig) -> None:
     assert found == pytest.approx(wanted, rel=2e-2)
 
 
-def test_displaced_force_has_the_lever_of_its_place(work: Workbench, rig: WingRig) -> None:
+def test_displaced_force_has_the_lever_of_its_place(work, rig):
     """The bending moment at the root, which the root's rotation shows."""
     structure = rig.structure(STATE, Changes())
     spring = rig.store.basis().flap_spring
@@ -95,7 +95,7 @@ def test_displaced_force_has_the_lever_of_its_place(work: Workbench, rig: WingRi
     assert moment("corner", Changes(shift_span=0.03, shift_chord=-0.02)) == pytest.approx(1.808, rel=1e-4)
 
 
-def test_weight_and_washout_in_flight(work: Workbench, rig: WingRig) -> None:
+def test_weight_and_washout_in_flight(work, rig):
     basis, design = rig.store.basis(), rig.design
     structure = rig.structure(STATE, Changes())
     trial = _trial(work, "flight 1")
@@ -113,7 +113,7 @@ def test_weight_and_washout_in_flight(work: Workbench, rig: WingRig) -> None:
     assert share[15] > share[0] > 0.0
 
 
-def test_turned_gauge_reads_the_full_model_along_the_turned_direction(work: Workbench, rig: WingRig) -> None:
+def test_turned_gauge_reads_the_full_model_along_the_turned_direction(work, rig):
     angle = 0.2
     fault = Fault("rotation", ("g05",), (angle,))
     turned = rig.structure(STATE, Changes(faults=(fault,)))
@@ -128,9 +128,7 @@ def test_turned_gauge_reads_the_full_model_along_the_turned_direction(work: Work
     assert abs(wide) < 0.5 * abs(along)
 
 
-def test_friction_at_the_root_stiffens_small_swings_and_damps_large_ones(
-    work: Workbench, rig: WingRig
-) -> None:
+def test_friction_at_the_root_stiffens_small_swings_and_damps_large_ones(work, rig):
     law = Law("root", FRICTION, (6.0, 0.0))
     chance = Chance(STATE, {trial.name: trial.release for trial in work.plan.trials})
     signals = true_signals(rig, work.plan, chance, Changes(laws=(law,)))
@@ -147,9 +145,7 @@ def test_friction_at_the_root_stiffens_small_swings_and_damps_large_ones(
     assert frequency > 1.01 * free.angular_frequency[0] / (2.0 * np.pi)
 
 
-def test_steps_and_modes_are_fine_enough(
-    work: Workbench, rig: WingRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_and_modes_are_fine_enough(work, rig, monkeypatch):
     """Finer steps and more modes change readings by less than a tenth of the noise."""
     trial = _trial(work, "release 40 mm up 1")
     law = Law("root", FRICTION, (6.0, 0.0))
@@ -167,9 +163,7 @@ def test_steps_and_modes_are_fine_enough(
 
 
 @pytest.mark.parametrize("identifier", ["point_mass", "joint_micro_slip", "gauge_misalignment", "mains_hum"])
-def test_cases_of_the_wing_repeat(
-    work: Workbench, tmp_path_factory: pytest.TempPathFactory, identifier: str
-) -> None:
+def test_cases_of_the_wing_repeat(work, tmp_path_factory, identifier):
     folder = tmp_path_factory.getbasetemp() / "blind"
     order = Order("case-1", "catalogue", "wing", (identifier,), 9)
     one, two = make_case(order, folder), make_case(order, folder)

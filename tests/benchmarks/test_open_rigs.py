@@ -2,7 +2,6 @@
 
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ LAWS: dict[str, tuple[str, float, Primitive]] = {
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_equations_and_model_files_agree(name: str, tmp_path: Path) -> None:
+def test_equations_and_model_files_agree(name, tmp_path):
     """As they are and with a law, to less than half of the noise, though two integrators moved them."""
     bench = small(name)
     write(tmp_path / "case", bench, Truth(bench.factors), "plain", (1, 2))
@@ -58,7 +57,7 @@ def test_equations_and_model_files_agree(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [1, 4])
-def test_what_is_hidden_has_its_size(number: int) -> None:
+def test_what_is_hidden_has_its_size(number):
     bench, truth, facts = drawn(number, 1, SAMPLES)
     assert GAPS[0] * 0.9 < facts["gap"] < GAPS[1] * 1.1
     assert SHARES[0] * 0.9 < facts["remainder"] / facts["gap"] < SHARES[1] * 1.1
@@ -66,14 +65,14 @@ def test_what_is_hidden_has_its_size(number: int) -> None:
     assert bench.left(truth, without) == pytest.approx(facts["remainder"])
 
 
-def test_the_last_campaigns_hide_a_remainder_alone() -> None:
+def test_the_last_campaigns_hide_a_remainder_alone():
     _, truth, facts = drawn(27, 1, SAMPLES)
     assert facts["identifiers"] == []
     assert truth.law == ""
     assert ALONE[0] * 0.9 < facts["remainder"] < ALONE[1] * 1.1
 
 
-def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path: Path) -> None:
+def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path):
     bench = small("damper")
     truth = Truth(bench.factors, "coulomb_friction", 0.1)
 
@@ -124,9 +123,7 @@ def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path: Path) -> N
         ),
     ],
 )
-def test_what_is_left_takes_no_name(
-    seed: int, number: int, kind: str, named: list[str], tmp_path: Path
-) -> None:
+def test_what_is_left_takes_no_name(seed, number, kind, named, tmp_path):
     row = judge(tmp_path, seed, number, "plain")
     assert (row["kind"], row["named"]) == (kind, named), row["sentence"]
     if (seed, number) == (1, 25):
@@ -135,7 +132,7 @@ def test_what_is_left_takes_no_name(
 
 
 @pytest.mark.parametrize(("left", "outcome"), [("law", "family"), ("push", "wrong")])
-def test_the_family_of_a_law_that_is_left_alone_is_right(left: str, outcome: str) -> None:
+def test_the_family_of_a_law_that_is_left_alone_is_right(left, outcome):
     families = {item.identifier: item.family for item in library()}
     row = {"outcome": "wrong", "family": families["cubic_stiffness"]}
     assert outcome_of(row, {"rig": "damper", "identifiers": [], "left": left}) == outcome

@@ -9,7 +9,6 @@ import pytest
 from calibration.errors import ExperimentDataError
 from calibration.geometry import (
     published_lengths,
-    read_lengths,
     tailored_design,
     tailored_geometry,
 )
@@ -19,16 +18,6 @@ from fe.wing.mesh import build_mesh
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
-
-
-def test_the_published_lengths():
-    result = published_lengths()
-    for length, measured in zip(result, (1.828, 0.433, 0.260), strict=True):
-        assert length.prior.deviation == pytest.approx(2.54e-3 / 1.96)
-        # The tolerance is 12.7 times the reading's: the posterior is the measurement within 0.02 mm.
-        assert length.posterior.mean == pytest.approx(measured, abs=0.02e-3)
-        assert length.posterior.standard_deviation == pytest.approx(0.1017e-3, rel=1e-3)
-    assert result.semi_span.posterior.mean == pytest.approx(1.828005, abs=1e-6)
 
 
 def test_posterior_by_quadrature():
@@ -42,19 +31,6 @@ def test_posterior_by_quadrature():
     deviation = math.sqrt(float(np.sum((grid - mean) ** 2 * density)))
     assert length.posterior.mean == pytest.approx(mean, rel=1e-9)
     assert length.posterior.standard_deviation == pytest.approx(deviation, rel=1e-6)
-
-
-def test_files_of_lengths(tmp_path):
-    file = tmp_path / "lengths.csv"
-    file.write_text(INPUTS.text("lengths.csv"), encoding="utf-8")
-    for own, published in zip(read_lengths(file), published_lengths(), strict=True):
-        assert own.posterior.mean == pytest.approx(published.posterior.mean, rel=1e-12)
-
-
-def test_the_published_file_gives_the_published_figures(reference):
-    for read, published in zip(read_lengths(reference), published_lengths(), strict=True):
-        found = read.designed, read.measured
-        assert found == pytest.approx((published.designed, published.measured), rel=1e-12)
 
 
 # -------------------------------- the measured planform in the design, and what a wing cannot be

@@ -6,7 +6,6 @@ import stat
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +13,7 @@ from reporting import files
 from reporting.errors import DiskFullError, FileNotWrittenError
 
 
-def test_bytes_and_text_arrive_and_nothing_else_is_left(tmp_path: Path) -> None:
+def test_bytes_and_text_arrive_and_nothing_else_is_left(tmp_path):
     target = tmp_path / "new" / "data.bin"
     assert files.atomic_write_bytes(target, b"\x00first") == target
     files.atomic_write_bytes(target, b"second")
@@ -24,7 +23,7 @@ def test_bytes_and_text_arrive_and_nothing_else_is_left(tmp_path: Path) -> None:
     assert [path.name for path in target.parent.iterdir()] == ["data.bin"]
 
 
-def test_permissions_follow_the_umask(tmp_path: Path) -> None:
+def test_permissions_follow_the_umask(tmp_path):
     previous = os.umask(0o027)
     try:
         files.atomic_write_bytes(tmp_path / "data", b"x")
@@ -33,7 +32,7 @@ def test_permissions_follow_the_umask(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "data").stat().st_mode) == 0o640
 
 
-def test_an_exception_in_the_block_leaves_the_old_file(tmp_path: Path) -> None:
+def test_an_exception_in_the_block_leaves_the_old_file(tmp_path):
     target = tmp_path / "data"
     files.atomic_write_bytes(target, b"old")
 
@@ -59,8 +58,8 @@ def test_an_exception_in_the_block_leaves_the_old_file(tmp_path: Path) -> None:
     ],
 )
 def test_a_failing_disk_gives_one_sentence_and_keeps_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, expected: type[Exception], words: str
-) -> None:
+    tmp_path, monkeypatch, number, expected, words
+):
     target = tmp_path / "data"
     files.atomic_write_bytes(target, b"old")
 
@@ -76,7 +75,7 @@ def test_a_failing_disk_gives_one_sentence_and_keeps_the_old_file(
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_folders_and_devices_are_never_replaced(tmp_path: Path) -> None:
+def test_folders_and_devices_are_never_replaced(tmp_path):
     with pytest.raises(FileNotWrittenError, match="a folder"):
         files.atomic_write_bytes(tmp_path, b"x")
     with pytest.raises(FileNotWrittenError, match="not an ordinary file"):
@@ -86,7 +85,7 @@ def test_folders_and_devices_are_never_replaced(tmp_path: Path) -> None:
         files.atomic_write_bytes(tmp_path / "file" / "below", b"x")
 
 
-def test_a_link_is_followed(tmp_path: Path) -> None:
+def test_a_link_is_followed(tmp_path):
     (tmp_path / "real").write_bytes(b"old")
     (tmp_path / "link").symlink_to(tmp_path / "real")
     files.atomic_write_bytes(tmp_path / "link", b"new")
@@ -94,7 +93,7 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
     assert (tmp_path / "real").read_bytes() == b"new"
 
 
-def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path: Path) -> None:
+def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path):
     target = tmp_path / "state"
     script = (
         "import sys; from reporting.files import atomic_write_bytes\n"
@@ -117,7 +116,7 @@ def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path: Path) -> None:
         target.unlink()
 
 
-def test_leftovers_are_counted_and_other_files_stay(tmp_path: Path) -> None:
+def test_leftovers_are_counted_and_other_files_stay(tmp_path):
     (tmp_path / f".run.1-0{files.TEMPORARY_SUFFIX}.nc").write_bytes(b"half")
     (tmp_path / ".hidden").write_bytes(b"mine")
     (tmp_path / "run.nc").write_bytes(b"whole")

@@ -1,19 +1,80 @@
-"""Reading NetCDF: all of a file, or one sentence, whatever HDF5 does about it."""
+"""NetCDF is written for xarray without it, and read whole or refused in one sentence, whatever HDF5 does."""
 
 import gc
 import os
+import subprocess
+import sys
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from reporting import netcdf
 from reporting.errors import DamagedFileError
+from reporting.groups import Group, Variable, write_groups
 from reporting.netcdf import read_groups
+
+SIZES = {"step": 4, "sensor": 3, "state": 2, "empty": 0}
+_TYPES = ("f8", "f4", "i8", "i1", "U5")
+_NAMES = st.text("abcxyz", min_size=1, max_size=6).map("v_{}".format)
+
+
+@st.composite
+def variables(draw: st.DrawFn, axes: tuple[str, ...]) -> Variable:
+    """Draw a variable of some axes."""
+    values = np.arange(np.prod([SIZES[axis] for axis in axes], dtype=int)) * draw(st.integers(1, 5))
+    shaped = values.reshape([SIZES[axis] for axis in axes]).astype(draw(st.sampled_from(_TYPES)))
+    attrs = {"units": "1", "long_name": draw(st.text("abc äµ", max_size=9))}
+    return Variable(axes, shaped, attrs)
+
+
+@st.composite
+def group(draw: st.DrawFn) -> Group:
+    """Draw a group: some axes have labels, others have coordinates beside them."""
+    axes = st.lists(st.sampled_from(list(SIZES)), unique=True, max_size=3).map(tuple)
+    told = draw(st.dictionaries(_NAMES, axes.flatmap(variables), min_size=1, max_size=4))
+    used = {axis for variable in told.values() for axis in variable.dims}
+    coords = {axis: draw(variables((axis,))) for axis in sorted(used) if draw(st.booleans())}
+    beside = {f"w_{axis}": draw(variables((axis,))) for axis in sorted(used) if draw(st.booleans())}
+    return Group(told, {**coords, **beside}, {"parameter": "e"} if draw(st.booleans()) else {})
+
+
+@settings(max_examples=25)
+@given(groups=st.dictionaries(st.sampled_from(["one", "two", "three"]), group(), min_size=1))
+def test_xarray_reads_what_was_written(groups, tmp_path_factory):
+    file, again = (tmp_path_factory.mktemp("groups") / "file.nc" for _ in range(2))
+    attrs = {"title": "a tree", "seed": 7}
+    write_groups(file, groups, attrs)
+    write_groups(again, groups, attrs)
+    assert file.read_bytes() == again.read_bytes()
+    sets = {name: xr.Dataset(one.variables, one.coords, one.attrs) for name, one in groups.items()}
+    with xr.open_datatree(file, engine="h5netcdf") as tree:
+        xr.testing.assert_identical(
+            tree.load(), xr.DataTree.from_dict({"/": xr.Dataset(attrs=attrs), **sets})
+        )
+        for name, one in groups.items():
+            for key, variable in {**one.variables, **one.coords}.items():
+                assert variable.values.dtype.kind == "U" or tree[name][key].dtype == variable.values.dtype
+
+
+def test_a_run_is_flown_and_stored_without_heavy_libraries():
+    """`uav-twin run --no-report` reads the program's modules and none of these."""
+    code = (
+        "import sys, twin_master.workflow, twin_master.assets.design_source\n"
+        "import calibration.paper.load_test\n"
+        "import calibration.static.errors_in_variables, calibration.static.experiments\n"
+        "import calibration.static.stiffness_curve\n"
+        "heavy = {'xarray', 'pandas', 'dask', 'distributed', 'zarr', 'matplotlib', 'bokeh', 'skfem', 'pymor',"
+        " 'meshio', 'scipy.interpolate', 'scipy.optimize', 'scipy.sparse'}\n"
+        "print(*sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 def tree() -> xr.DataTree:
@@ -36,7 +97,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "a.nc"
 
 
-def test_what_was_written_comes_back_to_the_last_bit(path: Path) -> None:
+def test_what_was_written_comes_back_to_the_last_bit(path):
     with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as opened:
         plain = opened.load()
     found = read_groups(path)
@@ -51,7 +112,7 @@ def test_what_was_written_comes_back_to_the_last_bit(path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"text", b"\x89HDF\r\n\x1a\n", b"CDF\x01" + bytes(40)])
-def test_what_is_no_netcdf_is_one_sentence(tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_netcdf_is_one_sentence(tmp_path, content):
     with pytest.raises(DamagedFileError, match="there is no file"):
         read_groups(tmp_path / "a.nc")
     (tmp_path / "a.nc").write_bytes(content)
@@ -83,12 +144,7 @@ def refuse(path: Path) -> object:
 
 
 @pytest.mark.parametrize("reading", [spin, wait, crash, fill, refuse])
-def test_no_end_a_crash_and_a_full_memory_are_one_sentence(
-    path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-    reading: Callable[[Path], object],
-) -> None:
+def test_no_end_a_crash_and_a_full_memory_are_one_sentence(path, monkeypatch, capfd, reading):
     fork, readers = os.fork, []
 
     def forked() -> int:
@@ -109,7 +165,7 @@ def test_no_end_a_crash_and_a_full_memory_are_one_sentence(
         os.kill(readers[0], 0)
 
 
-def test_finalizers_of_this_process_do_not_run_in_the_reader(path: Path, tmp_path: Path) -> None:
+def test_finalizers_of_this_process_do_not_run_in_the_reader(path, tmp_path):
     """A worker of an FMU must not be ended by a fork that collects the garbage of its parent."""
     told = tmp_path / "told"
 
@@ -131,7 +187,7 @@ def test_finalizers_of_this_process_do_not_run_in_the_reader(path: Path, tmp_pat
     assert told.read_text().split() == [str(os.getpid())]
 
 
-def test_a_warning_of_threads_is_no_error(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_of_threads_is_no_error(path, monkeypatch):
     fork = os.fork
 
     def warned() -> int:
@@ -142,7 +198,7 @@ def test_a_warning_of_threads_is_no_error(path: Path, monkeypatch: pytest.Monkey
     assert read_groups(path).attrs["schema"] == "outer"
 
 
-def test_the_fork_holds_no_file_of_this_process(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fork_holds_no_file_of_this_process(path, monkeypatch):
     """Or the lock of a run folder would outlive a process that is killed while a file is read."""
     monkeypatch.setattr(
         netcdf, "_groups", lambda path: " ".join(found.name for found in Path("/proc/self/fd").iterdir())

@@ -1,12 +1,14 @@
-"""A page is self-contained, escaped, numbered and well-formed."""
+"""A page is self-contained, escaped, numbered and well-formed; its figures say the values that were drawn."""
 
 import base64
 import hashlib
 import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
+from benchmarks.browser import CHROMIUM, open_browser
 from reporting import figures
 from reporting.errors import InvalidFigureError
 from reporting.page import Column, Page, Table, Words, script_source
@@ -63,67 +65,56 @@ def page(title: str = "Title") -> Page:
     return result
 
 
-def test_page_is_well_formed_and_escaped() -> None:
-    text = page("Title <img src=x>").render()
-    checker = parse(text)
-    tags = [tag for tag, _ in checker.seen]
+@pytest.fixture(scope="module")
+def text() -> str:
+    return page("Title <img src=x>").render()
+
+
+def test_page_is_well_formed_and_escaped(text):
+    tags = [tag for tag, _ in parse(text).seen]
     assert tags.count("script") == 1  # what shows values under the pointer
     assert "img" not in tags
     assert "b" in tags  # the numbers of figures and tables only
     assert "one &lt;b&gt;line&lt;/b&gt;" in text
     assert tags.count("figure") == 2
     assert tags.count("section") == 2
+    assert "3.5\u00a0%" in text  # units and figures stay on one line
+    assert "<small>N/mm</small>" in text
+    assert page("Title <img src=x>").render() == text
 
 
-def test_page_asks_nothing_of_any_server() -> None:
-    text = page().render()
-    for tag, attributes in parse(text).seen:
+def test_page_asks_nothing_of_any_server_and_its_links_lead_somewhere(text):
+    seen = parse(text).seen
+    identifiers = [attributes["id"] for _, attributes in seen if "id" in attributes]
+    assert len(identifiers) == len(set(identifiers))
+    for tag, attributes in seen:
         assert tag not in {"link", "iframe", "object", "embed"}
         assert "src" not in attributes
         for name in ("href", "xlink:href"):
             assert (attributes.get(name) or "#").startswith("#")
-    assert "@import" not in text
-    assert not re.search(r"url\((?!#)", text)
+        assert tag != "a" or (attributes["href"] or "").removeprefix("#") in identifiers
+    assert not re.search(r"@import|url\((?!#)", text)
 
 
-def test_a_server_can_allow_the_script_and_no_other() -> None:
-    (script,) = re.findall(r"<script>(.*?)</script>", page().render(), re.DOTALL)
+def test_a_server_can_allow_the_script_and_no_other(text):
+    (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert script_source() == f"'sha256-{digest}'"
 
 
-def test_ids_are_unique_and_links_lead_somewhere() -> None:
-    seen = parse(page().render()).seen
-    identifiers = [attributes["id"] for _, attributes in seen if "id" in attributes]
-    assert len(identifiers) == len(set(identifiers))
-    for tag, attributes in seen:
-        if tag == "a":
-            assert (attributes["href"] or "").removeprefix("#") in identifiers
-
-
-def test_same_content_same_bytes() -> None:
-    assert page().render() == page().render()
-
-
-def test_units_and_figures_stay_on_one_line() -> None:
-    text = page().render()
-    assert "3.5\u00a0%" in text
-    assert "<small>N/mm</small>" in text
-
-
-def test_a_ragged_table_is_refused() -> None:
+def test_a_ragged_table_is_refused():
     with pytest.raises(InvalidFigureError, match="Row 1 of a table has 1 cells"):
         Table((Column("a"), Column("b")), [("1", "2"), ("3",)])
 
 
-def test_an_empty_page_is_still_a_page() -> None:
+def test_an_empty_page_is_still_a_page():
     text = Page("Empty").render()
     parse(text)
     assert "<nav>" not in text
     assert "<script" not in text
 
 
-def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_there() -> None:
+def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_there():
     words = Words("twin_master.report", half=0.5)
     cells = [
         {"text": "name", "cell": "{{ row }}"},
@@ -135,3 +126,110 @@ def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_ther
     assert words.table("t", ["a"], what="length", long=True)[1] == [["a", "0.5", "x"]]
     words.content["tables"]["t"] = {"columns": ["item", "value"], "rows": [["{{ what }}", "1"], ["none", ""]]}
     assert words.table("t", [["b", "2"]], what="length")[1] == [["length", "1"], ["b", "2"]]
+
+
+X = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+Y = np.array([12.0, 13.5, 11.25, 14.0, 15.0])
+
+
+def drawing() -> "figures.Figure":
+    with figures.publication_style():
+        figure = figures.new_figure(4.0)
+        above = figure.add_axes((0.1, 0.6, 0.8, 0.3))
+        above.fill_between(X, Y - 2.0, Y + 1.0, color=figures.PAST, alpha=figures.BAND_OPACITY)
+        above.plot(X, Y, color=figures.PAST, label='speed < "limit"')
+        above.axhline(10.0, color=figures.REFERENCE, label="limit")
+        above.errorbar([2.5], [12.5], yerr=[[0.25], [0.5]], fmt="D", color=figures.PRESENT, label="tested")
+        above.set_xlabel("time (s)")
+        above.set_ylabel("speed (m/s)")
+        figures.panel_label(above, "a", "Tunnel")
+        left = figure.add_axes((0.1, 0.1, 0.35, 0.3))
+        left.plot(X, 10.0**X, color=figures.PAST)
+        left.set_yscale("log")
+        left.set_xlabel("turn")
+        right = figure.add_axes((0.55, 0.1, 0.35, 0.3))
+        right.scatter([1.0, 2.0, 3.0], [0.0, 1.0, 1.0], label="choice")
+        right.set_yticks([0, 1], ["2g", "3g"])
+        field = figure.add_axes((0.55, 0.42, 0.3, 0.1))
+        mesh = field.pcolormesh(
+            [0.5, 1.5, 2.5, 3.5], [0.0, 10.0, 20.0], [[0.1, 0.25, 0.5], [1.0, np.nan, 3.0]]
+        )
+        figure.colorbar(mesh, cax=figure.add_axes((0.9, 0.42, 0.02, 0.1)), label="residual")
+        field.set_xlabel("gauge")
+        image = figure.add_axes((0.1, 0.42, 0.3, 0.1))
+        image.imshow([[1.0, 2.0], [3.0, 4.0]], aspect="auto")
+        image.set_yticks([])
+    return figure
+
+
+SEEN = {
+    "0": ['a Tunnel: speed < "limit"', "time (s): 2", "speed (m/s): 11.25 (9.25 to 12.25)"],
+    "1": ["a Tunnel: tested", "time (s): 2.5", "speed (m/s): 12.5 (12.25 to 13)"],
+    "2": ['speed < "limit"', "turn: 2", "100"],
+    "3": ["choice", "2", "3g"],
+}
+"""What is said at the middle point of each series, in the order of drawing."""
+
+
+CELLS = {
+    (3, 0.9, 0.25): ["gauge: 3", "5", "residual: 0.5"],
+    (3, 0.1, 0.75): ["gauge: 1", "15", "residual: 1"],
+    (3, 0.5, 0.75): None,
+    (4, 0.75, 0.75): ["1", "residual: 2"],
+    (4, 0.25, 0.25): ["0", "residual: 3"],
+}
+"""What is said in maps: number of the panel, share of its width and height; None where there is no value."""
+
+
+def test_drawing_changes_nothing_of_a_figure():
+    figure = drawing()
+    first = figures.to_svg(figure)
+    assert figures.to_svg(figure) == first
+    assert all(artist.get_gid() is None for axes in figure.axes for artist in (axes, *axes.get_children()))
+    assert first.count(b"data-axes=") == 5  # the scale of colours is none
+    assert first.count(b"data-series=") == len(SEEN)  # a limit has no points
+    assert not re.search(rb'id="hover', first)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")
+def test_the_pointer_and_a_tap_are_told_what_was_drawn(tmp_path):
+    page = Page("Values")
+    page.add_figure(figures.to_svg(drawing()), "Caption.", title="Figure")
+    file = tmp_path / "page.html"
+    file.write_text(page.render(), encoding="utf-8")
+    find = """(number) => { const one = document.querySelectorAll('[data-series]')[number];
+      const marks = [...one.querySelectorAll('use')]
+        .map((use) => [+use.getAttribute('x'), +use.getAttribute('y')]);
+      const line = () => [...one.querySelector('path').getAttribute('d').matchAll(/[ML] (\\S+) (\\S+)/g)]
+        .map((found) => [+found[1], +found[2]]);
+      const points = marks.length ? marks : line(), [x, y] = points[points.length >> 1];
+      const at = new DOMPoint(x, y).matrixTransform(one.closest('svg').getScreenCTM());
+      return [at.x, at.y]; }"""
+    with open_browser() as browser:
+        tab = browser.tab()
+        tab.go(f"file://{file}", 1300, 1200)
+        tab.wait("document.readyState === 'complete'")
+        sign = "document.querySelector('.reading')"
+        for number, lines in SEEN.items():
+            x, y = tab.value(f"({find})({number})")
+            tab.send("Input.dispatchMouseEvent", type="mouseMoved", x=x + 2.0, y=y + 1.0)
+            assert tab.value(f"{sign}.innerText").split("\n") == lines
+            assert tab.value("document.querySelectorAll('.ring').length") == 1
+        at = """(panel, right, up) => { const group = document.querySelectorAll('[data-axes]')[panel];
+          const [x0, x1, y0, y1] = JSON.parse(group.dataset.axes).box;
+          const place = new DOMPoint(x0 + right * (x1 - x0), y0 + up * (y1 - y0));
+          const seen = place.matrixTransform(group.closest('svg').getScreenCTM());
+          return [seen.x, seen.y]; }"""
+        for place, cell in CELLS.items():
+            left, top = tab.value(f"({at})({', '.join(map(str, place))})")
+            tab.send("Input.dispatchMouseEvent", type="mouseMoved", x=left, y=top)
+            assert tab.value(f"{sign}.hidden ? null : {sign}.innerText.split('\\n')") == cell
+        tab.press("Escape")
+        assert tab.value(f"{sign}.hidden")
+        tab.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+        tab.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        assert not tab.value(f"{sign}.hidden")
+        tab.send("Emulation.setEmulatedMedia", media="print")
+        assert tab.value(f"getComputedStyle({sign}).display") == "none"
+        assert tab.errors == []
+        assert [one for one in tab.requests if not one.startswith("data:")] == [f"file://{file}"]

@@ -1,7 +1,6 @@
 """The readers of JSON, TOML and tables guess nothing; whatever is wrong is one sentence of the caller's."""
 
 import re
-from pathlib import Path
 
 import pytest
 
@@ -37,7 +36,7 @@ ERRORS = TableErrors(layout=WrongFileError, value=ValueRefusedError)
         ),
     ],
 )
-def test_a_file_is_read_with_and_without_a_byte_order_mark(tmp_path, kind, text, content) -> None:
+def test_a_file_is_read_with_and_without_a_byte_order_mark(tmp_path, kind, text, content):
     (read, parse), file = READERS[kind], tmp_path / "file"
     for encoding in ("utf-8", "utf-8-sig"):
         file.write_text(text, encoding=encoding)
@@ -47,7 +46,7 @@ def test_a_file_is_read_with_and_without_a_byte_order_mark(tmp_path, kind, text,
 @pytest.mark.parametrize(
     ("kind", "pieces", "sentence"), [(kind, *row) for kind in READERS for row in INPUTS.refused(kind)]
 )
-def test_what_is_wrong_is_one_sentence(tmp_path, kind, pieces, sentence) -> None:
+def test_what_is_wrong_is_one_sentence(tmp_path, kind, pieces, sentence):
     content = "".join(text * count for text, count in pieces).encode("latin-1")
     (read, parse), file = READERS[kind], tmp_path / "wing"
     file.write_bytes(content)
@@ -59,7 +58,7 @@ def test_what_is_wrong_is_one_sentence(tmp_path, kind, pieces, sentence) -> None
 
 
 @pytest.mark.parametrize("kind", READERS)
-def test_what_is_not_there_is_one_sentence(tmp_path, kind) -> None:
+def test_what_is_not_there_is_one_sentence(tmp_path, kind):
     for path in (tmp_path / "none.toml", tmp_path):
         with refused(WrongFileError, r"^The file .* cannot be read: (No such|Is a)"):
             READERS[kind][0](path, WrongFileError)
@@ -67,7 +66,7 @@ def test_what_is_not_there_is_one_sentence(tmp_path, kind) -> None:
         READERS[kind][0]("a\0b", WrongFileError)
 
 
-def test_the_deepest_document_that_is_allowed_is_read() -> None:
+def test_the_deepest_document_that_is_allowed_is_read():
     levels = DEEPEST_NESTING - 2  # the document itself and the value of x
     text = "x = " + "[" * levels + "7" + "]" * levels
     assert parse_toml(text, "the draft", WrongFileError)["x"]
@@ -81,7 +80,7 @@ def test_the_deepest_document_that_is_allowed_is_read() -> None:
 # ---------------------------------------------------------------- tables
 
 
-def test_a_table_is_read_with_and_without_a_byte_order_mark(tmp_path: Path) -> None:
+def test_a_table_is_read_with_and_without_a_byte_order_mark(tmp_path):
     file = tmp_path / "loads.csv"
     text = "# two rows\n" + table_text({"load": ("1.5", "-2e3"), "remark": ("a, b", "")})
     for encoding in ("utf-8", "utf-8-sig"):
@@ -92,7 +91,7 @@ def test_a_table_is_read_with_and_without_a_byte_order_mark(tmp_path: Path) -> N
         assert table.lines == (3, 4)
 
 
-def test_blanks_separate_and_names_are_given() -> None:
+def test_blanks_separate_and_names_are_given():
     given = {"header": ("time", "signal"), "separator": None}
     table = parse_table("0.0\t 1\n\n0.1\t -2\n", "x.dat", ERRORS, **given)
     assert table.numbers("signal", "the test").tolist() == [1.0, -2.0]
@@ -102,7 +101,7 @@ def test_blanks_separate_and_names_are_given() -> None:
 
 
 @pytest.mark.parametrize("text", ["٩٫٨١", "٩.٨١", "９.81", "1_000", "9,81", "", "0x10", "9.81 N", "−1"])
-def test_what_is_no_number_in_plain_digits_is_refused(text: str) -> None:
+def test_what_is_no_number_in_plain_digits_is_refused(text):
     with refused(ValueError, r"digits|convert"):
         plain_number(text)
     table = parse_table(f'load,x\n"{text}",1\n', "loads.csv", ERRORS)
@@ -111,12 +110,12 @@ def test_what_is_no_number_in_plain_digits_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(("text", "sentence"), INPUTS.refused("table"))
-def test_what_is_no_table_is_refused(text: str, sentence: str) -> None:
+def test_what_is_no_table_is_refused(text, sentence):
     with refused(WrongFileError, sentence):
         parse_table(text, "loads.csv", ERRORS)
 
 
-def test_values_that_none_can_have() -> None:
+def test_values_that_none_can_have():
     table = parse_table("load,x\n1,inf\n0,1e999\n-1,2\n", "loads.csv", ERRORS)
     with refused(ValueRefusedError, r"line 2: column 'x' holds inf, and a finite number is"):
         table.numbers("x", "the test")
@@ -126,7 +125,7 @@ def test_values_that_none_can_have() -> None:
         table.positive_numbers("load", "the test")
 
 
-def test_a_key_comes_once() -> None:
+def test_a_key_comes_once():
     table = parse_table("name\na\nb\n\na\n", "names.csv", ERRORS)
     table.refuse_repeated((1, 2, 3), "name", "keep one")
     with refused(WrongFileError, r"^names\.csv: the lines 2 and 5 hold the same name; keep one\.$"):

@@ -33,7 +33,7 @@ from twin_master.run_folder import (
     FIELD_NAME,
     KIND,
     create_run_folder,
-    is_run_folder,
+    folder_config,
     lock_run_folder,
     read_config,
     tidy,
@@ -158,7 +158,7 @@ DEEP = '{"a":' * 5000 + "1" + "}" * 5000
 @pytest.mark.parametrize("text", [DEEP, "[1]", "", '{"kind": NaN}', '{"kind": ' + "1" * 5000 + "}"])
 def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
     written(tmp_path, text, name="config.json")
-    assert not is_run_folder(tmp_path)
+    assert not folder_config(tmp_path)
     with pytest.raises(NotResumableError, match="is no run folder"):
         read_config(tmp_path)
     with pytest.raises(RunFolderExistsError, match="not touched"):
@@ -311,7 +311,7 @@ def test_existing_folders_are_refused(whole, tmp_path, library_file):
     mine = tmp_path / "mine"
     mine.mkdir()
     thesis = written(mine, "important", name="thesis.txt")
-    for place, sentence in ((mine, "no run folder"), (thesis, "no folder")):
+    for place, sentence in ((mine, "not touched"), (thesis, "no folder")):
         with pytest.raises(RunFolderExistsError, match=sentence):
             fly(place, library_file, replace=True)
     assert thesis.read_text(encoding="utf-8") == "important"

@@ -3,18 +3,27 @@
 import csv
 import json
 import math
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
-from calibration.result.file import load_calibration, save_calibration
+from calibration.result.file import load_calibration, result_bytes, save_calibration
+from fmu_asset.door.binding import load_binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.packing.contents import build_script_fmu
+from scenarios import asset_scripts, binding_files
 from tests.command_line import refused, said
 from tests.refusals import Inputs
+from tests.twin_master.runs import edited, loaded_from, table_of
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.errors import MissionInputError
+from twin_master.workflow import fly as new_run
 
 INPUTS = Inputs(__file__)
-MODEL = INPUTS.text("spring.toml")
-CAMPAIGN = INPUTS.text("spring_campaign.toml")
 
 
 @pytest.fixture
@@ -25,8 +34,8 @@ def lab(tmp_path: Path) -> Path:
     noise = {10.0: 0.3, 20.0: -0.4, 30.0: 0.1, 40.0: 0.2}
     rows = [f"{force},{force / 0.88 + off}" for force, off in noise.items()]
     (folder / "up.csv").write_text("force,tip\n" + "\n".join(rows))
-    (folder / "campaign.toml").write_text(CAMPAIGN)
-    (tmp_path / "model.toml").write_text(MODEL)
+    (folder / "campaign.toml").write_text(INPUTS.text("spring_campaign.toml"))
+    (tmp_path / "model.toml").write_text(INPUTS.text("spring.toml"))
     return folder
 
 
@@ -95,17 +104,7 @@ def test_a_calibration_of_the_other_kind_is_not_overwritten(lab, make_calibratio
         assert kept.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        ("[[parameter]]", "[[place]]", "'place[1].high' are not keys of a lumped model"),
-        ('unit = "mm"', 'unit = "m"', "1000"),
-        ("mean = 1.0", "mean = 1.6", "the mean 1.6 is not between low 0.5 and high 1.5"),
-        ('unit = "mm"', 'unit = "N"', "unit"),
-        (MODEL[MODEL.index("[[parameter]]") :], "", "has no parameter to calibrate: it lists none"),
-        (".", ",", "line 2: 4 cells came, and the header has 2 columns. A decimal comma makes two cells"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.table("changed.toml")["spring"])
 def test_what_is_wrong_is_one_sentence_and_nothing_is_written(lab, old, new, sentence):
     for file in (lab / "up.csv",) if old == "." else (lab / "campaign.toml", lab.parent / "model.toml"):
         file.write_text(file.read_text().replace(old, new))
@@ -143,3 +142,82 @@ def test_ringdown(plots, tmp_path, options):
     assert found["mode 1, natural frequency"] == pytest.approx(5.65, rel=5e-3)
     assert found["mode 2, natural frequency"] == pytest.approx(29.9, rel=2e-2)
     assert {path.name for path in (out / "figures").iterdir()} >= {"ringdown.svg", "ringdown.png"}
+
+
+TRUTH = 1.04
+NOISE = np.array([0.04, 0.05, 0.06, 0.015])
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the FMU, its model file and `lab`: nine operating points of a pump with thicker oil."""
+    folder = tmp_path_factory.mktemp("pump")
+    (folder / "lab").mkdir()
+    build_script_fmu(asset_scripts()["gear_pump"], folder / "gear_pump.fmu")
+    binding, random = load_binding(binding_files()["gear_pump"]), np.random.default_rng(7)
+    rows = ["speed,load,flow_seen,torque_seen,temperature_seen,filter_pressure_seen"]
+    with FmiAsset(folder / "gear_pump.fmu", binding, isolated=False) as pump:
+        for speed in (1000.0, 1400.0, 1800.0):
+            for pressure in (60.0, 120.0, 180.0):
+                pump.reset({"viscosity_factor": TRUTH})
+                shown = pump.step({"speed": speed, "pressure": pressure}).values
+                noisy = shown + NOISE * random.standard_normal(4)
+                rows.append(",".join(map(repr, [speed, pressure, *noisy.tolist()])))
+    (folder / "lab/points.csv").write_text("\n".join(rows))
+    (folder / "model.toml").write_text(INPUTS.text("pump.toml"))
+    (folder / "lab/campaign.toml").write_text(INPUTS.text("pump_campaign.toml"))
+    return folder
+
+
+def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench, tmp_path):
+    arguments = (bench / "lab", "--model", bench / "model.toml", "--out", tmp_path / "out", "--no-report")
+    said("calibrate", "campaign", *arguments)
+    file = tmp_path / "out/calibration.nc"
+    found = load_calibration(file)
+    assert found.explained is True
+    deviation = found.standard_deviation("viscosity_factor")
+    assert abs(found.mean("viscosity_factor") - TRUTH) < 3.0 * deviation < 0.012
+
+    table = table_of("pump_wear")
+    table["mission"] |= {"steps": 3, "prediction_steps": 2}
+    table["state"][0] |= {"levels_percent": [0, 30], "prior": [1, 0]}
+    table["state"][1] |= {"levels_percent": [0, 60], "prior": [1, 0]}
+    table["calibration"] |= {"draws": 4}
+    table["asset"] = {"kind": "script", "script": "gear_pump", "binding": "gear_pump", "isolated": False}
+    table["truth"]["gains"] = []
+    scenario = loaded_from(table, "pump_wear")
+    folder = new_run(scenario, tmp_path / "run", Overrides(calibration=file), report=False).folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    assert set(tree["calibration"]["draw_value"].values) <= set(found.draws_of("viscosity_factor"))
+    binding = load_binding(binding_files()["gear_pump"])
+    with FmiAsset(bench / "gear_pump.fmu", binding, isolated=False) as pump:
+        pump.reset({"viscosity_factor": found.mean("viscosity_factor")})
+        wanted = pump.step({"speed": 1800.0, "pressure": 180.0}).values
+    np.testing.assert_allclose(tree["truth"]["operation"].values[0], wanted, rtol=1e-6)
+
+    other = replace(found, priors=(replace(found.priors[0], high=9.0),), samples=found.samples + 0.25)
+    (tmp_path / "other.nc").write_bytes(result_bytes(other))  # of a pump that takes thicker oil
+    resolved = resolve_scenario(scenario, Overrides(calibration=tmp_path / "other.nc"))
+    with pytest.raises(
+        MissionInputError, match=r"range of 'viscosity_factor', 0\.8 to 1\.2.* calibration has"
+    ):
+        asset_source(resolved).check()
+
+
+def test_what_an_fmu_does_not_have_is_one_sentence(bench):
+    for old, new, sentence in INPUTS.table("changed.toml")["pump"]:
+        model = bench / "wrong.toml"
+        model.write_text(edited((bench / "model.toml").read_text(), (old, new)))
+        assert sentence in refused("calibrate", "campaign", bench / "lab", "--model", model, code=None)
+    shutil.copytree(bench / "lab", bench / "far")
+    (bench / "far/points.csv").write_text(
+        (bench / "lab/points.csv").read_text().replace("1400.0,", "9400.0,", 1)
+    )
+    for lab, model, sentence in (
+        ("far", bench / "model.toml", "The trial 'points', row 4 of its table"),
+        ("far", bench / "model.toml", "lies outside the range of 'speed', 500 to 2500"),
+        ("lab", bench / "gear_pump.fmu", "is an FMU: give a TOML file"),
+        ("lab", "single_mass_rig", "does not have"),
+    ):
+        assert sentence in refused("calibrate", "campaign", bench / lab, "--model", model, code=None)

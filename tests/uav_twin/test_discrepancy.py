@@ -80,12 +80,3 @@ def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path)
     error = refused("discrepancy", "run", str(campaign), *RIG, "--out", str(tmp_path / "v"))
     assert "1000" in error or "10^" in error or "unit" in error
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
-
-
-def test_the_catalogue():
-    shown = said("discrepancy", "effects")
-    assert "coulomb_friction" in shown
-    assert "ζ_eq(A)" in shown
-    shown = said("discrepancy", "effects", "--show", "coulomb_friction")
-    assert "friction_ratio" in shown
-    assert "Den Hartog" in shown

@@ -40,12 +40,6 @@ def taken(*words: object) -> str:
     return said("discrepancy", "import", *words)
 
 
-def write(name: str, header: str, *rows: object) -> None:
-    """Write a file of a header, lines behind it, and rows of comma-separated cells."""
-    lines = [row if isinstance(row, str) else ",".join(map(str, row)) for row in rows]  # type: ignore[call-overload]
-    Path(name).write_text("\n".join([header, *lines, ""]), "utf-8")
-
-
 def laboratory(folder: Path) -> Campaign:
     """Return a simulated campaign, its trials written as a laboratory's programme writes them."""
     model = choose_model(MODEL).model

@@ -1,4 +1,4 @@
-"""What commands refuse, row by row of `inputs/refused.toml`: a sentence, an exit code, nothing written."""
+"""What commands refuse (`inputs/refused.toml`: a sentence, an exit code, nothing written) and say."""
 
 import shlex
 import shutil
@@ -12,12 +12,12 @@ from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of
 from tests.uav_twin.test_discrepancy_import import TWO
-from tests.uav_twin.test_structure_command import DECK, STRUCTURE
 
 INPUTS = Inputs(__file__)
 RIG = "--model single_mass_rig"
 ROWS = [row for name in INPUTS.table("refused.toml") for row in INPUTS.refused(name)]
 ROWS += [(f"{line} --in-process", *rest) for line, *rest in INPUTS.refused("structural")]
+TOLD = INPUTS.table("told.toml")["rows"]
 
 
 @pytest.fixture(scope="module")
@@ -33,19 +33,21 @@ def folder(
     flown = text[text.index("[asset]") : text.index("[calibration]")]
     for name, content in {
         "a file": "x", "filled/mine.txt": "mine", "pairs/step2/pairs.csv": "x", "broken.toml": "format = 3",
-        "bad.ssp": "nothing", "bar.inp": DECK, "bar.toml": STRUCTURE,
+        "bad.ssp": "nothing", "bar.inp": INPUTS.text("bar.inp"), "bar.toml": INPUTS.text("bar.toml"),
         "library.toml": text.replace(flown, library), "pull.csv": TWO["pull.csv"].decode(),
         "filled/pull.csv": TWO["pull.csv"].decode(),
+        "run.nc": "", "misspelt.csv": "turn,strian_24\n0,1e-4\n", "lines.jsonl": "{}\n",
+        "room.toml": INPUTS.text("room.toml"), "cold.csv": "time,outside\n120,5\n180,-41\n",
         "my_part.toml": structure_files()["bracket"].read_text(encoding="utf-8"),
     }.items():  # fmt: skip
         (place / name).write_text(content, encoding="utf-8")
-    for name, model in (("ball", "ball2"), ("sized", "resize3")):
+    for name, model in (("ball", "ball2"), ("sized", "resize3"), ("room", "room2")):
         shutil.copy(foreign_fmu(model), place / f"{name}.fmu")
     said("discrepancy", "example", "static", place / "campaign", *RIG.split(), "--seed", "3")
     return place
 
 
-@pytest.mark.parametrize(("line", "sentence", "code"), ROWS, ids=[row[0] for row in ROWS])
+@pytest.mark.parametrize(("line", "sentence", "code"), ROWS, ids=[" ".join(row[:2]) for row in ROWS])
 def test_what_is_wrong_is_one_sentence_with_its_exit_code(
     folder, heat_exchanger, monkeypatch, line, sentence, code
 ):
@@ -54,3 +56,10 @@ def test_what_is_wrong_is_one_sentence_with_its_exit_code(
     line = line.replace("RIG", RIG).replace("FOULING", shlex.quote(str(heat_exchanger / "fouling.toml")))
     assert sentence in refused(*shlex.split(line), code=code)
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+@pytest.mark.parametrize(("line", "words"), TOLD, ids=[row[0] for row in TOLD])
+def test_what_is_said(folder, monkeypatch, line, words):
+    monkeypatch.chdir(folder)
+    text = said(*shlex.split(line))
+    assert [word for word in words if word not in text] == []

@@ -1,28 +1,46 @@
 """`uav-twin structure` as a user calls it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import meshio
+import numpy as np
 import pytest
+import xarray as xr
+from fmpy.validation import validate_fmu
 
+from calibration.result.file import load_calibration
+from fe.full.factorisation import Factorisation
+from fe.reduction.reduced_basis import measured_errors
+from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_comparison import calculix_program
+from fmu_asset.archive.fmu_file import packed_design_hash
+from reporting.progress import SilentProgress
+from scenarios import structure_files
+from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
+from tests.twin_master.runs import loaded_from, table_of
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.errors import MissionInputError
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.watch.opening import begun_watch
+from twin_master.workflow import fly as new_run
+from uav_twin import assemble_structure, reduced_structure
 
 INPUTS = Inputs(__file__)
-DECK = INPUTS.text("bar.inp")
-STRUCTURE = INPUTS.text("bar.toml")
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    (tmp_path / "bar.inp").write_text(DECK)
-    (tmp_path / "bar.toml").write_text(STRUCTURE)
+    (tmp_path / "bar.inp").write_text(INPUTS.text("bar.inp"))
+    (tmp_path / "bar.toml").write_text(INPUTS.text("bar.toml"))
     return tmp_path / "bar.toml"
 
 
-def test_info_says_what_a_structure_is(file):
+def test_info_gives_as_data_what_a_structure_is(file):
     record = json.loads(said("structure", "info", file, "--modes", "2", "--quiet", "--json"))
     assert record["mass"] == pytest.approx(7800 * 0.1 * 0.01**2)
     assert record["centre_of_gravity"] == pytest.approx([50, 5, 5])
@@ -32,17 +50,6 @@ def test_info_says_what_a_structure_is(file):
     assert load["strain"]["top"] == pytest.approx(1e-4, rel=1e-9)
     assert load["output"]["end"] == pytest.approx(1e-5, rel=1e-9)
     assert len(record["frequencies"]) == 2
-    text = said("structure", "info", file, "--modes", "2")
-    for part in (
-        "1 8-node hexahedra, 8 nodes",
-        "linear: far too stiff in bending",
-        "line 17: *INITIAL CONDITIONS is not known and was passed over; make sure that the model may do",
-        "1 touch no element, among them 9",
-        "scaled by e",
-        "holds x, y, z",
-    ):
-        assert part in text
-    assert "Load pull: largest displacement 0.01 mm" in text
 
 
 @pytest.mark.skipif(calculix_program() is None, reason="CalculiX (ccx) is not installed")
@@ -66,14 +73,12 @@ def test_verify_compares_with_calculix(file, tmp_path, monkeypatch):
 
 
 def test_a_fault_ends_in_one_sentence(file):
-    file.write_text(STRUCTURE.replace('"ROOT"', '"WALL"'))
+    file.write_text(INPUTS.text("bar.toml", ('"ROOT"', '"WALL"')))
     assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in refused("structure", "info", file)
 
 
-def test_a_shipped_structure_goes_by_its_name_and_nothing_moves_without_mass(file, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert "HEEL" in said("structure", "info", "bracket", "--modes", "1")
-    file.write_text(STRUCTURE.replace("density = 7800", "density = 0"))
+def test_nothing_moves_without_mass(file):
+    file.write_text(INPUTS.text("bar.toml", ("density = 7800", "density = 0")))
     assert "No modes: nothing has mass." in said("structure", "info", file, "--modes", "3")
 
 
@@ -101,9 +106,238 @@ def test_the_field_is_written_for_paraview(file, tmp_path):
     assert field.point_data["displacement"][:, 0].max() == pytest.approx(1e-5 / 0.9, rel=1e-9)
 
 
-def test_fmu_build_packs_a_structure_too(tmp_path):
-    """`fmu build --design` gives the bytes of `structure fmu`."""
-    target, other = tmp_path / "one.fmu", tmp_path / "two.fmu"
-    said("structure", "fmu", "bracket", "--out", str(target))
-    said("fmu", "build", "--design", "bracket", "--out", other)
-    assert target.read_bytes() == other.read_bytes()
+SKIN = stiffened_skin()
+CORNER = SKIN.node[300.0, 0.0, 0.0]
+GAUGES = {"patch": ((50.0, 50.0), (150.0, 50.0)), "skin": ((50.0, 150.0), (150.0, 150.0))}
+LENGTH = 100.0  # mm
+
+
+def ends(name: str) -> list[int]:
+    """Nodes of a gauge."""
+    return [SKIN.node[x, y, 0.0] for x, y in GAUGES[name]]
+
+
+def calculix(folder: Path, e: float, loss: float) -> tuple[dict[str, float], float]:
+    """Strains of the gauges and deflection of the corner [mm] under 1 N, by CalculiX."""
+    deck = stiffened_skin(skin=e, patch=e * (1.0 - loss))
+    (found,) = solved(deck, folder, [(CORNER, (0.0, 0.5, 1.0))])
+    strain = {}
+    for name in GAUGES:
+        first, last = ends(name)
+        strain[name] = float(found[last][0] - found[first][0]) / LENGTH
+    return strain, float(found[CORNER][2])
+
+
+@pytest.fixture(scope="module")
+def matrices(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The structure file beside the matrices that CalculiX stored."""
+    places = ("PATCH", ends("patch")), ("SKIN", ends("skin")), ("CORNER", CORNER), ("CORNER", CORNER)
+    tables = INPUTS.text("skin.toml", *((place, str(nodes)) for place, nodes in places))
+    return write_structure(tmp_path_factory.mktemp("skin"), stiffened_skin, tables)
+
+
+@needs_calculix
+def test_the_reduced_model_is_calculixs_within_its_bound(matrices, tmp_path):
+    model = reduced_structure(matrices)
+    for e, loss in ((1.0, 0.0), (1.05, 0.55)):
+        strain, corner = calculix(tmp_path, e, loss)
+        found = model.static_response({"e": e, "z1": loss, "push": 1.0})
+        printed = 1e-6 * abs(corner) / LENGTH  # seven digits of each displacement
+        np.testing.assert_allclose(
+            found.strain, [*strain.values()], rtol=0.0, atol=found.strain_error_bound + printed
+        )
+        bound = 1e3 * found.displacement_error_bound
+        assert 1e3 * found.displacement[0] == pytest.approx(corner, abs=bound + 1e-6 * abs(corner))
+    errors = measured_errors(assemble_structure(matrices), model, 6)
+    assert errors.broken == 0
+    assert errors.frequency < 1e-4
+
+
+@needs_calculix
+def test_every_command_takes_it(matrices, tmp_path):
+    """Info, reduce and fmu as of a mesh; FMPy finds nothing; what needs a mesh says so."""
+    info = said("structure", "info", matrices, "--modes", "2")
+    assert "725 free" in info
+    assert "whole.sti, whole.mas, whole.dof" in info
+    said("structure", "reduce", matrices, "--states", "2")
+    for kind in ("python", "compiled"):
+        target = tmp_path / f"{kind}.fmu"
+        said("structure", "fmu", matrices, "--out", target, "--kind", kind)
+        assert validate_fmu(str(target)) == []
+    said("fmu", "build", "--design", matrices, "--out", tmp_path / "b.fmu")
+    assert (tmp_path / "b.fmu").read_bytes() == (tmp_path / "python.fmu").read_bytes()
+    for words in (("verify", matrices), ("field", matrices, "--out", tmp_path / "field.vtu")):
+        assert "is a structure from matrices: without a mesh" in refused("structure", *words)
+
+
+@needs_calculix
+def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(matrices, tmp_path):
+    """What CalculiX answers with 0.96 times the modulus, read with noise."""
+    strain, corner = calculix(tmp_path, 0.96, 0.0)
+    random = np.random.default_rng(7)
+    lines = [
+        f"{force},{1e6 * strain['patch'] * force + 0.5 * random.standard_normal()!r},"
+        f"{corner * force + 0.02 * random.standard_normal()!r}"
+        for force in range(100, 1001, 100)
+    ]
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    (lab / "pushes.csv").write_text("\n".join(["force,patch,corner", *lines]) + "\n", encoding="utf-8")
+    (lab / "campaign.toml").write_text(INPUTS.text("skin_campaign.toml"), encoding="utf-8")
+    rig = tmp_path / "rig.toml"
+    said("structure", "fmu", matrices, "--out", tmp_path / "s.fmu", "--rig", rig)
+    words = ("--model", rig, "--asset", "skin 1", "--out", tmp_path / "out", "--no-report")
+    said("calibrate", "campaign", lab, *words)
+    found = load_calibration(tmp_path / "out" / "calibration.nc")
+    assert abs(found.mean("e") - 0.96) < 3.0 * found.standard_deviation("e") < 0.01
+    told = said(
+        "discrepancy", "run", lab, "--model", matrices, "--out", tmp_path / "verdict", "--no-report", "--json"
+    )
+    assert json.loads(told)["verdict"]["kind"] == "nothing missing"
+
+
+@needs_calculix
+def test_a_twin_finds_the_patch_that_calculix_weakened(matrices, tmp_path):
+    """The strains flown are CalculiX' with that patch."""
+    table = INPUTS.table("skin_mission.toml")
+    scenario = LoadedScenario(parse_scenario(table, "mission"), matrices.with_name("mission.toml"), "0" * 64)
+    folder = new_run(scenario, tmp_path / "run", report=False).folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    truth = tree["truth"]
+    assert truth["state"].values[-1] == pytest.approx([0.4])
+    strain, _ = calculix(tmp_path / "calculix", 1.03, 0.4)
+    wanted = float(tree["observed"]["push"][-1]) * np.array([*strain.values()])
+    np.testing.assert_allclose(truth["strain"].values[-1], wanted, rtol=0.0, atol=1e-3 * np.abs(wanted).max())
+    assert tree["filtered"]["mean"].values[-1] == pytest.approx([0.4], abs=0.1)
+    copies = {path.name for path in (folder / "asset" / "flown").iterdir()}
+    assert {"whole.sti", "whole.mas", "whole.dof", "patch_half.sti", "skin_half.sti"} <= copies
+    assert not (folder / "structure.vtu").exists()
+
+
+TRUTH = {"e": 0.96}
+
+
+def write_campaign(folder: Path, structure: Path) -> None:
+    """Write what the full model shows at eight load factors, with noise."""
+    folder.mkdir()
+    full = load_and_assemble(structure)
+    solution = Factorisation(full.stiffness(TRUTH, {})).solve(full.load("weight", 1.0))
+    shown = np.append(1e6 * (full.gauge_output @ solution), 1e3 * (full.displacement_output @ solution))
+    factors, noise = np.linspace(0.5, 4.0, 8), np.array([4.0] * 4 + [0.005])
+    rows = np.outer(factors, shown) + noise * np.random.default_rng(4).standard_normal((8, 5))
+    names = ("heel", "arm", "tip", "back", "sag")
+    lines = [",".join(map(repr, [n, *row])) for n, row in zip(factors.tolist(), rows.tolist(), strict=True)]
+    (folder / "loads.csv").write_text(f"load_factor,{','.join(names)}\n" + "\n".join(lines))
+    (folder / "campaign.toml").write_text(INPUTS.text("bracket_campaign.toml"))
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The calibration file of a bracket whose modulus is 0.96 times the nominal one."""
+    folder = tmp_path_factory.mktemp("bracket")
+    source = structure_files()["bracket"]
+    for file in (source, source.with_suffix(".inp")):
+        shutil.copy(file, folder)
+    write_campaign(folder / "lab", folder / source.name)
+    model, out = folder / "model.toml", folder / "out"
+    said("structure", "fmu", folder / source.name, "--rig", model)
+    words = ("--model", model, "--asset", "bracket 7", "--out", out, "--no-report")
+    said("calibrate", "campaign", folder / "lab", *words)
+    return out / "calibration.nc"
+
+
+def mission(**calibration: object) -> LoadedScenario:
+    """The shipped mission in six shifts, of an asset whose parameters are not named."""
+    table = table_of("bracket")
+    table["mission"] |= {"steps": 6, "prediction_steps": 2}
+    table["asset"] = {"kind": "structure", "structure": "bracket", "isolated": False}
+    table["truth"]["gains"] = []
+    table["calibration"] |= calibration
+    return loaded_from(table, "bracket")
+
+
+def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated):
+    found = load_calibration(calibrated)
+    assert abs(found.mean("e") - TRUTH["e"]) < 3.0 * found.standard_deviation("e") < 0.03
+    assert found.explained is True
+    assert any("does not tell pump" in sentence for sentence in found.findings)
+
+
+def test_the_twin_flies_with_it(calibrated, tmp_path):
+    """Its draws are those of the file; what flies stands at the means; the mass follows the modulus."""
+    found = load_calibration(calibrated)
+    said: list[str] = []
+    folder = new_run(
+        mission(), tmp_path / "run", Overrides(calibration=calibrated), progress=_Noted(said)
+    ).folder
+    wanted_words = f"Calibrated was the model {found.model}; flown is the FMU of the structure bracket, and"
+    assert found.design_hash == packed_design_hash(calibrated.parents[1] / "bracket.fmu")
+    believed = f"The twin believes the design that was calibrated, {found.design_hash[:12]}."
+    assert any(note.startswith(wanted_words) and note.endswith(believed) for note in said)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert wanted_words in page
+    assert believed in page
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    draws = tree["calibration"]["draw_value"].values
+    assert set(draws) <= set(found.draws_of("e"))
+    np.testing.assert_allclose(draws.mean(), found.mean("e"), atol=0.1 * found.standard_deviation("e"))
+    assert (folder / "asset/calibration.nc").read_bytes() == calibrated.read_bytes()
+    full = load_and_assemble(structure_files()["bracket"])
+    solution = Factorisation(full.stiffness({"e": found.mean("e")}, {})).solve(full.load("weight", 1.0))
+    wanted = float(tree["observed"]["load_factor"][0]) * (full.gauge_output @ solution)
+    np.testing.assert_allclose(tree["truth"]["strain"].values[0], wanted, rtol=5e-4)
+
+    said.clear()
+    own = resolve_scenario(mission(), Overrides(calibration=calibrated))
+    with begun_watch(own, mission().file, tmp_path / "watch", _Noted(said)):
+        pass
+    assert any("flown is the watched asset" in note and note.endswith(believed) for note in said)
+
+    scenario = resolve_scenario(mission(draws=3), Overrides(calibration=calibrated))
+    source = asset_source(scenario)
+    source.prepare(tmp_path, SilentProgress())
+    drawn = source.draws(scenario.mission.seed)
+    assert dict(drawn.others).keys() == {"pump"}
+    table = source.observation_table(drawn, build_graphical_model(scenario))
+    row = {"e": float(drawn.values[1])}
+    solution = Factorisation(full.stiffness(row, {})).solve(full.load("weight", 1.0))
+    ratio = table[1, 0, 0] / (1.5 * (full.gauge_output @ solution))
+    arm = (drawn.others["pump"][1] - 2.5) / 2.5  # the pump bends the bracket with nearly all of the load
+    np.testing.assert_allclose(ratio, 1.0 + arm, rtol=1e-3)
+
+
+class _Noted(SilentProgress):
+    """Keeps what is said."""
+
+    def __init__(self, said: list[str]) -> None:
+        self._said = said
+
+    def note(self, message: str) -> None:
+        self._said.append(message)
+
+
+def test_what_the_calibration_does_not_fit_is_refused(calibrated, tmp_path):
+    with pytest.raises(Exception, match="has no samples of `pomp`; it has e, pump"):
+        new_run(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
+    source = structure_files()["bracket"]
+    shutil.copy(source.with_suffix(".inp"), tmp_path)
+    text, table = source.read_text(encoding="utf-8"), mission().scenario.to_dict()
+    for tables, change, words in (
+        (
+            ("asset", "belief"),
+            ("free = true", ""),
+            "parameter pump, which the structure bracket does not know",
+        ),
+        (("belief",), ("density = ", "density = 1"), "bracket, which the twin believes, has the design"),
+    ):
+        (tmp_path / "other.toml").write_text(text.replace(*change), encoding="utf-8")
+        own = {name: table[name] | {"structure": str(tmp_path / "other.toml")} for name in tables}
+        other = loaded_from(table | own, "bracket")
+        with pytest.raises(MissionInputError, match=words):
+            new_run(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
+        assert not (tmp_path / "run").exists()
+    own = {"asset": table["asset"] | {"structure": str(tmp_path / "other.toml")}}  # the truth may be another
+    other = loaded_from(table | own, "bracket")
+    asset_source(resolve_scenario(other, Overrides(calibration=calibrated))).check()

@@ -143,10 +143,6 @@ def _watched_table(standing: Mapping[str, Any]) -> "Table":
     return table
 
 
-SHOWN = 10
-"""Failures that are printed; the others stand in `fleet.json`."""
-
-
 def run(
     file: Path,
     *,
@@ -175,12 +171,13 @@ def learn(
     record = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _report(folder)
-    if json:
-        terminal.print_json({"file": str(out), **record})
-        return
-    headings = ("group", "learnt", "assumed", "mean", "95 % interval")
-    terminal.print_table(headings, lesson_rows(record))
-    terminal.say(f"Learnt: {out}")
+    _answer("learn", {"file": str(out), **record}, json=json, rows=lesson_rows(record), out=out)
+
+
+def _answer(command: str, record: Mapping[str, Any], *, json: bool, **values: Any) -> None:
+    from reporting.page import Words
+
+    terminal.answer(command, Words("twin_master.fleet"), record, json=json, **values)
 
 
 def engine_of(workers: int | None, cluster: str | None) -> "Engine":
@@ -201,6 +198,7 @@ def fly_and_show(
 ) -> "FleetOutcome":
     """Fly a fleet and print what became of it."""
     from twin_master.fleet.flight import fly_fleet
+    from twin_master.fleet.reading import figure_rows
 
     folder = out if out is not None else Path("runs") / fleet.head.name
     try:
@@ -212,11 +210,12 @@ def fly_and_show(
     if report:
         _report(outcome.folder)
     figures = _figures([outcome.folder])
-    if json:
-        told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": len(outcome.failures)}
-        terminal.print_json(told | {"failures": outcome.failures, "ended": outcome.ended, "groups": figures})
-    else:
-        _show(outcome, figures)
+    told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": len(outcome.failures)}
+    told |= {"failures": outcome.failures, "ended": outcome.ended, "groups": figures}
+    _answer(
+        "run", told, json=json, outcome=outcome, rows=figure_rows(figures), groups=list(figures),
+        told=[*outcome.failures.items(), *outcome.ended.items()], page=outcome.folder / "report.html",
+    )  # fmt: skip
     return outcome
 
 
@@ -232,10 +231,7 @@ def compare(folders: list[Path], *, json: bool = False) -> None:
     from twin_master.fleet.reading import figure_rows
 
     figures = _figures(folders)
-    if json:
-        terminal.print_json(figures)
-    else:
-        terminal.print_table(["figure", *figures], figure_rows(figures))
+    _answer("compare", figures, json=json, rows=figure_rows(figures), groups=list(figures))
 
 
 Figures = dict[str, dict[str, "Estimated | int"]]
@@ -250,21 +246,3 @@ def _figures(folders: list[Path]) -> Figures:
         for name, group in open_fleet(folder).items():
             found[name if len(folders) == 1 else f"{folder}: {name}"] = group_figures(group)
     return found
-
-
-def _show(outcome: "FleetOutcome", figures: Figures) -> None:
-    from twin_master.fleet.reading import figure_rows
-
-    console = terminal.console()
-    terminal.print_table(["figure", *figures], figure_rows(figures))
-    kept = f", {counted(outcome.shards_kept, 'shard')} there before" if outcome.shards_kept else ""
-    rate = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s{kept}"
-    short = f", {len(outcome.ended)} ended early" if outcome.ended else ""
-    console.print(f"{rate}; {len(outcome.failures)} failed in flight{short}.", soft_wrap=True)
-    told = [*outcome.failures.items(), *outcome.ended.items()]
-    for name, sentence in told[:SHOWN]:
-        console.print(f"  {name}: {sentence}", soft_wrap=True, style="yellow")
-    if len(told) > SHOWN:
-        console.print(f"  and {len(told) - SHOWN} more, in {outcome.folder / 'fleet.json'}")
-    page = outcome.folder / "report.html"
-    console.print(f"Report: {page}" if page.is_file() else f"Fleet: {outcome.folder}", soft_wrap=True)

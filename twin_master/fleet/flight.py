@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reporting.files import atomic_write_bytes, atomic_write_text, written
-from reporting.folders import lock_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
@@ -22,12 +20,19 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
-from twin_master.fleet.shard import Engine, Kit, Piece, ShardResult, flown, with_parameters
-from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of
+from twin_master.fleet.shard import Engine, Kit, Piece, ShardResult, flown, unflown, with_parameters
+from twin_master.fleet.store import STORE_NAME, check_installed, create_store, sizes_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
-from twin_master.run_folder import CONFIG_NAME, check_versions, held, to_json
+from twin_master.run_folder import (
+    check_versions,
+    create_run_folder,
+    folder_config,
+    held,
+    lock_run_folder,
+    to_json,
+)
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.watch.feeds import file_feed
@@ -157,63 +162,40 @@ def held_fleet(
         It holds something else.
     NotResumableError
         It was begun by another version.
-    FleetError
+    RunFolderError
         Another process holds it.
     """
     config = {"kind": kind, "format": 1, "fleet": record}
-    if folder.exists() and not folder.is_dir():
-        raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
-    if folder.is_dir() and any(folder.iterdir()):
-        found = fleet_config(folder, kind)
-        if not replace_old and {key: found.get(key) for key in config} != json.loads(to_json(config)):
-            otherwise = ", or give --replace" if kind == KIND else ""
-            raise RunFolderExistsError(said("fleet.another", folder=folder, otherwise=otherwise))
-        if not replace_old:
-            check_versions(folder, found, record["seed"])
+    found = None if replace_old else folder_config(folder, kind)
+    if found is None:
+        ready()
+        provenance = collect_provenance(record["seed"]).as_dict()
+        with create_run_folder(folder, {**config, "provenance": provenance}, replace=replace_old):
+            yield config
+        return
+    if {key: found.get(key) for key in config} != json.loads(to_json(config)):
+        otherwise = ", or give --replace" if kind == KIND else ""
+        raise RunFolderExistsError(said("fleet.another", folder=folder, otherwise=otherwise))
+    check_versions(folder, found, record["seed"])
     ready()
-    if replace_old and folder.is_dir():
-        with held(_locked(folder)):
-            shutil.rmtree(folder)
-    with written(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    with held(_locked(folder)):
-        if not (folder / CONFIG_NAME).is_file():
-            provenance = collect_provenance(record["seed"]).as_dict()
-            atomic_write_text(folder / CONFIG_NAME, to_json({**config, "provenance": provenance}))
+    with held(lock_run_folder(folder)):
         yield config
 
 
-def fleet_record(folder: Path) -> dict[str, Any] | None:
-    """Return the configuration of a fleet, flown or watched; None where a folder holds none."""
-    path = folder / CONFIG_NAME
-    found = read_json(path, RunFolderExistsError) if path.is_file() else None
-    if isinstance(found, dict) and found.get("kind") in (KIND, WATCHED_KIND) and "fleet" in found:
-        return found
-    return None
-
-
-def fleet_config(folder: Path, kind: str = KIND) -> dict[str, Any]:
-    """Return the configuration of a folder that holds a fleet of a kind.
+def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
+    """Return the configuration of a folder that holds a fleet, by default one that is flown.
 
     Raises
     ------
     RunFolderExistsError
         It holds no fleet.
     """
-    found = fleet_record(folder)
-    if found is None or found["kind"] != kind:
+    found = folder_config(folder, *(kinds or (KIND,)))
+    if found is None or "fleet" not in found:
         raise RunFolderExistsError(
             f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."
         )
     return found
-
-
-def _locked(folder: Path) -> int:
-    with written(folder):
-        lock = lock_folder(folder)
-    if lock is None:
-        raise FleetError(f"another process flies or watches the fleet in {folder}: wait for it to end.")
-    return lock
 
 
 def flies_model(scenario: Scenario) -> bool:
@@ -354,23 +336,20 @@ def _fly(
             except IN_FLIGHT as error:
                 if not group.files:
                     raise
-                keep(number, members, str(error))  # of one asset with a file of its own
+                keep(number, members, unflown(members[0], str(error)))  # of one asset with a file of its own
             else:
                 yield Piece(number, packed, ready)
 
-    def keep(number: int, members: Sequence[Member], result: ShardResult | str) -> None:
+    def keep(number: int, members: Sequence[Member], result: ShardResult) -> None:
         group, first, end = fleet.groups[number], members[0].row, members[-1].row + 1
-        if isinstance(result, str):
-            status = {"status": np.array([FAILED]), "seed": np.array([members[0].seed])}
-            result = ShardResult(status, {first: result}, {})
         with written(folder / STORE_NAME):
-            for name, values in result.arrays.items():
+            for name, values in result[0].items():
                 arrays(group.name)[name][first:end] = values
-        failures, ended = (
-            {f"{group.name}/{group.members[row].name}": text for row, text in texts.items()}
-            for texts in (result.failures, result.ended)
-        )
-        journal.append({"group": number, "rows": [first, end], "failures": failures, "ended": ended})
+        told = {
+            what: {f"{group.name}/{name}": text for name, text in texts.items()}
+            for what, texts in result[1].items()
+        }
+        journal.append({"group": number, "rows": [first, end], **told})
 
     there = {
         (record["group"], row)

@@ -21,7 +21,7 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text
 from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
-from twin_master.fleet.flight import WATCHED_KIND, fleet_record, told_of
+from twin_master.fleet.flight import KIND, WATCHED_KIND, fleet_config, told_of
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
 from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, has_flown, open_group
@@ -62,7 +62,7 @@ def write_fleet_report(folder: Path | str) -> Path:
 
     Raises
     ------
-    FleetError
+    RunFolderExistsError
         The folder holds no fleet.
     FileNotWrittenError
         The disk is full or the folder cannot be written.
@@ -75,12 +75,12 @@ def fleet_page(folder: Path, most: int) -> str:
 
     Raises
     ------
+    RunFolderExistsError
+        The folder holds no fleet.
     FleetError
-        The folder holds no fleet, or nothing was begun there.
+        It is damaged.
     """
-    config = fleet_record(folder)
-    if config is None:
-        raise FleetError(f"{folder} holds no fleet.")
+    config = fleet_config(folder, KIND, WATCHED_KIND)
     watched, fleet = config["kind"] == WATCHED_KIND, config["fleet"]
     members = sum(len(group.get("members", ())) for group in fleet["groups"])  # of a watch they are not known
     groups = len(fleet["groups"])

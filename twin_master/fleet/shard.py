@@ -8,41 +8,32 @@ in any order.
 """
 
 import logging
-import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from itertools import islice
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
-
-from reporting.progress import Progress
-from twin_master.errors import FleetError
-from twin_master.fleet.plan import Member
-from twin_master.sentences import said
-
-if TYPE_CHECKING:
-    from distributed import Client
-
 import pickle
 import shutil
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
+from itertools import islice
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 from weakref import finalize
 
+import numpy as np
 from numpy.typing import NDArray
 
 from reporting.files import atomic_write_bytes
-from reporting.progress import SilentProgress
+from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.store import outcomes_of
+from twin_master.errors import FleetError
+from twin_master.fleet.plan import Member
+from twin_master.fleet.store import FAILED, outcomes_of
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.mission.replay import BelievedModel, filtered_again
@@ -50,10 +41,13 @@ from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one,
 from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import Fed
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from fe.runtime.reduced import ReducedModel
 
 
@@ -114,23 +108,15 @@ class Kit:
     wing: "ReducedModel | None"
 
 
-@dataclass(frozen=True)
-class ShardResult:
-    """What a worker hands back.
+ShardResult = tuple[Mapping[str, NDArray[Any]], dict[str, dict[str, str]]]
+"""Variables of the store with B rows; and by the names of twins what ended their flights, `failures`, and how
+assets ended their simulations early, `ended`."""
 
-    Attributes
-    ----------
-    arrays : dict of str to array
-        Variables of the store with B rows.
-    failures : dict of int to str
-        What ended flights, by the number in the group.
-    ended : dict of int to str
-        How assets ended their simulations early, likewise.
-    """
 
-    arrays: Mapping[str, NDArray[Any]]
-    failures: Mapping[int, str]
-    ended: Mapping[int, str]
+def unflown(member: Member, sentence: str) -> ShardResult:
+    """Return what is kept of a twin that could not fly, and why."""
+    status = {"status": np.array([FAILED]), "seed": np.array([member.seed])}
+    return status, {"failures": {member.name: sentence}, "ended": {}}
 
 
 @cache
@@ -198,12 +184,11 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
     kit = _unpacked(packed)
     recorded = [member.recording for member in members if member.recording is not None]
     flights = assimilated(kit.knowledge, recorded) if recorded else _flown(kit, members)
-    failures, ended = (
-        {m.row: kit.told(text) for m, text in zip(members, texts, strict=True) if text}
-        for texts in (flights.failure, flights.ended)
-    )
-    arrays = outcomes_of(kit.knowledge, flights, members)
-    return ShardResult(arrays, failures, ended)
+    told = {
+        what: {m.name: kit.told(text) for m, text in zip(members, texts, strict=True) if text}
+        for what, texts in (("failures", flights.failure), ("ended", flights.ended))
+    }
+    return outcomes_of(kit.knowledge, flights, members), told
 
 
 def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
@@ -300,11 +285,7 @@ class Piece:
     members: tuple[Member, ...]
 
 
-Flown = tuple[Piece, ShardResult | str]
-"""A piece with its result, or with a sentence where its one twin ended the process that flew it."""
-
-
-def flown(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterator[Flown]:
+def flown(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterator[tuple[Piece, ShardResult]]:
     """Yield what becomes of each piece, as it is done.
 
     Raises
@@ -321,7 +302,7 @@ def flown(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterat
         yield from _by_workers(client, pieces)
 
 
-def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown]:
+def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[tuple[Piece, ShardResult]]:
     from distributed import CancelledError, as_completed
     from distributed.scheduler import KilledWorker
 
@@ -339,12 +320,13 @@ def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown]:
     for future in waiting:
         piece = given.pop(future.key)
         try:
-            result: ShardResult | str = future.result()  # flown again where its worker died with it
+            result: ShardResult = future.result()  # flown again where its worker died with it
         except KilledWorker:
             if len(piece.members) > 1:
                 waiting.update(submit(replace(piece, members=(one,)) for one in piece.members))
                 continue
-            result = "its flight ended the worker process: fly an FMU that crashes isolated."
+            sentence = "its flight ended the worker process: fly an FMU that crashes isolated."
+            result = unflown(piece.members[0], sentence)
         except CancelledError:
             raise FleetError(said("fleet.lost")) from None
         yield piece, result

@@ -10,11 +10,12 @@ from pathlib import Path
 
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError
-from twin_master.fleet.flight import fleet_record
+from twin_master.fleet.flight import KIND, WATCHED_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.report import fleet_page
 from twin_master.fleet.watching import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.run_folder import folder_config
 from twin_master.viewer.server import serve_page, text_of
 
 WORST = 50
@@ -23,7 +24,7 @@ WORST = 50
 
 def is_fleet(folder: Path) -> bool:
     """Return whether a folder is that of a fleet, flown or watched."""
-    return fleet_record(folder) is not None
+    return folder_config(folder, KIND, WATCHED_KIND) is not None
 
 
 def serve_fleet(

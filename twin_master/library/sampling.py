@@ -1,13 +1,14 @@
 """Sampling an FMU over a grid into an observation library: in several processes, resumable after a kill."""
 
+import io
 import itertools
 import json
 import os
 import shutil
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,16 +17,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
-from fe.runtime.errors import ReducedModelFileError
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuError
-from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, written
+from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.folders import lock_folder
 from reporting.json_file import parse_json
-from reporting.progress import Progress, reporter
+from reporting.progress import Progress, Stage, reporter
 from reporting.provenance import hash_file
 from twin_master.assets.library_source import (
     FORMAT,
@@ -34,12 +32,12 @@ from twin_master.assets.library_source import (
     ObservationLibrary,
     write_observation_library,
 )
-from twin_master.errors import InvalidObservationLibraryError, TwinMasterError, check_names
+from twin_master.errors import InvalidObservationLibraryError, check_names
 from twin_master.library.grid import Float, GridSampler, SamplingGrid
 from twin_master.network.memory import NUMBER, check_fits
 from twin_master.sentences import said
 
-PLAN_NAME = "grid.json"
+PLAN_NAME, ROWS_NAME = "grid.json", "observations.npy"
 _COPIES = 3  # of what was sampled: the blocks, all of them, and the library
 
 
@@ -123,69 +121,51 @@ def sample_library(
     if count < 1:
         raise InvalidObservationLibraryError(f"the number of workers must be at least 1, and {count} came.")
     binding = load_binding(grid.binding)
-    _check_grid(grid, binding)
+    sensors = _check_grid(grid, binding)
     record = _record(grid)
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
     lock = lock_folder(folder)
     if lock is None:
         raise InvalidObservationLibraryError(said("library.locked", folder=folder))
     try:
-        remove_leftovers(folder)
-        found = _read_blocks(grid, folder)
-        todo = [number for number in range(len(grid.blocks)) if number not in found]
-        begin = time.perf_counter()
+        rows = _kept_rows(folder, (grid.size, sensors))
+        todo = [(first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()]
+        kept, begin = len(grid.blocks) - len(todo), time.perf_counter()
         with reporter(progress).stage("Sampling the FMU", total=len(grid.blocks), unit="blocks") as stage:
-            stage.advance(len(found))
-            for number, values in _sampled(grid, todo, min(count, max(len(todo), 1))):
-                _keep_block(_block_file(folder, number), values)
-                found[number] = values
-                stage.advance(1)
+            stage.advance(kept)
+            _sample(grid, rows, todo, count, stage)
         seconds = time.perf_counter() - begin
-        rows = np.concatenate([found[number] for number in sorted(found)])
-        library = ObservationLibrary(sampled_dataset(grid, binding, record, rows))
+        library = ObservationLibrary(sampled_dataset(grid, binding, record, np.array(rows)))
         write_observation_library(out, library)
         shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(lock)
-    return SamplingOutcome(out, library, len(grid.blocks) - len(todo), len(grid.blocks), count, seconds)
+    return SamplingOutcome(out, library, kept, len(grid.blocks), count, seconds)
 
 
-def _sampled(grid: SamplingGrid, todo: list[int], count: int) -> Iterator[tuple[int, Float]]:
-    """Yield number and observations of each block as they come; each thread waits for an FMU of its own."""
-    own = threading.local()
-    samplers: list[GridSampler] = []
-    failures: list[BaseException] = []
+def _sample(grid: SamplingGrid, rows: Float, todo: list[tuple[int, int]], count: int, stage: Stage) -> None:
+    """Fill the rows of blocks, each thread by an FMU of its own; what is finished stays, whatever comes."""
+    samplers, blocks = list[GridSampler](), iter(todo)
 
-    def sample(number: int) -> tuple[int, Float | None]:
+    def work() -> None:
+        with closing(GridSampler(grid)) as sampler:
+            samplers.append(sampler)
+            for first, last in blocks:
+                rows[first:last] = sampler.block(first, last)
+                stage.advance(1)
+
+    with ThreadPoolExecutor(count) as pool:
         try:
-            if not failures:
-                if not hasattr(own, "sampler"):
-                    own.sampler = GridSampler(grid)
-                    samplers.append(own.sampler)
-                return number, own.sampler.block(*grid.blocks[number])
-        except (FmuError, TwinMasterError, OSError) as error:  # what came before is kept
-            failures.append(error)
-        return number, None
-
-    pool = ThreadPoolExecutor(count)
-    try:
-        for done in as_completed([pool.submit(sample, number) for number in todo]):
-            number, values = done.result()
-            if values is not None:
-                yield number, values
-        if failures:
-            raise failures[0]
-    except BaseException as error:
-        failures.append(error)
-        raise
-    finally:
-        for sampler in samplers:
-            sampler.close()
-        pool.shutdown(cancel_futures=True)
+            for done in as_completed([pool.submit(work) for _ in range(min(count, len(todo)))]):
+                done.result()
+        finally:
+            todo.clear()
+            for sampler in samplers:
+                sampler.close()
 
 
-def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
-    """Check names against the binding and the binding against the FMU, before anything is started."""
+def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
+    """Check the grid against binding and FMU, before anything is started; return the number of sensors."""
     parameters = [*grid.parameters, *([grid.parameter] if grid.parameter else [])]
     rows = (
         ("state", grid.states, binding.health),
@@ -206,11 +186,12 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
     fmu = FmiAsset(grid.fmu, binding)
     say_sandbox(Path(grid.fmu), binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
-    count = sensors.stop - sensors.start
+    count: int = sensors.stop - sensors.start
     check_fits(
         {f"{count} sensors at {grid.size} points": _COPIES * NUMBER * count * grid.size},
         "take fewer levels, draws or controls",
     )
+    return count
 
 
 def _record(grid: SamplingGrid) -> dict[str, Any]:
@@ -252,35 +233,17 @@ def _difference(kept: bytes, record: dict[str, Any]) -> str:
         return "damaged"
 
 
-def _block_file(folder: Path, number: int) -> Path:
-    return folder / f"block_{number:05d}.npz"
-
-
-def _keep_block(path: Path, values: Float) -> None:
-    """Keep a finished block, whole or not at all.
-
-    It is not flushed to the disk, which can take longer than sampling it: a block that a power failure
-    damages is recognised by its checksum and sampled again.
-    """
-    temporary = path.with_name(f".{path.stem}{TEMPORARY_SUFFIX}{path.suffix}")
-    with written(path):
-        temporary.write_bytes(arrays_to_bytes({"values": values}))
-        temporary.replace(path)
-
-
-def _read_blocks(grid: SamplingGrid, folder: Path) -> dict[int, Float]:
-    """Return the finished blocks; one that is damaged is sampled again."""
-    found: dict[int, Float] = {}
-    for number, (first, last) in enumerate(grid.blocks):
-        path = _block_file(folder, number)
-        if path.is_file():
-            try:
-                values = arrays_from_bytes(path.read_bytes(), str(path), ["values"])["values"]
-            except (OSError, ReducedModelFileError):
-                continue
-            if values.ndim == 2 and len(values) == last - first:
-                found[number] = values
-    return found
+def _kept_rows(folder: Path, shape: tuple[int, int]) -> Float:
+    """Return the observations (N, G) on disk, NaN where there is none yet; whoever fills them keeps them."""
+    path = folder / ROWS_NAME
+    with suppress(OSError, ValueError):  # there are none, or they are damaged
+        if np.load(path, mmap_mode="r").shape == shape:  # a file that is too short would grow to be written
+            rows: Float = np.load(path, mmap_mode="r+")
+            return rows
+    content = io.BytesIO()
+    np.save(content, np.full(shape, np.nan))
+    atomic_write_bytes(path, content.getvalue())
+    return _kept_rows(folder, shape)
 
 
 def sampled_dataset(

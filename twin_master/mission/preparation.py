@@ -29,10 +29,10 @@ from twin_master.mission.planning import planned
 from twin_master.mission.truth import Plant, Truth
 from twin_master.network.estimator import Estimator
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.identified import IdentifiedSensorModel
+from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy
 from twin_master.network.rewards import RewardModel, RewardSettings
-from twin_master.network.sensor_model import GaussianSensorModel, InspectedSensorModel, check_noise
+from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario

@@ -25,8 +25,6 @@ MOST_BELIEFS, MOST_UNSETTLED = 180, 1000
 """Beliefs to improve the bounds at, where the gap stays wider than asked for; where they cannot settle."""
 _SHARE = 0.9
 """Of the gap of the prior that a descent leaves alone, so that it is short while the gap is wide."""
-_INFORMED = 200
-"""Sweeps of the informed bound; each is a bound."""
 _PARTS = 4
 """Beliefs that a belief is composed of at most, beside the corners."""
 _ROUNDED = 0.15
@@ -157,7 +155,8 @@ class _Upper:
 
     def __init__(self, problem: DecisionProblem) -> None:
         controls, states, _ = problem.transition.shape
-        self._problem, self._corner = problem, _informed(problem)
+        plan = value_iteration(problem.transition, problem.reward, problem.discount)
+        self._problem, self._corner = problem, plan.action_value.T.copy()  # as if the state were told
         self._point, self._value = np.empty((0, states)), np.empty((0, controls))
         self._index()
 
@@ -299,22 +298,6 @@ class _Bounds:
         rows = self.problem.following(belief, first)
         now, later = float(belief @ self.problem.reward[:, first]), float(self.problem.discount[first])
         return now + later * float(self.lower(rows).sum()), now + later * float(self.upper.at(rows).sum())
-
-
-def _informed(problem: DecisionProblem) -> Float:
-    """Return the fast informed bound (U, S): the state is told behind each turn; Hauskrecht 2000."""
-    plan = value_iteration(problem.transition, problem.reward, problem.discount)
-    value, expected = plan.action_value.T, problem.transition.expected
-    for _ in range(_INFORMED):
-        before = value
-        later = [
-            sum(np.max([expected(u, seen * row) for row in before], axis=0) for seen in table)
-            if problem.moves_first
-            else np.max([expected(u, row) for row in before], axis=0)
-            for u, table in enumerate(problem.likelihood)
-        ]
-        value = problem.reward.T + problem.discount[:, None] * np.array(later)
-    return np.asarray(value)
 
 
 @dataclass(frozen=True)

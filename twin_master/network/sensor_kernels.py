@@ -1,14 +1,10 @@
 """Compiled loops of Gaussian sensors: the log density of what they show in each state.
 
-What the draws add to the mean of a sensor, in units of its noise, is put together from few functions of the
-draw (`separated`): with d what is observed beside the mean, -|d - A b_e|^2 / 2 of a draw e then is
--|d|^2 / 2 + (A'd) b_e - |A b_e|^2 / 2, of which the last term is the same for all observations by the same
-sensors. Observations are taken by blocks: the innermost loop of each sum runs over those of the block, which
-are computed side by side, each as it would be alone.
+Observations are taken by blocks: the innermost loop of each sum runs over those of the block, which are
+computed side by side, each as it would be alone.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.compilation import callable_when_compiled, compiled
 from reporting.arrays import Float, Index
@@ -49,197 +45,95 @@ def separated(values: Float, size: float) -> tuple[Float, Float]:
 
 
 @callable_when_compiled
-def _exponentials(exponent: Float, largest: Float, mantissa: Float, bits: Index) -> None:
-    """Fill mantissa (B,) and the bits of a power of two (B,), whose product is exp(exponent - largest).
-
-    The exponential function is written out because a call of one is not computed side by side.
-    """
-    for b in range(len(exponent)):
-        value = max(exponent[b] - largest[b], LEAST)
-        whole = np.floor(value * PER_LOG_TWO + 0.5)
-        rest = (value - whole * LOG_TWO_HIGH) - whole * LOG_TWO_LOW
-        square = rest * rest
-        even = ((EVEN[0] * square + EVEN[1]) * square + EVEN[2]) * square + EVEN[3]
-        odd = rest * ((ODD[0] * square + ODD[1]) * square + ODD[2])
-        mantissa[b] = 1.0 + 2.0 * odd / (even - odd)
-        bits[b] = (np.int64(whole) + 1023) << 52
-
-
-@callable_when_compiled
 def _log_sum_exp(exponent: Float, largest: Float, total: Float, mantissa: Float, bits: Index) -> None:
-    """Fill total (B,) with log sum exp over rows of exponent (E, B); the other arrays (B,) are for work."""
+    """Fill total (B,) with log sum exp over rows of exponent (E, B); the other arrays (B,) are for work.
+
+    The exponential function is written out, as a number times a power of two, because a call of one is not
+    computed side by side.
+    """
     largest[:], total[:] = -np.inf, 0.0
     for e in range(len(exponent)):
         for b in range(len(total)):
             largest[b] = max(largest[b], exponent[e, b])
     power = bits.view(np.float64)
     for e in range(len(exponent)):
-        _exponentials(exponent[e], largest, mantissa, bits)
+        for b in range(len(total)):
+            value = max(exponent[e, b] - largest[b], LEAST)
+            whole = np.floor(value * PER_LOG_TWO + 0.5)
+            rest = (value - whole * LOG_TWO_HIGH) - whole * LOG_TWO_LOW
+            square = rest * rest
+            even = ((EVEN[0] * square + EVEN[1]) * square + EVEN[2]) * square + EVEN[3]
+            odd = rest * ((ODD[0] * square + ODD[1]) * square + ODD[2])
+            mantissa[b] = 1.0 + 2.0 * odd / (even - odd)
+            bits[b] = (np.int64(whole) + 1023) << 52
         for b in range(len(total)):
             total[b] += mantissa[b] * power[b]
     for b in range(len(total)):
         total[b] = largest[b] + np.log(total[b]) if largest[b] > -np.inf else -np.inf
 
 
-@callable_when_compiled
-def _prepare(
-    seen: NDArray[np.bool_], part: Float, function: Float, log_scale: Float, interval: Float,
-    outward: Float, outward_part: Float, offset: Float,
-) -> float:  # fmt: skip
-    """Fill what all observations by the same sensors share in a state, and return the log of their scale.
+@compiled
+def log_densities(
+    shown: Float, mean: Float, inverse: Float, outward: Float, part: Float, function: Float, offset: Float,
+    scale: Float, result: Float,
+) -> None:  # fmt: skip
+    """Fill result (T, S, E) with the log density of each draw, or (T, S, 1) with that of their sum.
 
-    The covariance is the unit matrix plus interval times its transpose, inverted by Woodbury's identity: with
-    the Cholesky factor L of 1 + interval' interval, outward (F, G) is L^-1 interval'.
+    With d the distances in units of the noise it is (|outward d|² - |d|²) / 2 + d part function - offset
+    + scale.
 
     Parameters
     ----------
-    seen : (G,) ndarray of bool
-        Sensors that report.
-    part : (G, R)
-        What each function of the draw adds to each sensor.
-    function : (R, E)
-        By draw.
-    log_scale : (G,)
-        Minus the log deviation.
-    interval : (G, F)
-        In units of the deviation.
-    outward, outward_part, offset : (F, G), (F, R), (E,)
-        To be filled: the third is half the square of what each draw adds.
+    shown : (G, T)
+    mean, inverse : (S, G)
+        The latter is of the deviation, zero where a sensor is lost.
+    outward, part : (S, F, G), (S, G, R)
+    function, offset, scale : (R, E), (S, E), (S,)
+    result : (T, S, E) or (T, S, 1)
+        To be filled.
     """
-    sensors, factors = interval.shape
-    parts = len(function)
-    shared, matrix, square = 0.0, np.eye(factors), np.zeros((parts, parts))
-    outward[:], outward_part[:], offset[:] = 0.0, 0.0, 0.0
-    for g in range(sensors):
-        if not seen[g]:
-            continue
-        shared += log_scale[g] - LOG_ROOT_TWO_PI
-        for f in range(factors):
-            outward[f, g] = interval[g, f]
-            for h in range(f + 1):
-                matrix[f, h] += interval[g, f] * interval[g, h]
-        for r in range(parts):
-            for k in range(r + 1):
-                square[r, k] += part[g, r] * part[g, k]
-    for f in range(factors):
-        for h in range(f):
-            for i in range(h):
-                matrix[f, h] -= matrix[f, i] * matrix[h, i]
-            matrix[f, h] /= matrix[h, h]
-            matrix[f, f] -= matrix[f, h] ** 2
+    sensors, draws, parts, factors = len(shown), offset.shape[1], len(function), outward.shape[1]
+    for first in range(0, shown.shape[1], BLOCK):
+        size = min(BLOCK, shown.shape[1] - first)
+        distance, slope, exponent = (
+            np.empty((sensors, size)),
+            np.empty((parts, size)),
+            np.empty((draws, size)),
+        )
+        bits, square, along, mantissa = (
+            np.empty(size, np.int64),
+            np.empty(size),
+            np.empty(size),
+            np.empty(size),
+        )
+        for s in range(len(mean)):
+            square[:], slope[:] = 0.0, 0.0
             for g in range(sensors):
-                outward[f, g] -= matrix[f, h] * outward[h, g]
-        matrix[f, f] = np.sqrt(matrix[f, f])
-        shared -= np.log(matrix[f, f])
-        for g in range(sensors):
-            outward[f, g] /= matrix[f, f]
-            for r in range(parts):
-                outward_part[f, r] += outward[f, g] * part[g, r]
-    for r in range(parts):
-        for k in range(r + 1):
+                for b in range(size):
+                    distance[g, b] = (shown[g, first + b] - mean[s, g]) * inverse[s, g]
+                    square[b] += distance[g, b] * distance[g, b]
+                for r in range(parts):
+                    for b in range(size):
+                        slope[r, b] += distance[g, b] * part[s, g, r]
             for f in range(factors):
-                square[r, k] -= outward_part[f, r] * outward_part[f, k]
-            half = square[r, k] * (0.5 if k == r else 1.0)
-            for e in range(len(offset)):
-                offset[e] += half * function[r, e] * function[k, e]
-    return shared
-
-
-@callable_when_compiled
-def _exponents(
-    distance: Float, part: Float, function: Float, outward: Float, outward_part: Float, offset: Float,
-    square: Float, slope: Float, exponent: Float,
-) -> None:  # fmt: skip
-    """Fill the log density of each draw (E, B) of observations, `distance` (G, B) off the mean in deviations.
-
-    square (B,) and slope (R, B) are for work.
-    """
-    square[:], slope[:] = 0.0, 0.0
-    for g in range(len(distance)):
-        for b in range(len(square)):
-            square[b] += distance[g, b] * distance[g, b]
-        for r in range(len(slope)):
-            for b in range(len(square)):
-                slope[r, b] += distance[g, b] * part[g, r]
-    for f in range(len(outward)):
-        along = np.zeros(len(square))
-        for g in range(len(distance)):
-            for b in range(len(square)):
-                along[b] += outward[f, g] * distance[g, b]
-        for b in range(len(square)):
-            square[b] -= along[b] * along[b]
-            for r in range(len(slope)):
-                slope[r, b] -= along[b] * outward_part[f, r]
-    for b in range(len(square)):
-        if not square[b] < np.inf:  # an absurd observation
-            square[b], slope[:, b] = np.inf, 0.0
-    for e in range(len(exponent)):
-        for b in range(len(square)):
-            exponent[e, b] = -0.5 * square[b] - offset[e]
-        for r in range(len(slope)):
-            for b in range(len(square)):
-                exponent[e, b] += slope[r, b] * function[r, e]
-
-
-@compiled
-def log_densities(
-    observation: Float,
-    control: Index,
-    mean: Float,
-    part: Float,
-    function: Float,
-    inverse_deviation: Float,
-    log_scale: Float,
-    interval: Float,
-    log_weight: Float,
-    result: Float,
-) -> None:
-    """Fill result (T, S, E) with the log density for each draw, or (T, S, 1) with that of their average.
-
-    mean, inverse_deviation and log_scale = log inverse_deviation are (U, S, G); part (U, S, G, R) and
-    interval (U, S, G, F) are in units of the deviation; function is (R, E) and log_weight (E,).
-    """
-    sensors, draws, factors = observation.shape[1], len(log_weight), interval.shape[3]
-    outward, outward_part = np.empty((factors, sensors)), np.empty((factors, len(function)))
-    offset = np.empty(draws)
-    for u in range(len(mean)):
-        rows = np.nonzero(control == u)[0]
-        first = 0
-        while first < len(rows):
-            seen, size = ~np.isnan(observation[rows[first]]), 1
-            while size < min(BLOCK, len(rows) - first) and np.all(
-                seen != np.isnan(observation[rows[first + size]])
-            ):
-                size += 1
-            block = rows[first : first + size]
-            first += size
-            distance, slope = np.empty((sensors, size)), np.empty((len(function), size))
-            exponent, bits = np.empty((draws, size)), np.empty(size, np.int64)
-            square, largest, mantissa = np.empty(size), np.empty(size), np.empty(size)
-            shown = np.zeros((sensors, size))
+                along[:] = 0.0
+                for g in range(sensors):
+                    for b in range(size):
+                        along[b] += outward[s, f, g] * distance[g, b]
+                for b in range(size):
+                    square[b] -= along[b] * along[b]
             for b in range(size):
-                for g in range(sensors):
-                    shown[g, b] = observation[block[b], g]
-            for s in range(mean.shape[1]):
-                shared = _prepare(
-                    seen, part[u, s], function, log_scale[u, s], interval[u, s], outward, outward_part,
-                    offset,
-                )  # fmt: skip
-                for g in range(sensors):
+                if not square[b] < np.inf:  # an absurd observation
+                    square[b], slope[:, b] = np.inf, 0.0
+            for e in range(draws):
+                for b in range(size):
+                    exponent[e, b] = -0.5 * square[b] - offset[s, e]
+                for r in range(parts):
                     for b in range(size):
-                        distance[g, b] = (shown[g, b] - mean[u, s, g]) * inverse_deviation[u, s, g]
-                    if not seen[g]:
-                        distance[g] = 0.0
-                for e in range(draws if result.shape[2] == 1 else 0):
-                    offset[e] -= log_weight[e]
-                _exponents(
-                    distance, part[u, s], function, outward, outward_part, offset, square, slope, exponent
-                )
-                if result.shape[2] == 1:
-                    _log_sum_exp(exponent, largest, square, mantissa, bits)
-                    for b in range(size):
-                        result[block[b], s, 0] = shared + square[b]
-                else:
-                    for b in range(size):
-                        for e in range(draws):
-                            result[block[b], s, e] = shared + exponent[e, b]
+                        exponent[e, b] += slope[r, b] * function[r, e]
+            if result.shape[2] == 1:
+                _log_sum_exp(exponent, along, square, mantissa, bits)
+                exponent[0] = square
+            for b in range(size):
+                for e in range(result.shape[2]):
+                    result[first + b, s, e] = exponent[e, b] + scale[s]

@@ -1,6 +1,6 @@
 """Gaussian sensors: the likelihood of what they show, residuals, and classes of what they may show.
 
-Kapteyn et al. 2021, eqs. (30) and (32). Sensors that are read only when asked for stand behind the gauges.
+Kapteyn et al. 2021, eqs. (30) and (32).
 """
 
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import rel_entr
 
 from reporting.arrays import Float, Index
@@ -129,7 +129,7 @@ class GaussianSensorModel(QuantityModel):
         for array in (independent, self.total_standard_deviation, self.interval):
             array.setflags(write=False)
         by_control = np.ascontiguousarray(1.0 / independent.transpose(1, 0, 2))
-        self._inverse_deviation, self._log_scale = by_control, np.log(by_control)
+        self._inverse_deviation = by_control
         self._scaled_interval = np.ascontiguousarray(
             self.interval.transpose(1, 0, 2, 3) * by_control[..., None]
         )
@@ -142,6 +142,7 @@ class GaussianSensorModel(QuantityModel):
         size = float(np.max(np.abs(values) * by_control[..., None]))
         part, self._function = separated(beside.reshape(-1, self.draw_count), size)
         self._part = np.ascontiguousarray(part).reshape(*self._mean.shape, len(self._function))
+        self._shared = dict[int, tuple[Any, ...]]()  # by control, of the sensors that were there last
 
     def checked(self, observation: ArrayLike) -> Float:
         """Return observations (..., G) in which NaN stands for a lost sensor.
@@ -230,13 +231,47 @@ class GaussianSensorModel(QuantityModel):
         inside = self.averages_inside and draws == 1
         result = np.zeros((len(observations), self.state_count, draws))
         for sensors in np.eye(self.sensor_count, dtype=bool) if inside else [np.array([True])]:
-            found = np.empty_like(result)
-            log_densities(
-                np.where(sensors, observations, np.nan), control, self._mean, self._part, self._function,
-                self._inverse_deviation, self._log_scale, self._scaled_interval, self._log_weight, found,
-            )  # fmt: skip
-            result += found
+            seen = sensors & ~np.isnan(observations)
+            alike: dict[tuple[int, bytes], list[int]] = {}
+            there = seen.view(f"V{self.sensor_count}")[:, 0].tolist()  # as bytes
+            for row, kind in enumerate(zip(control.tolist(), there, strict=True)):
+                alike.setdefault(kind, []).append(row)
+            for kind, rows in alike.items():
+                result[rows] += self._alike(observations[rows], *kind, draws)
         return result
+
+    def _alike(self, observations: Float, control: int, seen: bytes, draws: int) -> Float:
+        """Return log densities (T, S, E) or (T, S, 1) of what the same sensors show under a control."""
+        there = np.frombuffer(seen, dtype=bool)
+        if self._shared.get(control, (b"",))[0] != seen:
+            self._shared[control] = seen, *self._shared_by(control, there)
+        _, scale, offset, inverse, outward, part = self._shared[control]
+        offset = offset - self._log_weight if draws == 1 else offset
+        result = np.empty((len(observations), self.state_count, draws))
+        shown = np.ascontiguousarray(np.where(there, observations, 0.0).T)
+        mean, function = self._mean[control], self._function
+        log_densities(shown, mean, inverse, outward, part, function, offset, scale, result)
+        return result
+
+    def _shared_by(self, control: int, there: NDArray[np.bool_]) -> tuple[Float, ...]:
+        """Return what all observations by the same sensors share, as `log_densities` takes it.
+
+        First are the log of their scale (S,) and half the squares of what each draw adds (S, E). The
+        covariance is the unit matrix plus interval times its transpose, inverted by Woodbury's identity: with
+        the Cholesky factor L of 1 + interval' interval, outward (F, G) is L^-1 interval'. With d what is
+        observed beside the mean, -|d - A b_e|² / 2 of a draw e is -|d|² / 2 + (A'd) b_e - |A b_e|² / 2.
+        """
+        interval, part = (
+            np.where(there[:, None], given[control], 0.0) for given in (self._scaled_interval, self._part)
+        )
+        root = np.linalg.cholesky(np.eye(interval.shape[-1]) + interval.swapaxes(1, 2) @ interval)
+        outward = np.linalg.solve(root, interval.swapaxes(1, 2))
+        whole = part - outward.swapaxes(1, 2) @ (outward @ part)
+        offset = 0.5 * np.sum((whole.swapaxes(1, 2) @ part @ self._function) * self._function, axis=1)
+        inverse = self._inverse_deviation[control] * there
+        scale = np.log(inverse[:, there]).sum(axis=1) - LOG_ROOT_TWO_PI * there.sum()
+        scale -= np.log(np.einsum("sff->sf", root)).sum(axis=1)
+        return scale, offset, inverse, outward, whole
 
     def nearest(
         self, observation: Float, control_index: int, value: Float, precision: ArrayLike = 1.0
@@ -330,60 +365,6 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
         raise InvalidModelError(
             said("network.noise", key=key, which=which, unit=unit, ends=ends, advice=advice)
         )
-
-
-class InspectedSensorModel(GaussianSensorModel):
-    """Gaussian sensors, and readings of the state itself.
-
-    An observation is a row: its G values, and behind them I readings, NaN where they were not asked for; a
-    row without them has none. Given the state they are independent.
-
-    Parameters
-    ----------
-    *args, **keywords
-        Of `GaussianSensorModel`.
-    reading : (S, I)
-        What each reading shows in each state without noise, SI.
-    reading_deviation : (S, I)
-        Standard deviation of its noise, and of what lies within the interval of the state, SI.
-    asked_by : (I,)
-        Index of the control that asks for each reading.
-    """
-
-    def __init__(
-        self, *args: Any, reading: Float, reading_deviation: Float, asked_by: Index, **keywords: Any
-    ) -> None:
-        super().__init__(*args, **keywords)
-        self.reading, self.reading_deviation, self.asked_by = reading, reading_deviation, asked_by
-
-    def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
-        """Return one row drawn in each of N states (N,) under a control: (N, G + I), SI."""
-        gauges = super().sampled(state, control_index, generator)
-        noise = self.reading_deviation[state] * generator.standard_normal((len(state), len(self.asked_by)))
-        read = np.where(self.asked_by == control_index, self.reading[state] + noise, np.nan)
-        return np.hstack((gauges, read))
-
-    def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
-        """Return log p(o | D, u) for each state (S,), of a row (G + I,) or (G,)."""
-        return np.asarray(self.log_likelihood_sequence(np.asarray(observation)[None], [control_index])[0])
-
-    def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
-        """Return log p(o_t | D_t, u_t) for a sequence of rows: (T, G + I) or (T, G), and (T,) -> (T, S)."""
-        gauges, told = self.apart(observations)
-        return np.asarray(super().log_likelihood_sequence(gauges, control_index) + told)
-
-    def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
-        """Return the values of the sensors, and log p(readings | D); see `GaussianSensorModel.apart`."""
-        rows, count = np.asarray(observation, dtype=np.float64), self.sensor_count
-        gauges, read = self.checked(rows[..., :count]), rows[..., count:]
-        if not read.shape[-1]:
-            return gauges, np.zeros((*read.shape[:-1], self.state_count))
-        if read.shape[-1] != self.reading.shape[1] or np.isinf(read).any():
-            widths = count, count + self.reading.shape[1], rows.shape[-1]
-            raise InvalidObservationError(said("network.readings", widths=widths))
-        residual = (read[..., None, :] - self.reading) / self.reading_deviation
-        density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI
-        return gauges, np.where(np.isnan(read)[..., None, :], 0.0, density).sum(axis=-1)
 
 
 SAMPLES = 1500

@@ -6,7 +6,7 @@ First the sentences with which it begins: what was decided, what is believed, wh
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -173,17 +173,17 @@ def write_report(
     """
     folder = Path(run_folder)
     run = read_run(folder, tree)
-    drawings, words = {}, {}
+    drawings, figures = {}, {}
     for drawn in _figures(run, now, folder):  # one after the other: those of a long mission are large
-        words[drawn.name], drawings[drawn.name] = (drawn.title, drawn.caption), to_svg(drawn.figure)
+        drawings[drawn.name] = to_svg(drawn.figure)
         if drawn.name == MAIN_FIGURE:
             atomic_write_bytes(folder / FIGURE_FOLDER / f"{MAIN_FIGURE}.png", to_png(drawn.figure))
-    told = WORDS.figure(NETWORK, None, run=run)
-    words[NETWORK] = told.title, told.caption
+        figures[drawn.name] = drawn._replace(figure=None)  # type: ignore[arg-type]
+    figures[NETWORK] = WORDS.figure(NETWORK, None, run=run)
     drawings[NETWORK] = resources.files(__package__).joinpath("network.svg").read_bytes()
     for name, drawing in drawings.items():
         atomic_write_bytes(folder / FIGURE_FOLDER / f"{name}.svg", drawing)
-    return atomic_write_text(folder / REPORT_NAME, render_page(run, drawings, words))
+    return atomic_write_text(folder / REPORT_NAME, render_page(run, drawings, figures))
 
 
 def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[ReportFigure]:
@@ -269,103 +269,69 @@ def _check_words(run: Run, check: PredictiveCheck) -> dict[str, str | bool]:
     return {"noise": told, "error": share if high else "", "lowest": lowest, "learnt": learnt}
 
 
-def render_page(run: Run, drawings: Mapping[str, bytes], words: Mapping[str, tuple[str, str]]) -> str:
+def render_page(run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, ReportFigure]) -> str:
     """Return the page: outcome, mission, belief, decision, check, model and run.
 
     Parameters
     ----------
     run
         The run.
-    drawings, words
+    drawings, figures
         Its figures as SVG by the names of their files, and title and caption of each.
     """
     mission = run.scenario.mission
-    page = Page(
-        mission.title or mission.name,
-        WORDS.say("subtitle", run=run, name=mission.name, seed=_seed(run)),
-        footer=(WORDS.say("sources"), WORDS.say("colours")),
-    )
-    page.add_section("Outcome")
-    _add_outcome(page, run)
-    for section in WORDS.content["section"]:
-        shown = [name for name in section["figures"] if name in drawings]
-        if shown:
-            page.add_section(section["title"])
-        for name in shown:
-            page.add_figure(drawings[name], words[name][1], title=words[name][0])
-            if name == "calibration":
-                _add_calibrated(page, run)
-            if name == "learnt":
-                add_learnt(page, run)
-    page.add_section("The run")
-    _add_run(page, run)
+    told: dict[str, Any] = {"run": run, "seed": run.config.get("seed", run.tree.attrs.get("seed", "unknown"))}
+    footer = WORDS.say("sources"), WORDS.say("colours")
+    page = Page(mission.title or mission.name, WORDS.say("subtitle", **told), footer=footer)
+    lost = np.isnan(run.observed)
+    blind = np.flatnonzero(lost.all(axis=1))
+    whole, own = ([one for one in run.learnt if one.of_sensors == each] for each in (False, True))
+    given = run.scenario.transition.probability
+    asset, model, kept = run.summary.get("asset"), run.summary.get("twin_model"), run.calibration
+    told |= {
+        "figures": figures, "opening": opening_sentences(run), "another": _another_truth(run),
+        "referred": any(figure["reference"] is not None for figure in run.summary.get("figures", ())),
+        "share": 100.0 * lost.mean(), "ranges": lost_ranges(run),
+        "blind": turn_ranges(blind, run.step) if len(blind) else "",
+        "learnt_asset": whole, "truth": any(learnt.truth is not None for learnt in whole),
+        "plain": listing(f"{p:g} in {name}" for name, p in given.items() if isinstance(p, int | float)),
+        "learnt_sensors": sensor_rows(run), "labels": [learnt.label for learnt in own],
+        # The prior of the sensors is one, unless the scenario gives one for each.
+        "prior": [
+            f"{learnt.title.lower()} {with_interval(np.nanmedian(learnt.prior, axis=0))}" for learnt in own
+        ],
+        "calibrated": _calibrated(kept), "monitors": _monitors(run),
+        "of": asset and model and calibrated_with(kept, asset, model, run.config.get("inputs", {})),
+    }  # fmt: skip
+    WORDS.fill(page, drawings, **told)
     return page.render()
 
 
-def _seed(run: Run) -> str:
-    return str(run.config.get("seed", run.tree.attrs.get("seed", "unknown")))
-
-
-def _add_outcome(page: Page, run: Run) -> None:
-    page.add_paragraph(" ".join(opening_sentences(run)))
-    for text in _notices(run):
-        page.add_notice(text)
-    figures = run.summary.get("figures", ())
-    referred = any(figure["reference"] is not None for figure in figures)
-    points = " and ".join(factor.title for factor in run.factors if factor.unit == "%")
-    WORDS.add_table(page, "figures", figures, points=points, referred=referred)
-
-
-def add_learnt(page: Page, run: Run) -> None:
-    """Add the last values of what was learnt, of the asset and of its sensors."""
-    given = getattr(run.scenario.transition, "probability", {}) or {}
-    plain = listing(f"{value:g} in {name}" for name, value in given.items() if isinstance(value, int | float))
-    factor = any(learnt.name == "transition_factor" for learnt in run.learnt)
-    whole = [learnt for learnt in run.learnt if not learnt.of_sensors]
-    truth = any(learnt.truth is not None for learnt in whole)
-    WORDS.add_table(page, "learnt_asset", whole, run=run, factor=factor, plain=plain, truth=truth)
-    own = [learnt for learnt in run.learnt if learnt.of_sensors]
-    # The prior of the sensors is one, unless the scenario gives one for each.
-    prior = "; ".join(
-        f"{learnt.title.lower()} {with_interval(np.nanmedian(learnt.prior, axis=0))}" for learnt in own
-    )
-    more = [learnt.label for learnt in own]
-    WORDS.add_table(page, "learnt_sensors", sensor_rows(run), run=run, prior=prior, more=more)
-
-
-def _add_calibrated(page: Page, run: Run) -> None:
-    """Add what the calibration file says of the wing or the model, where the run flew with one."""
-    kept = run.calibration
+def _calibrated(kept: Mapping[str, Any]) -> list[Any]:
+    """Return the figures that the calibration file has of the wing or the model; none without one."""
     names = kept.get("correlation", {}).get("names", ()), kept.get("names", {}).get("quantities", ())
-    found = [
+    return [
         kept[group][name] for group, own in zip(("state", "quantities"), names, strict=True) for name in own
     ]
-    WORDS.add_table(page, "calibrated", found, campaign=kept.get("campaign"), wing=kept.get("asset"))
-    for sentence in kept.get("findings", ()) if found else ():
-        page.add_paragraph(sentence)
-    asset, model = run.summary.get("asset"), run.summary.get("twin_model")
-    told = asset and model and calibrated_with(kept, asset, model, run.config.get("inputs", {}))
-    if told:
-        page.add_paragraph(told)
 
 
-def _notices(run: Run) -> list[str]:
-    """Return what a reader must not miss: another model, alarms, another truth, lost observations."""
-    notices = [notice["sentence"] for notice in run.summary.get("notices", ())]
-    if run.summary.get("asset_and_model_differ"):
-        asset, model = run.summary["asset"], run.summary["twin_model"]
-        notices.insert(0, WORDS.say("differ", asset=asset, model=model))
+def _another_truth(run: Run) -> str | None:
     truth, parameter = true_value(run), run.scenario.calibration.parameter
-    if truth is not None and all(learnt.name != parameter for learnt in run.learnt):
-        sentence = another_truth(parameter, truth, *believed(run))
-        notices += [] if sentence is None else [sentence]
-    lost = np.isnan(run.observed)
-    if lost.any():
-        notices.append(WORDS.say("lost", share=100.0 * lost.mean(), ranges=lost_ranges(run)))
-        if lost.all(axis=1).any():
-            turns = turn_ranges(np.flatnonzero(lost.all(axis=1)), run.step)
-            notices.append(WORDS.say("blind", run=run, turns=turns))
-    return notices
+    if truth is None or any(learnt.name == parameter for learnt in run.learnt):
+        return None
+    return another_truth(parameter, truth, *believed(run))
+
+
+def _monitors(run: Run) -> list[Sequence[str]]:
+    """Return the largest of each figure that the asset reported of itself."""
+    rows: list[Sequence[str]] = []
+    for name, variable in (run.tree["truth"].data_vars if run.truth is not None else {}).items():
+        strain = name == "strain_error_bound"
+        scale, unit = (1.0e6, "µε") if strain else (1.0, variable.attrs.get("units", "1"))
+        if variable.dims == ("step",) and unit != "1" and np.isfinite(variable.values).any():
+            largest = scale * float(np.nanmax(variable.values))
+            rows.append((f"largest {str(name).replace('_', ' ')}", f"{largest:.3g} {unit}"))
+    return rows
 
 
 def turn_ranges(turns: ArrayLike, step_word: str = "turn") -> str:
@@ -393,18 +359,3 @@ def lost_ranges(run: Run) -> str:
     if blind.any():
         phrases.append(f"all {word}s at {turn_ranges(np.flatnonzero(blind), run.step)}")
     return "; ".join(phrases)
-
-
-def _add_run(page: Page, run: Run) -> None:
-    rows: list[Sequence[str]] = []
-    monitors = run.tree["truth"].data_vars if run.truth is not None else {}
-    for name, variable in monitors.items():
-        strain = name == "strain_error_bound"
-        scale, unit = (1.0e6, "µε") if strain else (1.0, variable.attrs.get("units", "1"))
-        if variable.dims == ("step",) and unit != "1" and np.isfinite(variable.values).any():
-            largest = scale * float(np.nanmax(variable.values))
-            rows.append((f"largest {str(name).replace('_', ' ')}", f"{largest:.3g} {unit}"))
-    evidence = float(np.sum(run["filtered/log_evidence"]))
-    WORDS.add_table(page, "run", rows, run=run, seed=_seed(run), evidence=evidence)
-    page.add_paragraph(WORDS.say("timing"))
-    WORDS.add_table(page, "provenance", origin=run.config.get("provenance", {}), config=run.config)

@@ -23,6 +23,7 @@ from twin_master.run_folder import (
     CONFIG_NAME,
     begun_folder,
     check_versions,
+    folder_config,
     kept_scenario,
     read_config,
     resumed_folder,
@@ -161,8 +162,8 @@ def stored(folder: Path) -> bool:
 
 def _config(folder: Path) -> dict[str, Any] | None:
     """Return the configuration of a watch; None where the folder holds something else."""
-    config = read_json(folder / CONFIG_NAME, NotResumableError) if (folder / CONFIG_NAME).is_file() else None
-    return config if isinstance(config, dict) and config.get("watched") else None
+    config = folder_config(folder)
+    return config if config is not None and config.get("watched") else None
 
 
 Decide = Callable[[Mapping[str, Any]], object]

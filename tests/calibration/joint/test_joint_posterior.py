@@ -15,8 +15,8 @@ from scipy import stats
 
 from calibration.dynamics.damped_cosine import RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
-from calibration.dynamics.trials import Frequencies, fit_trials
-from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError, PosteriorError
+from calibration.dynamics.trials import fit_trials
+from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError
 from calibration.joint.inference import infer
 from calibration.joint.measurement import PUBLISHED_MODES, _mean_of, measured_modes, modal_readings
 from calibration.joint.posterior import joint_posterior
@@ -75,9 +75,9 @@ def tables():
 
 
 def test_enumeration_finds_mean_deviation_and_evidence(tables):
-    # Damping priors far from zero, so that alpha and beta integrate in closed form.
+    # Damping priors far from zero, so that alpha and beta are Gaussians in closed form at each point.
     prior = wing_priors(VALIDITY, damping_alpha=(2.0, 0.3), damping_beta=(8e-4, 1e-4))
-    result = asked(tables, priors=prior, count=2000)
+    found = asked(tables, priors=prior, count=20_000)
     axes = np.linspace(0.95, 1.07, 31), np.linspace(0.09, 0.24, 61), np.linspace(0.466, 0.478, 25)
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)  # e, servo, weighed total
     quantities = grid - np.array([0.0, 0.0, 2.0]) * grid[:, 1:2]
@@ -99,30 +99,32 @@ def test_enumeration_finds_mean_deviation_and_evidence(tables):
         log_density += norm.logpdf(MODAL[mode].value, frequency[:, mode], spread)
     design = np.stack([0.5 / omega, 0.5 * omega], axis=2)
     ratios, deviations = np.array([(item.value, item.deviation) for item in MODAL[2:]]).T
-    covariance = design @ np.diag([0.3**2, 1e-4**2]) @ np.swapaxes(design, 1, 2)
-    covariance += np.diag(np.square(deviations))
+    swept = np.diag([0.3**2, 1e-4**2]) @ np.swapaxes(design, 1, 2)
+    covariance = design @ swept + np.diag(np.square(deviations))
     residual = ratios - design @ np.array([2.0, 8e-4])
     solved = np.linalg.solve(covariance, residual[..., None])[..., 0]
     log_density -= 0.5 * np.sum(residual * solved, axis=1)
     log_density -= 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1]
     weight = np.exp(log_density - log_density.max())
-    cell = math.prod(axis[1] - axis[0] for axis in axes)
-    evidence = math.log(weight.sum() * cell) + log_density.max()
     weight /= weight.sum()
-    mean = weight @ quantities
-    deviation = np.sqrt(weight @ (quantities - mean) ** 2)
-    assert result.log_evidence == pytest.approx(evidence, abs=0.02)
-    np.testing.assert_array_less(np.abs(result.mean[:3] - mean), 0.02 * deviation)
-    np.testing.assert_allclose(result.standard_deviation[:3], deviation, rtol=0.02)
+    damping = np.array([2.0, 8e-4]) + (swept @ solved[..., None])[..., 0]
+    reduced = np.einsum("nij,nji->ni", swept, np.linalg.solve(covariance, np.swapaxes(swept, 1, 2)))
+    points = np.hstack([quantities, damping])
+    mean = weight @ points
+    variance = weight @ (points - mean) ** 2
+    variance[3:] += np.array([0.3**2, 1e-4**2]) - weight @ reduced
+    deviation = np.sqrt(variance)
+    np.testing.assert_array_less(np.abs(found.mean(axis=0) - mean), 0.02 * deviation)
+    np.testing.assert_allclose(found.std(axis=0), deviation, rtol=0.02)
 
 
 def test_the_papers_posterior_is_the_limit_without_uncertainty(tables):
     """With f1, the ratios and the total exact, and f2 left out, masses follow e as in the paper."""
     wide = wing_priors(VALIDITY, servo_mass=(0.157, 1.0), pitot_mass=(0.157, 1.0))
     exact = modal_readings([item.value for item in MODAL], (1e-5, 1.0, 1e-6, 1e-6))
-    result = asked(tables, exact, total_mass=weighed(0.472, 1e-7), model_error=(0.0, 0.5), priors=wide)
-    e, servo, pitot, alpha, beta = result.samples.T
-    together = np.corrcoef(result.samples, rowvar=False)
+    found = asked(tables, exact, total_mass=weighed(0.472, 1e-7), model_error=(0.0, 0.5), priors=wide)
+    e, servo, pitot, alpha, beta = found.T
+    together = np.corrcoef(found, rowvar=False)
     assert together[1, 2] == pytest.approx(-1.0, abs=1e-6)
     assert together[0, 1] == pytest.approx(-1.0, abs=1e-4)
     np.testing.assert_allclose(2.0 * servo + pitot, 0.472, atol=1e-6)
@@ -131,10 +133,10 @@ def test_the_papers_posterior_is_the_limit_without_uncertainty(tables):
     shift = math.log(5.6492) - AT_CENTRE[0] - SLOPE[0, 0] * (e - 1.0) - SLOPE[2, 0] * (0.472 - 0.4725)
     np.testing.assert_allclose(servo, 0.169 + shift / along, atol=2e-5)
     for row in range(0, 1000, 100):
-        frequency = line_frequency(result.samples[row, :3])
+        frequency = line_frequency(found[row, :3])
         ratio = rayleigh_damping_ratio(alpha[row], beta[row], frequency)
         np.testing.assert_allclose(ratio, [item.value for item in MODAL[2:]], atol=1e-5)
-    one, two, other = (asked(tables, seed=seed, count=200).samples for seed in (3, 3, 4))
+    one, two, other = (asked(tables, seed=seed, count=200) for seed in (3, 3, 4))
     assert one.tobytes() == two.tobytes()
     assert not np.array_equal(one, other)
     assert one.shape == (200, 5)
@@ -149,55 +151,7 @@ def test_prior_samples_are_the_prior():
     assert np.all((drawn[:, :3] >= LIMITS[:, 0]) & (drawn[:, :3] <= LIMITS[:, 1]))
 
 
-def simulate(generator, prior, model_error):
-    """Draw a wing from the prior and measure it with Gaussian errors; the last are its displacements [m]."""
-    truth = prior_samples(prior, 1, int(generator.integers(2**32)))[0]
-    frequency = line_frequency(truth[None, :3])[0]
-    ratio = rayleigh_damping_ratio(truth[3], truth[4], frequency)
-    wing = frequency * (1.0 + np.array(model_error) * generator.standard_normal(2))
-    deviations = (0.06, 0.3), (0.002, 0.004)
-    measured = wing + deviations[0] * generator.standard_normal(2)
-    measured_ratio = np.maximum(ratio + deviations[1] * generator.standard_normal(2), 1e-4)
-    modal = modal_readings((*measured, *measured_ratio), (*deviations[0], *deviations[1]))
-    scale = weighed(2.0 * truth[1] + truth[2] + 1e-3 * generator.standard_normal(), 1e-3)
-    return truth, modal, scale, STATIC.load / PUBLISHED_LINE.stiffness(truth[0])
-
-
-@pytest.mark.long
-def test_the_truth_has_a_uniform_rank_among_the_samples(tables):
-    """Simulation-based calibration: wings from the prior, cut at zero, with the assumed model error."""
-    generator = np.random.default_rng(2021)
-    prior = wing_priors(VALIDITY, damping_alpha=(0.5, 0.5), damping_beta=(7e-4, 3e-4))
-    repetitions, count = 120, 99
-    ranks = np.empty((repetitions, 5), dtype=int)
-    held = np.zeros(5)
-    for repetition in range(repetitions):
-        truth, modal, scale, displacement = simulate(generator, prior, MODEL_ERROR)
-        errors = generator.standard_normal((2, STATIC.count))
-        static = replace(
-            STATIC, load=STATIC.load + STATIC.load_standard_deviation * errors[0],
-            displacement=displacement + STATIC.displacement_standard_deviation * errors[1],
-        )  # fmt: skip
-        samples = asked(tables, modal, static, scale, priors=prior, seed=repetition, count=count).samples
-        ranks[repetition] = np.sum(samples < truth, axis=0)
-        lower, upper = np.quantile(samples, [0.05, 0.95], axis=0)
-        held += (lower <= truth) & (truth <= upper)
-    assert 0.85 < held.mean() / repetitions < 0.94
-    assert np.all(held / repetitions > 0.79)
-    for place in range(5):
-        counted = np.histogram(ranks[:, place], bins=np.linspace(-0.5, count + 0.5, 9))[0]
-        assert stats.chisquare(counted).pvalue > 1e-3, STATE[place]
-
-
 SHARP = modes(deviation={"frequency_1": 0.001, "frequency_2": 0.03})
-
-
-def test_model_error_is_what_it_says(tables):
-    """Without model error f2 drags the masses along; with it, f2 is left to miss by 4.5 %."""
-    allowed, wide = asked(tables, SHARP), asked(tables, SHARP, model_error=(0.02, 0.05))
-    assert wide.standard_deviation[1] > 1.4 * allowed.standard_deviation[1]
-    assert line_frequency(allowed.samples[:, :3])[:, 1].mean() == pytest.approx(28.6, abs=0.15)
-    assert asked(tables, model_error=(0.0, 0.0)).log_evidence < allowed.log_evidence - 0.5
 
 
 @settings(max_examples=15, deadline=None)
@@ -209,22 +163,20 @@ def test_every_measurement_gives_a_posterior_or_a_clear_refusal(first, ratio, ze
     values = np.array([first, first * ratio, zeta, 0.05])
     modal = modal_readings(values, values * [error, error, 0.2, 0.2])
     try:
-        result = asked(line_table(), modal, total_mass=weighed(total, 1e-3), count=100)
+        found = asked(line_table(), modal, total_mass=weighed(total, 1e-3), count=100)
     except CalibrationError as refusal:
         if "contradict" not in str(refusal) and "negative Rayleigh" not in str(refusal):
             raise
         return
-    assert np.all(np.isfinite(result.samples))
-    assert np.all((result.samples[:, :3] >= LIMITS[:, 0]) & (result.samples[:, :3] <= LIMITS[:, 1]))
-    assert np.all(result.samples[:, 3:] >= 0.0)
-    assert abs(2.0 * result.mean[1] + result.mean[2] - total) < 5e-3
+    assert np.all(np.isfinite(found))
+    assert np.all((found[:, :3] >= LIMITS[:, 0]) & (found[:, :3] <= LIMITS[:, 1]))
+    assert np.all(found[:, 3:] >= 0.0)
+    assert abs(np.mean(2.0 * found[:, 1] + found[:, 2]) - total) < 5e-3
 
 
 def refusal(kind, sentence, **changed):
     return pytest.param(changed, kind, sentence, id=sentence)
 
-
-LIGHT = wing_priors(VALIDITY, servo_mass=(5.0, 0.1))
 
 SOFT = replace(STATIC, displacement=STATIC.displacement * 0.7)
 
@@ -234,12 +186,7 @@ OVERDAMPED = modal_readings((5.6492, 29.9699, 0.01, 0.3), (0.06, 0.3, 1e-4, 1e-3
 @pytest.mark.parametrize(
     ("changed", "kind", "sentence"),
     [
-        refusal(PosteriorError, "must be positive, but 0 were asked", count=0),
-        refusal(PosteriorError, "at most 100,000 samples", count=10**40),
         refusal(ExperimentDataError, "cannot weigh 2 kg", total_mass=weighed(2.0)),
-        refusal(ExperimentDataError, "weighed_mass and its standard", total_mass=weighed(0.472, 0.0)),
-        refusal(ExperimentDataError, "standard deviation from 0 to below 1", model_error=(0.01, 5.0)),
-        refusal(PosteriorError, "prior of servo_mass", priors=LIGHT),
         refusal(OutsideValidityError, "outside", static=SOFT),
         refusal(ExperimentDataError, "negative Rayleigh coefficient", modal=OVERDAMPED),
         refusal(OutsideValidityError, r"pressed against 1\.15, where the model ends", modal=SHARP,
@@ -263,16 +210,12 @@ def test_any_model_is_inferred():
     """Two lines through one point: the posterior of a linear model is the Gaussian of its closed form."""
     priors = tuple(ParameterPrior(name, "1", 1.0, 2.0, -50.0, 50.0, "here") for name in "ab")
     design, read, spread = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-4]]), np.array([3.0, 3.0002]), 1e-5
-    found = infer(priors, lambda ab: (read - ab @ design.T, np.full((len(ab), 2), spread)), count=4000)
+    found = infer(priors, lambda ab: (read - ab @ design.T, np.full((len(ab), 2), spread)), count=20_000)
     precision = design.T @ design / spread**2 + np.eye(2) / 4.0
     mean = np.linalg.solve(precision, design.T @ read / spread**2 + 0.25)
     deviation = np.sqrt(np.diag(np.linalg.inv(precision)))
-    np.testing.assert_allclose(found.mean, mean, atol=0.02 * deviation.max())
-    np.testing.assert_allclose(found.standard_deviation, deviation, rtol=0.02)
-    assert found.effective > 0.8 * found.proposals
-    covariance = design @ (4.0 * np.eye(2)) @ design.T + spread**2 * np.eye(2)
-    expected = stats.multivariate_normal.logpdf(read, design @ np.ones(2), covariance)
-    assert found.log_evidence == pytest.approx(expected, abs=0.02)
+    np.testing.assert_allclose(found.mean(axis=0), mean, atol=0.02 * deviation.max())
+    np.testing.assert_allclose(found.std(axis=0), deviation, rtol=0.02)
 
 
 @pytest.mark.slow
@@ -289,8 +232,8 @@ def test_our_wing():
             young_modulus_factor=point[0], stiffness_loss=(0.0, 0.0), servo_mass=point[1], pitot_mass=point[2]
         )
         np.testing.assert_allclose(found, shapes.frequency[list(shapes.followed)], rtol=1e-5)
-    result = asked(wing)
-    mean, deviation = result.mean, result.standard_deviation
+    found = asked(wing, count=20_000)
+    mean, deviation = found.mean(axis=0), found.std(axis=0)
     # Within a tenth of its deviation e is what the load test alone says; the masses follow from f1 there.
     alone = exact_posterior(
         STATIC, curve=stiffness_curve_of(model.tip_stiffness, model.validity["young_modulus_factor"])
@@ -300,7 +243,6 @@ def test_our_wing():
     assert deviation[1] == pytest.approx(0.0142, abs=5e-4)
     assert mean[3] == pytest.approx(1.033, abs=0.02)
     assert mean[4] == pytest.approx(7.58e-4, rel=0.02)
-    assert result.effective > 15_000
 
 
 # ---------------------------------------------------------------- what the ring-down is made to say
@@ -339,7 +281,7 @@ def trials(softening, seed, noise=1e-4, scatter=0.0):
 def test_a_linear_wing_is_given_its_statistical_error_alone():
     scores = []
     for seed in range(3):
-        fitted = fit_trials(trials(0.0, seed), Frequencies.FITTED, start=None)
+        fitted = fit_trials(trials(0.0, seed), free=True, start=-1.0)
         found = by_name(fitted)
         scores.append(
             (
@@ -348,7 +290,7 @@ def test_a_linear_wing_is_given_its_statistical_error_alone():
                 (found["damping_ratio_2"].value - ZETA2) / found["damping_ratio_2"].deviation,
             )
         )
-        errors = [fit.modes[0].standard_error["frequency"] for fit in fitted.fits]
+        errors = [fit.modes[0].standard_error["frequency"] for fit in fitted]
         expected = math.sqrt(sum(error**2 for error in errors)) / 5.0
         # Five trials in a row seldom scatter, and windows seldom slope, beyond chance.
         assert found["frequency_1"].deviation < 6.0 * expected
@@ -358,7 +300,7 @@ def test_a_linear_wing_is_given_its_statistical_error_alone():
 
 def test_a_wing_that_softens_is_given_its_spread():
     slope = 0.07
-    found = by_name(fit_trials(trials(slope, 1), Frequencies.FITTED, start=None))
+    found = by_name(fit_trials(trials(slope, 1), free=True, start=-1.0))
     # Windows of 0.8 s from 0.4 s on, as far as the mode stands above the noise; spread of the log amplitude.
     decay = 2.0 * math.pi * F1 * ZETA1
     last = min(5.6, math.log(0.012 / (4.0 * 1e-4)) / decay)
@@ -368,8 +310,8 @@ def test_a_wing_that_softens_is_given_its_spread():
 
 def test_frequencies_of_spectral_peaks_carry_their_bias():
     """Skirts of the first mode move the second peak: the authors' procedure is off, and says so."""
-    found = by_name(fit_trials(trials(0.0, 2), Frequencies.PEAKS, start=None))
-    fitted = by_name(fit_trials(trials(0.0, 2), Frequencies.FITTED, start=None))
+    found = by_name(fit_trials(trials(0.0, 2), start=-1.0))
+    fitted = by_name(fit_trials(trials(0.0, 2), free=True, start=-1.0))
     bias = abs(found["frequency_2"].value - F2)
     assert bias > 5.0 * fitted["frequency_2"].deviation
     assert found["frequency_2"].deviation > 0.5 * bias

@@ -69,38 +69,6 @@ def test_seeds_of_purposes_do_not_depend_on_how_often_they_are_asked_for():
     assert states[0] == states[2] != states[1]
 
 
-@pytest.mark.parametrize(
-    ("grid", "density"),
-    [
-        ([0.0, 1.0], [1.0, 1.0]),
-        ([0.0, 1.0, 1.0], [1.0, 1.0, 1.0]),
-        ([0.0, 1.0, 2.0], [1.0, -1.0, 1.0]),
-        ([0.0, 1.0, 2.0], [0.0, 0.0, 0.0]),
-        ([0.0, 1.0, 2.0], [1.0, np.nan, 1.0]),
-        ([0.0, 1.0, np.inf], [1.0, 1.0, 1.0]),
-    ],
-)
-def test_what_is_no_density_is_refused(grid, density):
-    with pytest.raises(PosteriorError):
-        ScalarPosterior(np.array(grid), np.array(density))
-
-
-@pytest.mark.parametrize(
-    ("ask", "words"),
-    [
-        (lambda: gaussian()[1].quantile(1.1), "from 0 to 1"),
-        (lambda: gaussian()[1].samples(0, 0), "number of samples"),
-        (lambda: gaussian()[1].samples(0, 10**40), "at most 10,000,000 samples"),
-        (lambda: GaussianPrior(np.nan, 1.0), "prior"),
-        (lambda: GaussianPrior(1.0, 0.0), "prior"),
-        (lambda: GaussianPrior(1.0, np.inf), "prior"),
-    ],
-)
-def test_senseless_requests_are_refused(ask, words):
-    with pytest.raises(PosteriorError, match=words):
-        ask()
-
-
 # ---------------------------------------------------------------- stiffness curves
 
 
@@ -140,21 +108,9 @@ def test_the_inverse_inverts_also_beyond_the_table(factor):
     assert float(curve.young_modulus_factor(curve.stiffness(factor))) == pytest.approx(factor, abs=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: stiffness_line(-1.0, 700.0), "rise with e"),
-        (lambda: stiffness_line(1.0, -5.0), "positive"),
-        (lambda: stiffness_curve_of(lambda e: 700.0 - e, RANGE), "rise with e"),
-        (
-            lambda: stiffness_curve_of(lambda e: 600.0 + 100.0 * e + 5.0 * (70.0 * e // 1.0), RANGE),
-            "too rough",
-        ),
-    ],
-)
-def test_bad_curves_are_refused(make, words):
-    with pytest.raises(PosteriorError, match=words):
-        make()
+def test_a_rough_curve_is_refused():
+    with pytest.raises(PosteriorError, match="too rough"):
+        stiffness_curve_of(lambda e: 600.0 + 100.0 * e + 5.0 * (70.0 * e // 1.0), RANGE)
 
 
 # ---------------------------------------------------------------- the exact posterior
@@ -220,10 +176,6 @@ def test_published_pairs():
     # The closed form of the paper's filter meets the paper's Table 1 to its last digit.
     ratio = exact_posterior(DATA, measure="ratio")
     assert f"{ratio.mean:.4f} {ratio.standard_deviation:.4f}" == "1.0073 0.0103"
-    # the grid does not matter
-    coarse, fine = exact_posterior(DATA, grid_size=301), exact_posterior(DATA, grid_size=8001)
-    assert coarse.mean == pytest.approx(fine.mean, abs=1e-9)
-    assert coarse.standard_deviation == pytest.approx(fine.standard_deviation, rel=1e-7)
     # measurements far from the prior are followed
     stiff = dataclasses.replace(
         DATA, displacement=DATA.load / PUBLISHED_LINE.stiffness(1.6), displacement_standard_deviation=1e-6,
@@ -235,5 +187,3 @@ def test_published_pairs():
     curve = stiffness_line(575.2, 101.8, "narrow model", 0.9, 0.99)
     with pytest.raises(OutsideValidityError, match=r"outside \[0.9, 0.99\], where narrow model"):
         exact_posterior(DATA, curve=curve)
-    with pytest.raises(PosteriorError, match="zero offset"):
-        log_likelihood(PUBLISHED_LINE, DATA, FACTORS, measure="ratio", zero_offset_standard_deviation=1e-4)

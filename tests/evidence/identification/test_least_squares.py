@@ -7,7 +7,6 @@ from evidence.identification import least_squares
 from evidence.identification.errors import IdentificationError
 from evidence.identification.identifiability import analyse, profile
 from evidence.identification.least_squares import DesignFit, identify, minimise_local
-from evidence.identification.local_model import LocalModel
 from evidence.identification.parameters import FreeParameter, scaled, values_of, with_values
 from evidence.identification.targets import Targets, Weights
 from fe.wing.design import WingDesign
@@ -42,9 +41,7 @@ def recovered(
     return identify(start, free, virtual_targets, tolerance=2e-4)
 
 
-def test_known_numbers_are_recovered(
-    recovered: DesignFit, virtual_design: WingDesign, free: tuple[FreeParameter, ...]
-) -> None:
+def test_known_numbers_are_recovered(recovered, virtual_design, free):
     assert recovered.converged
     assert recovered.iterations[0].objective > 100.0 * recovered.iterations[-1].objective
     error = scaled(free, recovered.values) - scaled(free, values_of(virtual_design, free))
@@ -52,9 +49,7 @@ def test_known_numbers_are_recovered(
     assert np.abs(scaled(free, recovered.start) - scaled(free, recovered.values)).max() > 0.04
 
 
-def test_the_solution_is_a_fixed_point(
-    recovered: DesignFit, free: tuple[FreeParameter, ...], virtual_targets: Targets
-) -> None:
+def test_the_solution_is_a_fixed_point(recovered, free, virtual_targets):
     again = identify(recovered.design, free, virtual_targets, tolerance=2e-4)
     assert again.converged
     assert len(again.iterations) == 1
@@ -62,17 +57,13 @@ def test_the_solution_is_a_fixed_point(
     assert again.iterations[-1].objective == pytest.approx(recovered.iterations[-1].objective, abs=1e-6)
 
 
-def test_without_weight_the_prior_decides(
-    virtual_model: LocalModel, some_parameters: tuple[FreeParameter, ...], virtual_targets: Targets
-) -> None:
+def test_without_weight_the_prior_decides(virtual_model, some_parameters, virtual_targets):
     loose = Weights(**dict.fromkeys(Weights.__dataclass_fields__, 1000000.0))
     found = minimise_local(virtual_model, some_parameters, virtual_targets, loose, 100.0)
     assert np.abs(scaled(some_parameters, found)).max() < 1e-6
 
 
-def test_bounds_and_the_radius_are_kept(
-    virtual_model: LocalModel, some_parameters: tuple[FreeParameter, ...], virtual_targets: Targets
-) -> None:
+def test_bounds_and_the_radius_are_kept(virtual_model, some_parameters, virtual_targets):
     softer = Targets(**{**virtual_targets.__dict__, "strain": 2.0 * virtual_targets.strain})
     found = minimise_local(virtual_model, some_parameters, softer, Weights(), 0.3)
     step = scaled(some_parameters, found) - scaled(some_parameters, virtual_model.values)
@@ -87,16 +78,14 @@ def test_bounds_and_the_radius_are_kept(
         assert parameter.lower - 1e-12 <= value <= parameter.upper + 1e-12
 
 
-def test_a_start_outside_the_bounds_is_refused(
-    virtual_design: WingDesign, some_parameters: tuple[FreeParameter, ...], virtual_targets: Targets
-) -> None:
+def test_a_start_outside_the_bounds_is_refused(virtual_design, some_parameters, virtual_targets):
     one = some_parameters[0]
     narrow = FreeParameter(one.name, one.unit, one.mean, one.standard_deviation, 1.0, 2.0, one.why, one.path)
     with pytest.raises(IdentificationError, match="outside its bounds of 1 to 2"):
         identify(virtual_design, [narrow], virtual_targets)
 
 
-def test_the_analysis_tells_known_from_unknown(recovered: DesignFit, virtual_targets: Targets) -> None:
+def test_the_analysis_tells_known_from_unknown(recovered, virtual_targets):
     analysis = analyse(recovered, virtual_targets, Weights())
     jacobian = analysis.singular_values[:, None] * analysis.directions
     covariance = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(FREE)))
@@ -109,9 +98,7 @@ def test_the_analysis_tells_known_from_unknown(recovered: DesignFit, virtual_tar
     assert nothing.width == pytest.approx(np.ones(len(FREE)))
 
 
-def test_a_profile_of_a_nearly_linear_number_is_a_parabola(
-    recovered: DesignFit, virtual_targets: Targets
-) -> None:
+def test_a_profile_of_a_nearly_linear_number_is_a_parabola(recovered, virtual_targets):
     analysis = analyse(recovered, virtual_targets, Weights())
     found = profile(recovered, virtual_targets, Weights(), analysis, "net lift at 3g")
     assert found.rise.min() == pytest.approx(0.0, abs=1e-3)
@@ -121,11 +108,8 @@ def test_a_profile_of_a_nearly_linear_number_is_a_parabola(
 
 
 def test_steps_that_are_refused_again_and_again_are_no_convergence(
-    monkeypatch: pytest.MonkeyPatch,
-    virtual_design: WingDesign,
-    free: tuple[FreeParameter, ...],
-    virtual_targets: Targets,
-) -> None:
+    monkeypatch, virtual_design, free, virtual_targets
+):
     """The local model promises that farther is better, and the full model never keeps it."""
     costs = iter([1.0] + [2.0] * 50)
 

@@ -1,19 +1,18 @@
 import numpy as np
 import pytest
 
-from evidence.identification.local_model import LocalModel, build_local_model
-from evidence.identification.parameters import FreeParameter, deviations, values_of, with_values
+from evidence.identification.local_model import build_local_model
+from evidence.identification.parameters import deviations, values_of, with_values
 from evidence.identification.pieces import reduced, wing_pieces
 from evidence.identification.residuals import fitted_residuals
-from evidence.identification.targets import Targets, Weights
-from fe.wing.design import WingDesign
+from evidence.identification.targets import Weights
 from fe.wing.operators import assemble
 from fe.wing.responses import eigenmodes, solve_static
 from tests.wings import tip_stiffness
 
 
 @pytest.mark.parametrize("relief", [False, True])
-def test_the_pieces_are_those_of_the_operators(virtual_design: WingDesign, relief: bool) -> None:
+def test_the_pieces_are_those_of_the_operators(virtual_design, relief):
     design = virtual_design.changed(lift={"inertia_relief": relief})
     operators = assemble(design)
     random = np.random.default_rng(3)
@@ -29,7 +28,7 @@ def test_the_pieces_are_those_of_the_operators(virtual_design: WingDesign, relie
 
 
 @pytest.mark.long
-def test_values_are_those_of_the_full_model(virtual_model: LocalModel, virtual_design: WingDesign) -> None:
+def test_values_are_those_of_the_full_model(virtual_model, virtual_design):
     operators = assemble(virtual_design)
     wing = virtual_model.wing
     for loss in ((0.0, 0.0), (0.8, 0.0), (0.6, 0.0), (0.8, 0.8)):
@@ -46,7 +45,7 @@ def test_values_are_those_of_the_full_model(virtual_model: LocalModel, virtual_d
         assert own == pytest.approx(modes.frequency[modes.flapwise_bending], rel=1e-5)
 
 
-def test_slopes_are_differences_of_values(virtual_model: LocalModel) -> None:
+def test_slopes_are_differences_of_values(virtual_model):
     wing, factor, h = virtual_model.wing, 1.0073, 1e-4
     for slope, value in (
         (wing.strain_slope(factor).value, lambda e: wing.strain(e, (0.0, 0.0)).value),
@@ -58,11 +57,8 @@ def test_slopes_are_differences_of_values(virtual_model: LocalModel) -> None:
 
 @pytest.mark.long
 def test_the_jacobian_is_that_of_the_full_model(
-    virtual_model: LocalModel,
-    virtual_design: WingDesign,
-    some_parameters: tuple[FreeParameter, ...],
-    virtual_targets: Targets,
-) -> None:
+    virtual_model, virtual_design, some_parameters, virtual_targets
+):
     # Two wings on either side, each with a basis of its own: every approximation is in the difference.
     weights, width = Weights(), deviations(some_parameters)
     base = values_of(virtual_design, some_parameters)
@@ -81,9 +77,7 @@ def test_the_jacobian_is_that_of_the_full_model(
         assert np.abs(jacobian[:, number] - difference).max() < 0.002 * largest + 0.02
 
 
-def test_an_affine_step_is_exact(
-    virtual_model: LocalModel, virtual_design: WingDesign, some_parameters: tuple[FreeParameter, ...]
-) -> None:
+def test_an_affine_step_is_exact(virtual_model, virtual_design, some_parameters):
     values = virtual_model.values.copy()
     names = [parameter.name for parameter in some_parameters]
     values[names.index("skin modulus at 0")] *= 1.02

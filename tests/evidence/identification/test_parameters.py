@@ -1,27 +1,31 @@
+"""Free numbers of a design, where they stand in it, and the file of a design."""
+
+import tomllib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evidence.identification.comparison import _row
+from evidence.identification.design_file import DIGITS, HEADER, _number, design_toml, rounded
 from evidence.identification.errors import IdentificationError
 from evidence.identification.parameters import (
     CLUSTERS,
-    FreeParameter,
     fixed_parameters,
     layout_of,
-    scaled,
     set_layout,
     values_of,
     wing_parameters,
     with_values,
 )
-from fe.wing.design import WingDesign, load_design
+from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design, parse_design
 
 DESIGN = load_design()
 PARAMETERS = wing_parameters(DESIGN)
 
 
-def test_every_parameter_is_documented_and_bounded() -> None:
+def test_every_parameter_is_documented_and_bounded():
     names = [parameter.name for parameter in (*PARAMETERS, *fixed_parameters())]
     assert len(names) == len(set(names))
     for parameter, value in zip(PARAMETERS, values_of(DESIGN, PARAMETERS), strict=True):
@@ -33,7 +37,7 @@ def test_every_parameter_is_documented_and_bounded() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.floats(-0.4, 0.4), min_size=len(PARAMETERS), max_size=len(PARAMETERS)))
-def test_what_is_written_is_read_back(steps: list[float]) -> None:
+def test_what_is_written_is_read_back(steps):
     values = values_of(DESIGN, PARAMETERS)
     width = np.array([parameter.standard_deviation for parameter in PARAMETERS])
     lower = np.array([parameter.lower for parameter in PARAMETERS])
@@ -43,7 +47,7 @@ def test_what_is_written_is_read_back(steps: list[float]) -> None:
     assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
-def test_writing_one_number_changes_nothing_else() -> None:
+def test_writing_one_number_changes_nothing_else():
     for parameter in PARAMETERS:
         if not parameter.path:
             continue
@@ -52,7 +56,7 @@ def test_writing_one_number_changes_nothing_else() -> None:
         assert values_of(moved, others).tolist() == values_of(DESIGN, others).tolist()
 
 
-def test_the_layout_is_two_rows_and_two_staggered_clusters() -> None:
+def test_the_layout_is_two_rows_and_two_staggered_clusters():
     content = {"planform": {"semi_span": 2.0}, "gauges": {"positions": [(0.0, 0.0)] * 24}}
     layout = {
         "row A first": 0.1, "row A pitch": 0.06, "row A gap": 0.2, "row A chord": 0.5,
@@ -71,12 +75,7 @@ def test_the_layout_is_two_rows_and_two_staggered_clusters() -> None:
     assert layout_of(content) == pytest.approx(layout)
 
 
-def test_scaled_values_count_prior_deviations() -> None:
-    parameter = FreeParameter("k", "N/m", 4.0, 2.0, 0.0, 9.0, "why", ("root", "flap_spring"))
-    assert scaled([parameter], np.array([7.0])).tolist() == [1.5]
-
-
-def test_a_start_laid_out_otherwise_is_refused() -> None:
+def test_a_start_laid_out_otherwise_is_refused():
     webs = [web.model_dump() for web in DESIGN.webs]
     webs[1]["shear_modulus"] *= 2.0
     with pytest.raises(
@@ -88,3 +87,39 @@ def test_a_start_laid_out_otherwise_is_refused() -> None:
         values_of(bare, PARAMETERS)
     with pytest.raises(IdentificationError, match="24 gauges"):
         values_of(DESIGN.changed(gauges={"positions": DESIGN.gauges.positions[:8]}), PARAMETERS)
+
+
+def test_a_written_design_is_read_back():
+    design = load_design()
+    text = design_toml(design, {"skin.stations.0.young_modulus": "identified", "webs.*.shear_modulus": "too"})
+    again = parse_design(tomllib.loads(text))
+    assert again == parse_design(rounded(design))
+    assert sum(line.endswith("# too") for line in text.splitlines()) == len(design.webs)
+    assert design_toml(again, {}) == design_toml(design, {})
+    assert "row A is gauges 1-16, row B gauges 17-24" in text
+
+
+def test_the_shipped_file_is_such_a_file():
+    shipped = load_design()
+    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    assert text.startswith("".join(f"# {line}".rstrip() + "\n" for line in HEADER))
+    assert parse_design(rounded(shipped)) == shipped
+
+
+@given(st.floats(1e-9, 1e13))
+def test_numbers_keep_their_digits(value):
+    text = _number(float(f"{value:.{DIGITS}g}"))
+    assert tomllib.loads(f"x = {text}")["x"] == pytest.approx(value, rel=10.0 ** (1 - DIGITS))
+
+
+def test_text_is_quoted():
+    design = load_design().changed(name='a "wing" \\ of mine')
+    assert tomllib.loads(design_toml(design, {}))["name"] == design.name
+
+
+def test_the_first_gauge_is_gauge_1():
+    difference = np.zeros((3, 24))
+    difference[2, 0] = 1.0
+    assert _row("strain", "%", difference, (None, None), True).where == "gauge 1"
+    difference[1, 23] = -2.0
+    assert _row("strain", "%", difference, (None, None), True).where == "gauge 24"

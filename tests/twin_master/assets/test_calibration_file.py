@@ -1,7 +1,6 @@
 """A calibration file in a scenario: what the twin draws from it, what the run keeps, what is refused."""
 
 import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,8 +18,7 @@ from calibration.result.file import (
 )
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
-from reporting.progress import SilentProgress
-from scenarios import scenario_files
+from tests.refusals import Inputs
 from tests.twin_master.runs import edited, table_of, text_of, written
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.parameter import draw_parameter
@@ -166,22 +164,6 @@ def test_what_is_refused_before_a_folder_is_made(file, tmp_path, library_file):
             parse_scenario(table | {"calibration": calibration}, "mine.toml")
 
 
-@pytest.mark.long
-def test_the_wing_among_several_fmus_is_tailored_too(file, tmp_path):
-    scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
-    assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
-    source = asset_source(scenario)
-    source.check()
-    (tmp_path / "run").mkdir()
-    hashes = source.prepare(tmp_path / "run", SilentProgress())
-    assert hashes["design"] == load_calibration(file).design_hash
-    with zipfile.ZipFile(tmp_path / "run" / "asset" / "components" / "wing.fmu") as archive:
-        record = json.loads(archive.read("resources/calibration.json"))
-    assert record["asset"] == "Wing 7 (é)"
-    moved = scenario.portable().moved(tmp_path / "run")
-    assert moved.asset.component[1].design == "calibration"
-
-
 def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, tmp_path):
     design = ('design = "uav_wing"', 'design = "my.toml"')
     text = edited(text_of("three_fmus"), design, design)
@@ -191,20 +173,7 @@ def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, 
     asset_source(scenario).check()
 
 
-COUPLED = next(name for name in scenario_files() if 'kind = "coupled"' in text_of(name))
-UNKNOWN = r"spring 7 has the parameter nonsense, which the binding \w+ does not know; .*`uav-twin"
-OF_A_WING = r"the parameter servo_mass, which the design .* `uav-twin calibrate`"
-
-
-@pytest.mark.parametrize(
-    ("scenario", "means", "words"),
-    [
-        ("level_turns", {"young_modulus_factor": 1.0, "nonsense": 1.0}, UNKNOWN),
-        ("level_turns", {"young_modulus_factor": 1.0, "servo_mass": 0.17}, OF_A_WING),
-        ("level_turns", {"young_modulus_factor": 1.3}, r"factor = 1\.[23]\d*, but .* 0\.9 to 1\.1"),
-        (COUPLED, {"young_modulus_factor": 1.0, "nonsense": 1.0}, "parameter nonsense, which the binding"),
-    ],
-)
+@pytest.mark.parametrize(("scenario", "means", "words"), Inputs(__file__).refused("campaign"))
 def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario, means, words):
     given = Overrides(calibration=of_campaign(tmp_path / "calibration.nc", **means))
     with pytest.raises(MissionInputError, match=words):

@@ -26,33 +26,6 @@ from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
-COUPLED = """[asset]
-kind = "coupled"
-binding = "coupled.toml"
-parameters = { conductance = 6100.0 }
-load = { wall_temperature = 80.0 }
-
-[[asset.component]]
-name = "exchanger"
-fmu = "HeatExchanger.fmu"
-parameters = { conductance = 5000.0 }
-
-[[asset.connection]]
-source = "flow"
-target = "exchanger.mass_flow"
-
-[[asset.connection]]
-source = "fouling"
-target = "exchanger.fouling"
-
-[[asset.connection]]
-source = "exchanger.outlet"
-target = "outlet"
-
-[belief]
-kind = "asset"
-
-"""
 INPUTS = Inputs(__file__)
 BOTH = pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
 
@@ -69,7 +42,7 @@ def folder(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     written(place, binding, *names, name="coupled.toml")
     text = (place / "fouling.toml").read_text(encoding="utf-8")
     asset = text[text.index("[asset]") : text.index("[calibration]")]
-    written(place, text, (asset, COUPLED), name="coupled_fouling.toml")
+    written(place, text, (asset, INPUTS.text("coupled.toml")), name="coupled_fouling.toml")
     return place
 
 
@@ -253,27 +226,6 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     assert theirs.happened.state.max() == 0.6
 
 
-@pytest.mark.long
-@pytest.mark.slow
-@pytest.mark.xdist_group("wing")
-def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path):
-    loaded = shipped("three_fmus", tmp_path, ("steps = 50", "steps = 24"))
-    whole = new_run(loaded, tmp_path / "whole").folder
-    inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
-    assert rows(inside) == rows(whole)
-    with cut_off_after(9):
-        new_run(loaded, tmp_path / "part")
-    resume_run(tmp_path / "part")
-    check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "journal.jsonl")
-    scenarios = [resolve_scenario(loaded, Overrides(seed=seed)) for seed in (7, 8)]
-    drawn = [scenario.asset.source(scenario).parameters() for scenario in scenarios]
-    assert all(drawn[0][name] != drawn[1][name] for name in ("damage_seed", "gauge_seed"))
-    received = np.genfromtxt(whole / "csv" / "observed.csv", delimiter=",", skip_header=1)[:, 6]
-    assert np.flatnonzero(np.isnan(received)).tolist() == [20, 21, 22, 23]  # the sixth gauge is lost
-    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
-    assert rows(new_run(loaded, tmp_path / "ssp", Overrides(ssp=ssp)).folder) == rows(whole)
-
-
 def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
     fleet = ensemble("three_fmus", range(3))
     (group,) = fleet.groups
@@ -292,3 +244,8 @@ def test_the_law_of_the_shipped_damage_is_what_the_twin_believes():
         assert [values[f"probability.{region}"] * severity for region in ("z1", "z2")] == [believed] * 2
     assert {factor.levels[1] - factor.levels[0] for factor in scenario.state} == {values["level"]}
     assert load_binding(binding_files()["three_fmus"]).step_size == 1.0
+    drawn = [
+        one.asset.source(one).parameters()
+        for one in (resolve_scenario(load_scenario("three_fmus"), Overrides(seed=seed)) for seed in (7, 8))
+    ]
+    assert all(drawn[0][name] != drawn[1][name] for name in ("damage_seed", "gauge_seed"))

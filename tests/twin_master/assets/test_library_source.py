@@ -120,18 +120,6 @@ def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
         resume_run(part)
 
 
-@pytest.mark.long
-def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path):
-    library = Overrides(library=sampled(tmp_path))
-    new_run(small_pump(), tmp_path / "asked")
-    new_run(small_pump(), tmp_path / "sampled", library)
-    names = [f"csv/{file.name}" for file in (tmp_path / "asked" / "csv").iterdir()]
-    check_same(tmp_path / "sampled", tmp_path / "asked", *names)
-    # With another seed the draws are others, inside the sampled range only for some.
-    with pytest.raises(InvalidObservationLibraryError, match="scenario and seed"):
-        new_run(small_pump(), tmp_path / "other", Overrides(library=library.library, seed=3))
-
-
 def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
     script = tmp_path / "gear_pump.py"
     text = asset_scripts()["gear_pump"].read_text(encoding="utf-8")

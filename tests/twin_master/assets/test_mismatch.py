@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,13 +14,11 @@ from hypothesis import strategies as st
 
 from benchmarks.misfit import find_misfit
 from benchmarks.seeds import fly_seeds
-from calibration.result.file import load_calibration, save_calibration
 from fe.runtime.patch import ModelPatch, SensorGain
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from scenarios import binding_files
-from tests.command_line import refused
 from tests.conftest import synthetic_library
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
@@ -31,7 +27,7 @@ from twin_master.assets.asset_source import AssetReading, PairedSource, Stateles
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
+from twin_master.errors import MissingObservationModelError, ScenarioError, TwinMasterError
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
@@ -58,34 +54,8 @@ def test_combinations_that_mean_nothing_are_refused_in_one_sentence(old, new, wo
         load_scenario(written(tmp_path, TEXT, (old, new)))
 
 
-def test_without_the_library_one_sentence_says_where_to_get_it(tmp_path):
-    error = refused("run", "model_mismatch", "--out", tmp_path / "run")
-    for word in ("UAV-Digital-Twin", "UAVconfig.json", "--strain-library FILE", "asset.file"):
-        assert word in error
-    assert not list(tmp_path.iterdir())
-
-
 def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
     return resolve_scenario(load_scenario(path), Overrides(strain_library=library))
-
-
-@pytest.mark.long
-def test_the_twin_may_believe_a_calibrated_wing(library_file, tmp_path, make_calibration):
-    file = save_calibration(make_calibration(), tmp_path / "wing.nc")
-    overrides = Overrides(strain_library=library_file, calibration=file)
-    scenario = resolve_scenario(load_scenario("model_mismatch"), overrides)
-    source = asset_source(scenario)
-    source.check()
-    assert source.origin.differ
-    assert sorted(source.files()) == ["asset/UAVconfig.json", "asset/calibration.nc"]
-    (tmp_path / "run" / "asset").mkdir(parents=True)
-    hashes = source.prepare(tmp_path / "run", SilentProgress())
-    assert {"strain_library", "calibration", "design"} <= {*hashes}
-    assert hashes["design"] == load_calibration(file).design_hash
-    found = source.draws(3)
-    assert found.mean == load_calibration(file).mean("young_modulus_factor")
-    with pytest.raises(MissionInputError, match="brings its own samples"):
-        resolve_scenario(load_scenario("level_turns"), overrides)
 
 
 def test_the_option_names_the_file_and_keeps_the_model(library_file, tmp_path):
@@ -108,20 +78,11 @@ def test_the_option_names_the_file_and_keeps_the_model(library_file, tmp_path):
         resolve_scenario(load_scenario("model_mismatch"), Overrides(fmu=tmp_path / "x.fmu"))
 
 
-def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path):
-    for change, error, sentence in (
-        (("= 3.0 }", "= 2.5 }"), MissingObservationModelError, r"3g at load factor 3, .* 2\.5"),
-        (
-            ('"young_modulus_factor"', '"stiffness"'),
-            MissingObservationModelError,
-            r"young_modulus_factor.*set `belief\.kind`",
-        ),
-        (("count = 24", "count = 23"), MissingObservationModelError, "24 gauges"),
-        ((DESIGN, 'design = "no.toml"\n'), MissionInputError, r"no\.toml cannot be read"),
-    ):
-        scenario = resolved(library_file, written(tmp_path, TEXT, change))
-        with pytest.raises(error, match=sentence):
-            asset_source(scenario).check()
+@pytest.mark.parametrize(("old", "new", "sentence"), Inputs(__file__).refused("disagreeing"))
+def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path, old, new, sentence):
+    scenario = resolved(library_file, written(tmp_path, TEXT, (old, new)))
+    with in_one_sentence(TwinMasterError, sentence):
+        asset_source(scenario).check()
 
 
 def linear_case(seed: int, spread: float) -> tuple[np.ndarray, ...]:
@@ -352,28 +313,6 @@ class TestOnTheWing:
         patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
         with pytest.raises(MissingObservationModelError, match="predicts strains, and `frequency`"):
             asset_source(patched).check()
-
-    @pytest.mark.long
-    def test_the_study_prints_its_table(self, wing, twisted):
-        """Scaled gauge by gauge, the model of the twin is that of this library, and is as good as the own."""
-        result = subprocess.run(
-            [sys.executable, "-m", "benchmarks.study_level_turns", "--combinations", "--strain-library",
-             str(twisted), "--missions", "3", "--first-seed", "0", "--model-error", "0", "scaled",
-             "--markdown"],
-            cwd=ROOT, capture_output=True, text=True, check=False, timeout=600,
-        )  # fmt: skip
-        assert result.returncode in (0, 1), result.stderr
-        rows = [line.strip("| ").split(" | ") for line in result.stdout.splitlines() if line.startswith("|")]
-        assert [len(row) for row in rows] == [8] * 10 + [12] * 8
-        found = {
-            tuple(row[:3]): [float(cell.strip("*").split()[0]) for cell in row[6:11]] for row in rows[12:]
-        }
-        assert len(found) == 6
-        own = found["our wing", "our wing", "none"]
-        np.testing.assert_allclose(
-            found["library", "our wing", "none, gauges scaled"], own, atol=1.0
-        )  # between the levels the library is interpolated
-        assert found["library", "our wing", "none"][-1] < own[-1] - 1.0
 
     def test_study_on_the_published_library(self, wing, published_library):
         """Our model holds the wing of the authors well enough to steer it; bounds for 30 missions."""

@@ -453,7 +453,7 @@ def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
     assert len(set(printed)) < len(set(soon))
     table = fleet_page(tmp_path / "flown", WORST).partition("Who needs attention next")[2]
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]
-    with pytest.raises(FleetError, match="holds no fleet"):
+    with pytest.raises(RunFolderExistsError, match="not the folder of a fleet"):
         fleet_page(tmp_path, WORST)
 
 

@@ -12,7 +12,7 @@ from twin_master.errors import InvalidModelError
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors, quantiles_of
 from twin_master.learning.posterior import posterior_of_draws
-from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
+from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.rewards import RewardModel, RewardSettings
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -97,24 +97,6 @@ def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_traje
     for turn in range(STEPS):
         others = tuple(axis for axis in range(STEPS + 2) if axis != turn)
         np.testing.assert_allclose(smoothed[turn], table.sum(axis=others), rtol=1e-10)
-
-
-def test_a_filter_that_learns_nothing_is_the_exact_filter():
-    exact = ExactFilter(model(), sensors())
-    learner = LearningFilter(model(), sensors(), LearntPriors())
-    estimates = run(learner, observations(), CONTROLS)
-    before: Carried | None = None
-    known = []
-    for turn, (row, control) in enumerate(zip(observations(), CONTROLS, strict=True)):
-        step = exact.turn(before, row, control, turn)
-        before = step.carried
-        known.append(before)
-        np.testing.assert_allclose(estimates[turn].filtered, step.filtered, rtol=1e-11)
-        np.testing.assert_allclose(estimates[turn].forecast, step.forecast, rtol=1e-11)
-        assert estimates[turn].log_evidence == pytest.approx(step.log_evidence, abs=1e-12)
-    smoothed = learner.smoothed([estimate.carried for estimate in estimates])
-    np.testing.assert_allclose(smoothed, exact.smoothed(known), rtol=1e-10)
-    assert not estimates[-1].learnt
 
 
 @pytest.mark.parametrize("degrees", [0.0, 6.0])

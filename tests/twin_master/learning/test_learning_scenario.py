@@ -9,6 +9,7 @@ import pytest
 
 from scenarios import scenario_files
 from tests.command_line import said
+from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, figures_of, journal, text_of, written
 from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
@@ -22,7 +23,7 @@ from twin_master.scenario.tables import Noticing
 from twin_master.store.writing import open_run
 from twin_master.workflow import resume as resume_run
 
-TEXT = text_of("level_turns_learning")
+TEXT, INPUTS = text_of("level_turns_learning"), Inputs(__file__)
 
 
 def test_without_the_table_the_filter_is_the_exact_one():
@@ -39,50 +40,17 @@ def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave():
     assert thrice.sum(axis=-1) == pytest.approx(1.0)
 
 
-NOISE, NOTICE = "noise_degrees = 10 ", "threshold = 100 "
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        (NOISE, "transition_factors = [1.0]", "two or more factors"),
-        (NOISE, "transition_factors = [2.0, 1.0]", "must increase"),
-        (NOISE, "gauge_gain_percent = [1.0, 2.0]", "one for each of the 24 sensors"),
-        (NOISE, "noise_degrees = 2.0", "greater than 2"),
-        (NOISE, "colour = true", "colour"),
-        (NOTICE, "threshold = 1.0", "greater than 1"),
-        (NOTICE, "gauge_gain_percent = 60", "less than or equal to 0.4"),
-        (NOTICE, "absurd_deviations = 1", "greater than or equal to 3"),
-        (NOTICE, "prior = 0.5", "less than 0.5"),
-        (NOTICE, "colour = true", "colour"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("learning"))
 def test_what_cannot_be_learnt_or_noticed_is_refused_in_a_sentence(tmp_path, old, new, sentence):
     with pytest.raises(TwinMasterError, match=sentence):
-        load_scenario(written(tmp_path, TEXT, (old, f"{new} ")))
+        load_scenario(written(tmp_path, TEXT, (old, new)))
 
 
 def test_more_transitions_than_there_can_be_are_refused(tmp_path):
-    file = written(tmp_path, TEXT, (NOISE, "transition_factors = [1.0, 11.0] "))
+    file = written(tmp_path, TEXT, ("noise_degrees = 10 ", "transition_factors = [1.0, 11.0] "))
     knowledge = prepare_twin(load_scenario(file))
     with pytest.raises(TwinMasterError, match=r"smaller `learning.transition_factors`"):
         knowledge.twin()
-
-
-FAULTS = """
-[[truth.sensor_faults]]
-kind = "drift"
-sensors = [5]
-first_step = 0
-rate_microstrain_per_step = 100
-
-[[truth.sensor_faults]]
-kind = "drift"
-sensors = [12]
-first_step = 3
-rate_microstrain_per_step = 1e14
-
-# What the figures"""
 
 
 def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
@@ -120,7 +88,11 @@ def test_sensors_with_parameters_of_their_own_are_refused(tmp_path):
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    changes = ("# What the figures", FAULTS), ("steps = 50", "steps = 9"), ("draws = 60", "draws = 8")
+    changes = (
+        ("# What the figures", INPUTS.text("faults.toml") + "# What the figures"),
+        ("steps = 50", "steps = 9"),
+        ("draws = 60", "draws = 8"),
+    )
     levels = ("count = 24\n", "count = 24\nbetween_levels = false\n")
     return written(tmp_path_factory.mktemp("notice"), TEXT, *changes, levels)
 

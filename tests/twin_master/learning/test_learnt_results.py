@@ -11,6 +11,7 @@ import xarray as xr
 from scipy.special import gammaln
 from scipy.stats import invgamma
 
+from reporting.page import ReportFigure
 from tests.command_line import said
 from tests.twin_master.runs import journal, text_of, written
 from twin_master.mission.preparation import prepare_twin
@@ -136,7 +137,8 @@ def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
     sensors = sensor_rows(record)
     assert len(sensors) == 24
     assert sensors[23].count("—") == 1  # the offset
-    text = render_page(record, {"learnt": b'<svg viewBox="0 0 1 1"></svg>'}, {"learnt": ("", "")})
+    figures = {"learnt": ReportFigure("learnt", None, "", "")}
+    text = render_page(record, {"learnt": b'<svg viewBox="0 0 1 1"></svg>'}, figures)
     assert "0.05 in 2g and 0.1 in 3g" in text
     assert re.search(r"<td>Young modulus factor</td>.*<td>Factor on the transitions</td>", text, re.DOTALL)
     assert re.search(r"it learnt the Young modulus factor: [\d.]+ \([\d.]+ to [\d.]+, truth 0\.95\)\.", text)

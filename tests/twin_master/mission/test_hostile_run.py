@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from fmu_asset.errors import FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, written
 from twin_master.environment import ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet
@@ -23,41 +24,16 @@ from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
 
-BINDING = """
-binding = { name = "hostile", step_size = 1.0 }
-control.u = { variable = "u", unit = "m/s" }
-health.d = { variable = "d", unit = "1" }
-parameter.k = { variable = "k", unit = "1" }
-observation.y = { variables = "y", unit = "m" }
-"""
-SCENARIO = """
-format = 2
-mission = { name = "hostile", steps = 30, prediction_steps = 3, first_control = "low", seed = 4 }
-state = [{ name = "d", title = "damage", unit = "1", levels = [0.0, 0.2, 0.4], prior = [1, 0, 0] }]
-control = [{ name = "low", values = { u = 2.0 } }, { name = "high", values = { u = 4.0 } }]
-observation = { role = "y", count = 1, unit = "m", standard_deviation = 0.1 }
-transition = { kind = "independent_worsening", probability = { low = 0.05, high = 0.1 } }
-planner = { gamma = 0.8 }
-asset = { kind = "fmu", file = "FMU", binding = "binding.toml" }
-belief = { kind = "asset" }
-calibration = { parameter = "k", source = "normal", mean = 1.0, standard_deviation = 0.01, draws = 5 }
 
-[rewards]
-health_limit = 80.0
-error_scale = 0.5
-control = { low = -0.2, high = 0.2 }
-control_weight = 1.0
-
-[truth]
-kind = "scripted"
-gains = [{ state = "d", first_step = 8, gain = 0.2 }]
-noise = { standard_deviation = 0.1 }
-"""
+INPUTS = Inputs(__file__)
+BINDING = INPUTS.text("hostile_binding.toml")
 
 
 def scenario(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = BINDING) -> Any:
     written(folder, binding, name="binding.toml")
-    return load_scenario(written(folder, SCENARIO, ("FMU", str(fmu)), *changes, name="scenario.toml"))
+    return load_scenario(
+        written(folder, INPUTS.text("hostile.toml"), ("FMU", str(fmu)), *changes, name="scenario.toml")
+    )
 
 
 @pytest.mark.parametrize(
@@ -123,22 +99,18 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
             environment.step(0)
 
 
-ARRAY = """
-binding = { name = "array", step_size = 1.0 }
-control.u = { variable = "u[1]", unit = "1" }
-health.d = { variable = "u[2]", unit = "1" }
-parameter.k = { variable = "gain", unit = "1" }
-observation.y = { variables = "y", unit = "m" }
-record.variables = ["state/calls", "y"]
-"""
-
-
 def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
     """Its outputs grow with every step, so that only the way through twin, store and names is looked at."""
     fmu = foreign_fmu.changed("array3", "names", ('name="calls"', 'name="state/calls"'))
     changes = ("steps = 30", "steps = 3"), *[("standard_deviation = 0.1", "standard_deviation = 0.05")] * 2
     two, three = (
-        scenario(tmp_path, fmu, *changes, ("count = 1", f"count = {count}"), binding=ARRAY)
+        scenario(
+            tmp_path,
+            fmu,
+            *changes,
+            ("count = 1", f"count = {count}"),
+            binding=INPUTS.text("array_binding.toml"),
+        )
         for count in (2, 3)
     )
     truth = open_run(new_run(two, tmp_path / "run").folder)["truth"]

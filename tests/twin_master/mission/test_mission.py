@@ -10,8 +10,8 @@ from benchmarks.seeds import fly_seeds
 from tests.twin_master.runs import journal, of_library, table_of
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
-from twin_master.errors import AssetOutputError, NotResumableError
-from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
+from twin_master.errors import AssetOutputError
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.loop import fly, kept_in, taken_up
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import SensorStatus, Truth
@@ -51,8 +51,8 @@ def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
             before = taken_up(file, knowledge, plant)
             return fly(knowledge.scenario, before.twin, plant, kept_in(file, plant), history=before)
 
-    whole, lines = part(), journal(tmp_path)
-    assert len(lines) == 50
+    whole = part()
+    assert len(journal(tmp_path)) == 50
     content = (tmp_path / JOURNAL_NAME).read_bytes()
     for turns in (1, 2, 17, 49, 50):
         kept = content.splitlines(keepends=True)[: turns + 1]
@@ -63,11 +63,6 @@ def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
         assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
         for array in ARRAYS:
             np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
-    altered = lines[4] | {"next_control": 1 - lines[4]["next_control"]}
-    kept = [*content.splitlines(keepends=True)[:5], line_of(altered)]
-    (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
-    with pytest.raises(NotResumableError, match="after turn 4"):
-        part()
 
 
 def test_timing_of_a_turn(paper):

@@ -152,15 +152,3 @@ def test_a_problem_whose_tables_do_not_fit_is_refused():
         replace(problem, likelihood=(problem.likelihood[0] * 0.5, *problem.likelihood[1:]))
     with pytest.raises(PlanningError, match="expected likelihoods of controls of shape"):
         replace(problem, likelihood=problem.likelihood[:2])
-
-
-@pytest.mark.parametrize("limit", ["_LARGEST", "_MOST_PARTS"])
-def test_where_bounds_cannot_settle_more_beliefs_are_visited(limit, monkeypatch):
-    problem = drawn(6, 4, moves_first=False)
-    visited: list[int] = []
-    for most in (np.inf, 0.0):
-        monkeypatch.setattr(f"twin_master.network.belief_planning.{limit}", most)
-        monkeypatch.setattr("twin_master.network.belief_planning.MOST_BELIEFS", 5)
-        monkeypatch.setattr("twin_master.network.belief_planning.MOST_UNSETTLED", 40)
-        visited.append(len(plan_on_belief(problem, gap=0.0).beliefs))
-    assert visited[0] < visited[1]

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from reporting.memory import memory_left
 from tests.twin_master.network.decision_oracles import precise_forward_backward
 from tests.twin_master.runs import loaded_from, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
@@ -34,7 +33,7 @@ from twin_master.network.memory import check_scenario_fits
 from twin_master.network.planner import given_policy, value_iteration
 from twin_master.network.sensor_model import check_noise
 from twin_master.network.transition import TransitionModel
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.reading import load_scenario, parse_scenario
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SPACE = StateSpace((Factor("z1", LEVELS), Factor("z2", (0.0, 0.5, 1.0))))
@@ -60,9 +59,6 @@ def test_moments_and_marginals_of_a_belief(weights):
     np.testing.assert_allclose(SPACE.mean(belief)[:, 0], mean, rtol=1e-13, atol=1e-15)
     variance = first @ np.square(LEVELS) - mean**2
     np.testing.assert_allclose(SPACE.standard_deviation(belief)[:, 0] ** 2, variance, atol=1e-14)
-
-
-def test_a_certain_belief_has_no_spread():
     assert np.all(SPACE.standard_deviation(SPACE.certain((0.6, 1.0))) == 0.0)
 
 
@@ -106,12 +102,6 @@ def test_rounding_within_the_tolerance_passes_and_the_result_is_a_read_only_copy
     assert checked[0, 0] == 0.1
     with pytest.raises(ValueError, match="read-only"):
         checked[0, 0] = 1.0
-
-
-def test_the_last_level_absorbs():
-    table = worsening_table(3, 0.1)
-    np.testing.assert_allclose(table, [[0.9, 0.1, 0], [0, 0.9, 0.1], [0, 0, 1]], rtol=1e-15)
-    np.testing.assert_array_equal(worsening_table(1, 0.3), [[1.0]])
 
 
 MOVES = TransitionModel.from_factors([[worsening_table(5, 0.1), worsening_table(3, 0.1)]])
@@ -272,31 +262,14 @@ def test_factors_share_a_table_where_that_is_small_and_blocks_where_it_costs_no_
     )
 
 
-GIGABYTES = 8e9
-
-
-@pytest.fixture
-def small_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine of 8 GB, whatever the tests run on."""
-    monkeypatch.setattr(memory, "memory_left", lambda: GIGABYTES)
-
-
-def six_factors() -> LoadedScenario:
-    """A scenario of 5^6 = 15,625 states."""
+def test_too_many_states_or_draws_are_refused_before_anything_is_built(monkeypatch):
+    """Of 5^6 = 15,625 states, on a machine of 8 GB."""
+    monkeypatch.setattr(memory, "memory_left", lambda: 8e9)
     table = table_of("level_turns")
     table["state"] = [table["state"][0] | {"name": f"z{number}"} for number in range(1, 7)]
     table["mission"]["steps"] = 60
     table["calibration"]["draws"] = 800
-    return loaded_from(table, "level_turns")
-
-
-def test_the_memory_of_this_machine_is_known():
-    assert 5e7 < memory_left() < 1e14
-
-
-@pytest.mark.usefixtures("small_machine")
-def test_too_many_states_are_refused_before_anything_is_built():
-    loaded = six_factors()
+    loaded = loaded_from(table, "level_turns")
     tracemalloc.start()
     try:
         with pytest.raises(InvalidModelError) as caught:
@@ -308,25 +281,15 @@ def test_too_many_states_are_refused_before_anything_is_built():
     for word in ("15625 states", "2 controls", "38.4 GB", "8 GB", "800 draws", "fewer levels"):
         assert word in sentence, sentence
     assert "\n" not in sentence
-
-
-@pytest.mark.usefixtures("small_machine")
-def test_too_many_draws_are_refused_with_their_size():
     table = table_of("level_turns")
     table["calibration"]["draws"] = 1000000
-    scenario = parse_scenario(table, "x")
     with pytest.raises(InvalidModelError, match=r"76.8 GB for 1000000 draws of 24 sensors"):
-        check_scenario_fits(scenario)
+        check_scenario_fits(parse_scenario(table, "x"))
     check_scenario_fits(load_scenario("level_turns").scenario)
-
-
-@pytest.mark.usefixtures("small_machine")
-def test_the_table_of_all_states_is_refused_too():
-    table = worsening_table(5, 0.1)
-    product = TransitionModel.from_factors([[table] * 6] * 2)
+    worse = worsening_table(5, 0.1)
     with pytest.raises(InvalidModelError, match="15625 states under 2 controls"):
-        _ = product.matrix
-    assert TransitionModel.from_factors([[table] * 2] * 2).matrix.shape == (2, 25, 25)
+        _ = TransitionModel.from_factors([[worse] * 6] * 2).matrix
+    assert TransitionModel.from_factors([[worse] * 2] * 2).matrix.shape == (2, 25, 25)
 
 
 @pytest.mark.parametrize(

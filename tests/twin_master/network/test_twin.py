@@ -1,5 +1,6 @@
 """The twin: the model that a scenario describes, and what it concludes from turn to turn."""
 
+import pickle
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -121,10 +122,14 @@ def test_an_impossible_observation_names_twin_step_and_sensors(knowledge):
     good = knowledge.sensor_model.mean[0, 1].copy()
     twin.turn(good, 1)
     bad = good.copy()
-    bad[4] = 1e300
-    with pytest.raises(ImpossibleObservation, match=r"level_turns.*step 1.*sensor 5") as caught:
+    bad[4] += 1e200
+    with pytest.raises(
+        ImpossibleObservation, match=r"'paper_level_turns', step 1: .* sensor 5: \+8e\+203 sd"
+    ) as caught:
         twin.turn(bad, 1)
-    assert caught.value.step == 1
+    error = pickle.loads(pickle.dumps(caught.value))  # as a worker of a fleet hands it on
+    assert (str(error), error.twin, error.step) == (str(caught.value), "paper_level_turns", 1)
+    assert next(iter(error.worst_residuals)) == "sensor 5"
     assert twin.turns == 1
     twin.turn(good, 1)
     assert twin.smoothed().shape == (2, 25)

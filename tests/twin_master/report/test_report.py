@@ -1,9 +1,7 @@
 """The report shows what the run holds, is reproducible, and refuses a damaged run with one sentence."""
 
-import errno
 import html
 import json
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +13,8 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.result.file import run_record
-from reporting.errors import DiskFullError
 from reporting.figures import to_svg
+from reporting.page import ReportFigure
 from reporting.words import number
 from tests.refusals import Inputs
 from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
@@ -244,7 +242,9 @@ def test_a_calibration_file_shows_its_wing(run, make_calibration):
     flown = rescripted(plain, asset={"design": "calibration", "parameters": {}})
     mean, wide = wing.mean("young_modulus_factor"), wing.standard_deviation("young_modulus_factor")
     assert true_value(flown) == mean  # the FMU starts at the mean
-    page = report.render_page(flown, {"calibration": DRAWING}, {"calibration": ("", "")})
+    page = report.render_page(
+        flown, {"calibration": DRAWING}, {"calibration": ReportFigure("calibration", None, "", "")}
+    )
     assert "The calibrated wing: Wing 7 (é)" in page
     servo = wing.mean("servo_mass"), wing.standard_deviation("servo_mass")
     assert f'{number(servo[0])}</td><td class="number">{number(servo[1])}' in page
@@ -293,21 +293,6 @@ def test_a_turn_that_is_none_of_the_run(folder):
     for now in (-1, 50):
         with pytest.raises(RunFolderError, match=r"must lie in 0\.\.49"):
             report.write_report(folder, now=now)
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_a_full_disk_keeps_the_old_report(run, tmp_path, monkeypatch):
-    place = stored(run, tmp_path / "run")
-    (place / "report.html").write_text("old")
-
-    def fail(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "no space")
-
-    monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(DiskFullError):
-        report.write_report(place)
-    assert (place / "report.html").read_text() == "old"
-    assert list((place / "figures").iterdir()) == []
 
 
 def test_a_title_that_would_be_broken_mathematics(run):

@@ -23,7 +23,6 @@ from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from reporting.figures import new_figure, to_svg
 from reporting.files import atomic_write_bytes
-from tests.command_line import command
 from tests.twin_master.runs import check_same
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
@@ -373,10 +372,3 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_pat
     assert process.wait(90.0) == 0, process.stderr.read()
     process.stderr.close()
     check_same(tmp_path / "run", run, "run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json")
-
-
-def test_a_folder_without_a_run_is_one_sentence(tmp_path):
-    result = command("view", tmp_path / "none")
-    assert result.returncode == 1
-    assert result.stderr.startswith(f"there is no run folder {tmp_path / 'none'}")
-    assert result.stderr.count("\n") == 1

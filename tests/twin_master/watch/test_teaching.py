@@ -14,9 +14,8 @@ import pytest
 
 from discrepancy.report.figures import ReportInput
 from discrepancy.verdict_folder import write_verdict_folder
-from tests.command_line import refused
 from tests.discrepancy.rigs import ORIGIN, drag_found
-from tests.twin_master.runs import check_same, journal, text_of, written
+from tests.twin_master.runs import check_same, journal
 from tests.twin_master.watch.watches import beliefs_of, decided, of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
@@ -264,10 +263,3 @@ def test_a_second_patch_stands_beside_the_first(tmp_path):
     assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
     assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}
     assert both_patches(None, second) == second.read_bytes()
-
-
-def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path):
-    scenario, out = written(tmp_path, text_of("bracket") + "\n[notice]\n"), tmp_path / "w"
-    words = ("watch", scenario, "--observations", "-", "--out", out, "--teach")
-    assert "this scenario has the role strain under z_heel, z_arm" in refused(*words)
-    assert not out.exists()

@@ -20,7 +20,7 @@ import pytest
 
 import uav_twin
 from reporting.progress import SilentProgress
-from tests.command_line import command, said
+from tests.command_line import command, refused, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
 from tests.twin_master.watch.watches import (
     begun,
@@ -51,6 +51,12 @@ pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and
 def last_line(folder: Path) -> str:
     """The last record of a journal, as text, without its hash."""
     return (folder / JOURNAL_NAME).read_text().splitlines()[-1][65:]
+
+
+def journalled(watch: Watch) -> list[Any]:
+    """The decisions that the journal of a watch holds."""
+    model = watch.models[0].knowledge.model
+    return [journalled_decision(line, watch.scenario, model) for line in journal(watch.folder)]
 
 
 def belief_of(watch: Watch) -> object:
@@ -95,20 +101,6 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tol
         assert belief_of(watch) == json.loads(last_line(whole))["filtered"]
     with pytest.raises(MissionInputError, match="holds no journal"):
         file_feed(tmp_path, base.scenario)
-
-
-def test_a_program_hands_over_messages_and_is_told_decisions(scenario, mission, told, tmp_path):
-    messages = (
-        {"turn": turn, "control": ("2g", "3g")[control], "strain": row}
-        for turn, (control, row) in enumerate(zip(mission.control_index[:6], mission.observed, strict=False))
-    )
-    decisions = list[Mapping[str, Any]]()
-    folder = uav_twin.watch(scenario, messages, tmp_path / "watch", report=False, decide=decisions.append)
-    assert decisions == told[:6]
-    np.testing.assert_array_equal(uav_twin.open_run(folder)["filtered"]["probability"], mission.filtered[:6])
-    with pytest.raises(MissionInputError, match="names no recording: give the observations"):
-        uav_twin.watch(scenario, folder=tmp_path / "none")
-    assert not (tmp_path / "none").exists()
 
 
 def test_a_kill_at_any_moment_loses_no_turn(watch, recorded, whole, monkeypatch):
@@ -209,8 +201,7 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
     watch = watchful(base, tmp_path / "watch")
     told = decided(watch, CsvFeed(tmp_path / "late.csv", watch.scenario))
-    model = watch.models[0].knowledge.model
-    assert [journalled_decision(line, watch.scenario, model) for line in journal(watch.folder)] == told
+    assert journalled(watch) == told
     assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
 
 
@@ -297,8 +288,7 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
     os.close(write)
     stream.close()
     assert kinds(6)[5:] == [(2, ["heard"])]
-    model = watch.models[0].knowledge.model
-    assert [journalled_decision(line, watch.scenario, model) for line in journal(watch.folder)] == told
+    assert journalled(watch) == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
     shown = viewed(watch).seen(0, 4)  # as the page shows it
     seen = [[notice["kind"] for notice in turn.get("notices", ())] for turn in shown]
@@ -426,6 +416,9 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
         uav_twin.open_run(folder)
     uav_twin.watch(scenario, recorded, folder, decide=decide, turns=20, report=False)
     np.testing.assert_array_equal(opened[0], mission.filtered[:8])
+    with pytest.raises(MissionInputError, match="names no recording: give the observations"):
+        uav_twin.watch(scenario, folder=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
     with pytest.raises(MissionInputError, match="give nothing beside --resume"):
         uav_twin.watch(None, recorded, folder, {"seed": 3}, resume=True)
     uav_twin.watch(None, recorded, folder, decide=decide, resume=True, turns=30, report=False)
@@ -440,36 +433,18 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     assert last_line(folder) == last_line(whole)
 
 
-def test_a_slip_of_the_pen_makes_no_folder(scenario, recorded, whole, tmp_path):
-    """An unknown column is passed over on request."""
-    (tmp_path / "run.nc").touch()
-    (tmp_path / "lines.jsonl").write_text('{"turn": 0, "strain_1": 1e-4}\n')
-    wrong, out = tmp_path / "m.csv", tmp_path / "watch"
-    wrong.write_text(edited(recorded.read_text(), ("strain_24", "strian_24")))
-    words = ("watch", scenario.path, "--out", out, "--no-report")
-    for source, sentence in (
-        (("missing.csv",), "there is no file"),
-        (
-            (wrong, "--turns", 2),
-            "the column `strian_24` is no sensor: a sensor is called such as `strain_24`",
-        ),
-        ((tmp_path / "lines.jsonl",), "holds JSON lines"),
-        ((tmp_path / "run.nc", "--follow"), "only a CSV file can be followed"),
-        (("-", "--follow"), "--follow belongs to a CSV file"),
-        (("mqtt://host",), "is expected"),
-        (("-", "--teach"), "this scenario gives none: `notice` is off"),
-    ):
-        assert sentence in command(*words, "--observations", *source).stderr
-        assert not out.exists()
-    passed = said(*words, "--observations", wrong, "--turns", 2, "--allow-unknown")
+def test_a_slip_of_the_pen_is_passed_over_on_request_and_no_run_replaced_by_its_watch(
+    scenario, recorded, whole, tmp_path
+):
+    (tmp_path / "m.csv").write_text(edited(recorded.read_text(), ("strain_24", "strian_24")))
+    words = ("watch", scenario.path, "--observations", tmp_path / "m.csv", "--turns", 2, "--allow-unknown")
+    passed = said(*words, "--out", tmp_path / "watch", "--no-report")
     assert [json.loads(line)["lost_sensors"] for line in passed.splitlines()] == [1, 1]
-    assert "holds a run already" in command("watch", scenario.path, "--out", whole).stderr
-    for options in (("--resume", "--seed", 3), ("--model-patch", "x.json"), ()):
-        assert command("watch", *options).returncode != 0
+    assert "holds a run already" in refused("watch", scenario.path, "--out", whole)
     copy = Path(shutil.copytree(whole, tmp_path / "copy"))
-    for source in (copy, copy / "run.nc"):  # what is watched is not replaced by its watch
+    for source in (copy, copy / "run.nc"):
         again = ("watch", scenario.path, "--out", copy, "--replace", "--observations", source)
-        assert "choose another --out" in command(*again).stderr
+        assert "choose another --out" in refused(*again)
     check_same(copy, whole, JOURNAL_NAME)
 
 

@@ -1,8 +1,10 @@
-"""Links between pages, and to places in them, lead somewhere: on a code host as on the site."""
+"""Pages use the terms of the glossary, their links lead somewhere, the picture is what its script draws."""
 
 import re
+import runpy
 from functools import cache
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -39,11 +41,39 @@ def broken(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere(page):
     assert broken(page) == []
 
 
-def test_a_broken_link_is_found(tmp_path: Path) -> None:
+def test_a_broken_link_is_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A `b` c, d\n[a](page.md#a-b-c-d) [b](#nowhere) [c](none.md) `[d](none.md)`\n")
     assert broken(page) == ["#nowhere", "none.md"]
+
+
+PLAIN = re.compile(rf"{CODE.pattern}|\]\([^)]*\)", CODE.flags)
+TURNED = ("one sees", "the house", "that we know", "believes ours", "gone on with", "elements, please")
+"""Turns of other languages that were found once."""
+
+
+def test_pages_use_the_terms_of_the_glossary():
+    glossary = ROOT / "docs" / "glossary.md"
+    rows = re.findall(r"^\| (.+?) \| .+ \| (.+?) \|$", glossary.read_text(encoding="utf-8"), re.MULTILINE)
+    refused = [word for _, words in rows[2:] for word in words.split(", ")]
+    assert len(refused) > 30
+    other = re.compile(rf"\b({'|'.join(map(re.escape, [*refused, *TURNED]))})\b", re.IGNORECASE)
+    found = {
+        str(page.relative_to(ROOT)): words
+        for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))
+        if page != glossary and (words := {*other.findall(PLAIN.sub("", page.read_text(encoding="utf-8")))})
+    }
+    assert not found
+
+
+IMAGES = ROOT / "docs" / "images"
+
+
+def test_the_committed_picture_is_what_the_script_draws():
+    drawn = runpy.run_path(str(IMAGES / "draw_whole.py"))["draw"]()
+    ElementTree.fromstring(drawn)
+    assert (IMAGES / "whole.svg").read_text(encoding="utf-8") == drawn

@@ -1,0 +1,134 @@
+"""Tables and progress on a terminal, on a pipe, and not at all."""
+
+import io
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from discrepancy.catalogue.library import load_catalogue
+from reporting.console_table import broken, console_table
+from reporting.progress import Progress, RichProgress, SilentProgress
+
+
+def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:
+    console = Console(file=StringIO(), width=width, highlight=False, markup=False)
+    console.print(console_table(headings, rows, width))
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("text", "lines"),
+    [
+        ("coulomb_friction", ["coulomb_friction"]),
+        ("temperature_dependent_modulus", ["temperature_", "dependent_modulus"]),
+        ("temperature-dependent modulus", ["temperature-", "dependent modulus"]),
+        ("a_verylongwordwithoutanybreak", ["a_", "verylongwordwithoutanybreak"]),
+        ("", [""]),
+    ],
+)
+def test_long_words_break_where_a_reader_expects_it(text, lines):
+    assert broken(text, 20).split("\n") == lines
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_every_identifier_can_be_read_in_the_first_column(width):
+    catalogue = load_catalogue()
+    rows = [(item.identifier, item.name, "0.0000123 K", "a place, upper skin") for item in catalogue]
+    lines = printed(("effect", "name", "detectable from", "shows best at"), rows, width)
+    assert max(map(len, lines)) <= width
+    first = "\n".join(line.split(" ", 2)[1] for line in lines if len(line) > 2)
+    for item in catalogue:
+        assert (item.identifier if width > 80 else broken(item.identifier, 20)) in first
+
+
+def test_columns_without_any_entry_are_left_out():
+    rows = [("mass ratio", "", "1"), ("length", "", "2")]
+    assert "unit" not in "".join(printed(("parameter", "unit", "value"), rows, 80))
+    assert "unit" in "".join(printed(("parameter", "unit", "value"), [("length", "m", "2")], 80))
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_a_long_title_does_not_break_the_numbers_beside_it(width):
+    rows = [
+        ("posterior mean of the Young modulus factor of the wing box", "1.008", "1.0073 (1)"),
+        ("filtered rms error of z1", "4.1592 points", "3.8 points (2)"),
+        ("asset, per turn", "0.281 ms (largest 3.14 ms)", ""),
+    ]
+    lines = printed(("figure", "this run", "reference"), rows, width)
+    for number in ("1.008", "1.0073 (1)", "4.1592 points", "3.8 points (2)"):
+        assert sum(number in line for line in lines) == 1, lines
+
+
+def fly(progress: Progress) -> None:
+    with progress.stage("Flying [the wing]", total=3, unit="turns") as stage:
+        for turn in range(3):
+            with progress.stage("Inside"):
+                pass
+            stage.advance(detail=f"turn {turn}")
+        progress.note("half way [there]")
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_stages_and_notes_are_shown(terminal):
+    stream = io.StringIO()
+    fly(RichProgress(Console(file=stream, force_terminal=terminal, width=120, color_system=None)))
+    text = stream.getvalue()
+    assert "Flying [the wing]" in text
+    assert "turns" in text
+    assert "half way [there]" in text
+    assert "Inside" in text
+
+
+def test_silence():
+    progress = SilentProgress()
+    assert isinstance(progress, Progress)
+    assert isinstance(RichProgress(Console(file=io.StringIO())), Progress)
+    fly(progress)
+
+
+def test_an_exception_passes_and_the_terminal_is_given_back():
+    stream = io.StringIO()
+    progress = RichProgress(Console(file=stream, force_terminal=True, width=120, color_system=None))
+
+    def fail() -> None:
+        with progress.stage("Breaking", total=4) as stage:
+            stage.advance()
+            raise KeyError("x")
+
+    with pytest.raises(KeyError):
+        fail()
+    assert stream.getvalue().rstrip().endswith("\x1b[?25h")  # the cursor is visible again
+    assert "1/4" in stream.getvalue()
+    fly(progress)
+
+
+def test_standard_output_stays_free(capsys):
+    fly(RichProgress())
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "Flying" in captured.err
+
+
+def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
+    seconds = iter([0.0, 1.0, 12.0, 15.0, 23.0, 23.5, 30.0])
+    monkeypatch.setattr("reporting.progress.time.perf_counter", lambda: next(seconds))
+    stream = io.StringIO()
+    progress = RichProgress(Console(file=stream, width=40))
+    with progress.stage("Checking a wing that has a long name", total=4, unit="checks") as stage:
+        assert stream.getvalue() == "Checking a wing that has a long name, 4 checks ...\n"
+        for number in range(4):
+            stage.advance(detail=f"check {number}")
+    assert stream.getvalue().splitlines()[1:] == [
+        "Checking a wing that has a long name: 2 of 4 checks, check 1, 12 s ...",
+        "Checking a wing that has a long name: 4 of 4 checks, check 3, 23 s ...",
+        "Checking a wing that has a long name: done, 23.5 s",
+    ]
+    told = io.StringIO()
+    with (
+        pytest.raises(KeyError),
+        RichProgress(Console(file=told), lines=True).stage("Failing"),
+    ):
+        raise KeyError
+    assert told.getvalue() == "Failing ...\n"
