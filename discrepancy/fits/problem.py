@@ -24,7 +24,7 @@ from fe.runtime.patch import ModelPatch
 from reporting.memory import Memory
 
 from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, moved
-from .trial_data import GlobalUnknowns, TrialData, global_unknowns, stand_in
+from .trial_data import TrialData, global_unknowns, stand_in
 
 KEPT = 2000
 """Responses that a problem keeps."""
@@ -57,47 +57,36 @@ class Problem:
         The model as it is.
     setting : Setting
         Scales for the catalogue.
-    trials : tuple of Trial, optional
-        Those to compare; the fitted ones if left out.
-    like : Problem, optional
-        Noise models and global unknowns are taken from it (for held-out trials).
+
+    Raises
+    ------
+    CampaignDataError
+        If all trials are held out.
     """
 
-    def __init__(
-        self,
-        campaign: Campaign,
-        model: Model,
-        setting: Setting,
-        trials: tuple[Trial, ...] | None = None,
-        like: "Problem | None" = None,
-    ) -> None:
-        self.campaign, self.setting = campaign, setting
-        self.model = model.remembering()
-        chosen = campaign.fitted if trials is None else trials
-        if not chosen:
+    def __init__(self, campaign: Campaign, model: Model, setting: Setting) -> None:
+        if not campaign.fitted:
             raise CampaignDataError(said("campaign.all_held_out", campaign=campaign))
+        self.campaign, self.setting, self.model = campaign, setting, model.remembering()
         self.channel_names = tuple(campaign.channels)
-        self.refinement: int = 1 if like is None else like.refinement
+        self.refinement = 1
         self.noise: dict[str, NoiseModel] = {
-            name: noise_model(channel, stand_in(campaign, name)) if like is None else like.noise[name]
+            name: noise_model(channel, stand_in(campaign, name))
             for name, channel in campaign.channels.items()
         }
-        self.trials = tuple(TrialData.of(campaign, trial, self.noise, model) for trial in chosen)
-        counts = np.zeros(len(self.channel_names))
+        self.freedom = np.array([item.degrees_of_freedom for item in self.noise.values()])
+        self.refusals: dict[str, str] = {}
+        self._take(campaign.fitted)
+        self.shared = global_unknowns(campaign, model, campaign.fitted, {})
+        self.shared = global_unknowns(campaign, model, campaign.fitted, self._unit_responses())
+
+    def _take(self, trials: Sequence[Trial]) -> None:
+        """Make trials ready to be compared."""
+        self.trials = tuple(TrialData.of(self.campaign, trial, self.noise, self.model) for trial in trials)
+        self.counts = np.zeros(len(self.channel_names))
         for data in self.trials:
-            np.add.at(counts, data.groups, data.weight.sum(axis=0))
-        self.counts = counts
-        self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
+            np.add.at(self.counts, data.groups, data.weight.sum(axis=0))
         self._responses = Memory(KEPT)
-        self.refusals: dict[str, str] = {} if like is None else like.refusals
-        self.shared: GlobalUnknowns
-        if like is not None:
-            self.shared = like.shared
-        else:
-            self.shared = global_unknowns(campaign, model, chosen, {})
-            ratios = self._unit_responses()
-            if ratios:
-                self.shared = global_unknowns(campaign, model, chosen, ratios)
 
     def refused(self, candidate: Candidate, cause: DiscrepancyError) -> None:
         """Keep why an effect could not be evaluated or fitted alone; of several, any may be to blame."""
@@ -309,9 +298,13 @@ class Problem:
             weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + left))
         return np.where(n > 0, weights, 1.0)
 
-    def with_trials(self, trials: tuple[Trial, ...]) -> "Problem":
-        """Return the same problem on other trials, with the same noise and global unknowns."""
-        return Problem(self.campaign, self.model, self.setting, trials, like=self)
+    def with_trials(self, trials: Sequence[Trial], model: Model | None = None) -> "Problem":
+        """Return the problem of other trials and another model, with the same noise and global unknowns."""
+        other = copy(self)
+        if model is not None:
+            other.model = model.remembering()
+        other._take(trials)
+        return other
 
     def widened(self, factors: FloatArray) -> "Problem":
         """Return the problem with noise so many times (channels,) as wide in trials in motion, and known.

@@ -101,7 +101,7 @@ def mutual_information(
         Their probabilities, of sum one.
     """
     model = problem.model.patched(proposal.added) if len(proposal.added) else problem.model
-    there = Problem(problem.campaign, model, problem.setting, (proposal.trial,), like=problem)
+    there = problem.with_trials((proposal.trial,), model)
     data = there.trials[0]
     # without a record, what the most probable hypothesis left stands for the noise
     rest = np.sqrt(problem.precisions(fits[0].sums))

@@ -156,7 +156,7 @@ class ForceSearch:
     def __init__(self, problem: Problem, about: Point | None = None) -> None:
         linear, self.laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
-        self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
+        self.problem = problem.with_trials(trials, linear)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear.ports)
         self.at: dict[str, Explained] = {}
