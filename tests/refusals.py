@@ -10,10 +10,12 @@ import pytest
 
 
 @contextmanager
-def refused(error: type[Exception] | tuple[type[Exception], ...], sentence: str) -> Iterator[None]:
+def refused(
+    error: type[Exception] | tuple[type[Exception], ...], sentence: str
+) -> Iterator[pytest.ExceptionInfo[Exception]]:
     """Expect an error of which the message holds a regular expression, on one line."""
     with pytest.raises(error, match=sentence) as caught:
-        yield
+        yield caught
     assert "\n" not in str(caught.value)
 
 

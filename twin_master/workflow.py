@@ -178,7 +178,7 @@ def _run(
     with timed("mission"):
         result = _fly(folder, config, knowledge, source, progress)
     with timed("store"), progress.stage("Storing"):
-        stored = store_flight(
+        store_flight(
             folder, config, result, source.origin, steps=scenario.mission.steps,
             misfit=_misfit(knowledge, source), write_field=_field_writer(source, result),
         )  # fmt: skip
@@ -186,10 +186,10 @@ def _run(
     del knowledge, result  # before the report is drawn
     if report:
         with timed("report"), progress.stage("Writing the report"):
-            _report(folder, stored())
+            _report(folder)
     timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
     atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
-    return read_outcome(folder, stored)
+    return read_outcome(folder)
 
 
 def _known(
@@ -294,7 +294,7 @@ def _timing(flight: History) -> dict[str, Any]:
     return record
 
 
-def _report(folder: Path, tree: Any) -> None:
+def _report(folder: Path) -> None:
     from twin_master.report.page import write_report
 
-    write_report(folder, tree=tree)
+    write_report(folder)

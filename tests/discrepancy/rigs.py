@@ -1,5 +1,6 @@
-"""Simulated campaigns of the single-mass rig, and sensitivities of fits."""
+"""What all rooms of tests share: campaigns and their settings, effects by name, the single-mass rig."""
 
+import shutil
 import tomllib
 from dataclasses import fields, replace
 from functools import cache
@@ -7,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from discrepancy.campaign.records import Campaign
-from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document import Origin
+from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import example_campaign, plan_for
@@ -20,6 +22,17 @@ from tests.refusals import Inputs
 
 MODEL = "single_mass_rig"
 INPUTS = Inputs(Path(__file__).with_name("models"))
+CAMPAIGNS = Inputs(Path(__file__).with_name("data"))
+
+
+def campaign_folder(path: Path, name: str, *changes: tuple[str, str, str]) -> Path:
+    """Write a campaign of the tests of data: of a file a piece is exchanged, the whole where it is empty."""
+    shutil.copytree(CAMPAIGNS.folder / name, path, dirs_exist_ok=True)
+    for file, old, new in changes:
+        text = (path / file).read_text(encoding="utf-8")
+        assert old in text
+        (path / file).write_text(text.replace(old, new, 1) if old else new, encoding="utf-8")
+    return path
 
 
 ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run rig", collect_provenance(0))
@@ -68,28 +81,39 @@ def one_mass(**terms: Any) -> LumpedModel:
     )
 
 
+def chosen(*identifiers: str) -> tuple[Effect, ...]:
+    """Return these effects of the catalogue."""
+    return tuple(effect_by_identifier(identifier, library()) for identifier in identifiers)
+
+
+def setting_of(campaign: Campaign, model: Model) -> Setting:
+    return Setting(campaign, model, model.scales(campaign))
+
+
+def hiding(
+    campaign: Campaign, model: Model, identifier: str, values: dict[str, float], place: str
+) -> ModelPatch:
+    """Return the patch of an effect in a campaign."""
+    return chosen(identifier)[0].patch(setting_of(campaign, model), values, place)
+
+
 def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:
     """A simulated campaign of the single-mass rig."""
     model = LumpedModel.load(MODEL)
     outputs = tuple(item.name for item in model.description.output)
     plan = plan_for(model, outputs, model.description.input[0].name)
     plan = replace(plan, duration=0.5 * plan.duration)
-    patch = ModelPatch()
+    bare, patch = example_campaign(model, kind, 4, plan), ModelPatch()  # type: ignore[arg-type]
     if hidden:
-        effect = effect_by_identifier(hidden, library())
-        bare = example_campaign(model, kind, 4, plan)  # type: ignore[arg-type]
-        setting = Setting(bare, model, model.scales(bare))
+        (effect,) = chosen(hidden)
         values = {item.name: item.prior.value(0.0) for item in effect.parameters}
         values[effect.parameters[0].name] = value
-        patch = effect.patch(setting, values, effect.places(setting)[0])
+        patch = hiding(bare, model, hidden, values, effect.places(setting_of(bare, model))[0])
     return example_campaign(model, kind, 4, plan, patch), model  # type: ignore[arg-type]
 
 
-FEW = tuple(
-    effect
-    for effect in library()
-    if effect.identifier
-    in ("quadratic_damping", "coulomb_friction", "structural_damping", "gauge_gain", "load_cell", "washout")
+FEW = chosen(
+    "quadratic_damping", "coulomb_friction", "structural_damping", "gauge_gain", "load_cell", "washout"
 )
 """Part of the catalogue, where the whole one would only take time."""
 

@@ -13,14 +13,11 @@ import pytest
 import uav_twin
 from discrepancy.application import _again, apply_verdict, gives
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
-from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.verdict import read_patch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import choose_model
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
@@ -37,7 +34,8 @@ from fmu_asset.archive.fmu_file import read_fmu
 from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
 from tests import command_line
-from tests.discrepancy.rigs import fmu_rig
+from tests.discrepancy.core.kit import problem_of
+from tests.discrepancy.rigs import chosen, fmu_rig, hiding
 
 
 def run(*words, failed=False):
@@ -47,18 +45,8 @@ def run(*words, failed=False):
     return done.stderr if failed else done.stdout
 
 
-CATALOGUE = load_catalogue()
-SPRING = ("cubic_stiffness", "seating_offset", "load_cell")
+SPRING = chosen("cubic_stiffness", "seating_offset", "load_cell")
 CUBIC = {"stiffening": 0.15}
-
-
-def named(*identifiers):
-    return tuple(effect_by_identifier(name, CATALOGUE) for name in identifiers)
-
-
-def hidden(model, campaign, identifier, values, place):
-    setting = Setting(campaign, model, model.scales(campaign))
-    return effect_by_identifier(identifier, CATALOGUE).patch(setting, values, place)
 
 
 def verdict_of(choice, campaign, effects, folder, *, replace_it=False):
@@ -75,7 +63,7 @@ def verdict_of(choice, campaign, effects, folder, *, replace_it=False):
 def example(choice, kind, seed, folder, effect, values, place):
     """Write an example that hides an effect."""
     plan = plan_of(choice.model)
-    patch = hidden(choice.model, example_campaign(choice.model, kind, seed, plan), effect, values, place)
+    patch = hiding(example_campaign(choice.model, kind, seed, plan), choice.model, effect, values, place)
     return write_example(choice.model, folder, kind, seed, plan, patch)
 
 
@@ -149,7 +137,7 @@ def test_there_and_back_from_python(kind, foreign_fmu, write_beam, tmp_path):
     ports = choice.model.ports
     port = "tip" if "tip" in ports else ports[0]
     campaign = example(choice, "static", 3, tmp_path / "campaign", "cubic_stiffness", CUBIC, port)
-    found = verdict_of(choice, campaign, named(*SPRING), tmp_path / "verdict")
+    found = verdict_of(choice, campaign, SPRING, tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
     applied = uav_twin.apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
     out = "'verdicts/a campaign_patched'"
@@ -159,7 +147,7 @@ def test_there_and_back_from_python(kind, foreign_fmu, write_beam, tmp_path):
     assert patched.model.patch == found.verdict.effects[0].patch
     for item, calibrated in zip(patched.model.parameters, found.verdict.parameters, strict=True):
         assert (item.mean, item.deviation) == (calibrated.mean, calibrated.deviation)
-    again = verdict_of(patched, campaign, named(*SPRING), tmp_path / "again")
+    again = verdict_of(patched, campaign, SPRING, tmp_path / "again")
     assert again.verdict.kind is VerdictKind.NOTHING_MISSING, again.verdict.sentence
     if kind == "wing":
         left = tmp_path / "verdict" / "patch.json"
@@ -190,7 +178,7 @@ def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
     """
     monkeypatch.chdir(tmp_path)
     choice = choose_model("three_mass_chain")
-    effects = named("root_compliance", "breathing_crack")
+    effects = chosen("root_compliance", "breathing_crack")
     share = {"compliance_share": 0.11}
     campaign = example(choice, "static", 3, tmp_path / "campaign", "root_compliance", share, "")
     verdict = verdict_of(choice, campaign, effects, tmp_path / "verdict").verdict
@@ -219,7 +207,7 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     """A hardening spring with nothing but a stiffness that drifts to explain it."""
     choice = choose_model("single_mass_rig")
     campaign = example(choice, "ringdown", 3, tmp_path / "campaign", "cubic_stiffness", CUBIC, "slide")
-    found = verdict_of(choice, campaign, named("stiffness_drift"), tmp_path / "verdict")
+    found = verdict_of(choice, campaign, chosen("stiffness_drift"), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
     assert gives(found.verdict)
     assert not gives(replace(found.verdict, hypotheses=found.verdict.hypotheses[1:]))  # the model as it is
@@ -310,7 +298,7 @@ def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     plan = plan_of(first.model)
     drag = ModelPatch((PowerDamping("slide", 0.1, 2.0, 0.0, 0.05, 0.01),))
     campaign = write_example(first.model, tmp_path / "campaign", "ringdown", 5, plan, drag)
-    found = verdict_of(first, campaign, named("quadratic_damping"), tmp_path / "verdict")
+    found = verdict_of(first, campaign, chosen("quadratic_damping"), tmp_path / "verdict")
     assert [item.identifier for item in found.verdict.effects] == ["quadratic_damping"]
     beneath = (str(laboratory / "rig.toml"), str(tmp_path / "first.json"))
     assert choose_model(tmp_path / "verdict" / "patch.json").beneath == beneath
@@ -365,12 +353,12 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings():
     model = uav_twin.load_model("single_mass_rig")
     plan = plan_of(model)
     bare = example_campaign(model, "ringdown", 1, plan)
-    patch = hidden(model, bare, "coulomb_friction", {"friction_ratio": 0.04}, "slide")
+    patch = hiding(bare, model, "coulomb_friction", {"friction_ratio": 0.04}, "slide")
     campaign, patched = example_campaign(model, "ringdown", 1, plan, patch), model.patched(patch)
-    problem = Problem(campaign, patched, Setting(campaign, patched, patched.scales(campaign)))
+    problem = problem_of(campaign, patched)
     count = problem.counts.sum()
     assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count
-    assert search(problem, named("load_cell")).none.chi_square < 1.2 * count
+    assert search(problem, chosen("load_cell")).none.chi_square < 1.2 * count
 
 
 @pytest.mark.parametrize("kind", ["lumped", "FMU"])

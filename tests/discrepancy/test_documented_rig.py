@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.catalogue.library import library
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
+from tests.discrepancy.rigs import chosen
 
 
 def named(folder, campaign, *rivals):
     """Return the law of the only effect that is named with its rivals, and its place."""
-    effects = [effect for effect in library() if effect.identifier in rivals]
-    found = investigate(
-        read_campaign(folder / campaign), LumpedModel.load(folder / "model.toml"), effects, thorough=False
-    )
+    model = LumpedModel.load(folder / "model.toml")
+    found = investigate(read_campaign(folder / campaign), model, chosen(*rivals), thorough=False)
     assert found.verdict.kind is VerdictKind.NAMED
     (effect,) = found.verdict.effects
     (law,) = effect.patch

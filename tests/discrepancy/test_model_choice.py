@@ -14,7 +14,6 @@ from discrepancy.model_choice import ModelKind, choose_model
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from tests.discrepancy.rigs import MODEL
-from tests.refusals import Inputs
 
 
 def test_models_by_name_and_file(tmp_path):
@@ -66,9 +65,6 @@ def test_a_structure_needs_no_cache(write_beam, tmp_path):
 # ---------------------------------------------------------------- tOML files that hold nonsense
 
 
-CAMPAIGN = Inputs(__file__).text("campaign.toml")
-
-
 @pytest.mark.parametrize(
     "read",
     [
@@ -84,21 +80,3 @@ def test_what_is_nested_too_deeply_is_refused(tmp_path, read, depth):
     path.write_text(f"format = 1\nkind = {'[' * depth}1{']' * depth}\n", encoding="utf-8")
     with pytest.raises(DiscrepancyError, match=r"campaign.toml is nested deeper than 32"):
         read(path)
-
-
-def test_a_row_that_comes_twice_is_refused(tmp_path):
-    head, _, _ = CAMPAIGN.partition("[[trial]]")
-    trial = '[[trial]]\nname = "load"\nkind = "static"\nfile = "load.csv"\n'
-    (tmp_path / "campaign.toml").write_text(head + trial, encoding="utf-8")
-    rows = "1.0,0.52\n2.0,1.03\n2.0,1.04\n"
-    for table, count in (
-        (f"force,tip\n{rows}", 3),
-        (f"force,tip\n{rows}2.0,1.03\n", None),
-        ("time,force,tip\n0,2.0,1.03\n9,2.0,1.03\n", 2),
-    ):
-        (tmp_path / "load.csv").write_text(table, encoding="utf-8")
-        if count:
-            assert len(read_campaign(tmp_path).trials[0].force) == count
-            continue
-        with pytest.raises(DiscrepancyError, match="lines 3 and 5 hold the same row; leave one out"):
-            read_campaign(tmp_path)

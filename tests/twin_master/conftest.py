@@ -11,5 +11,5 @@ from twin_master import workflow
 def no_report() -> Iterator[None]:
     """The report has tests of its own and takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "_report", lambda folder, _tree: (folder / "report.html").touch())
+        patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
         yield

@@ -64,7 +64,7 @@ def fly(
 def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
     """The mission of level turns; tests change copies of its folder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "_report", lambda folder, _tree: (folder / "report.html").touch())
+        patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
         return fly(tmp_path_factory.mktemp("flown") / "run", library_file)
 
 
@@ -255,7 +255,7 @@ class Notes(SilentProgress):
 
 
 def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, whole, monkeypatch):
-    def report(folder: Path, _tree: object = None) -> Path:
+    def report(folder: Path) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")
         return folder / "report.html"
 

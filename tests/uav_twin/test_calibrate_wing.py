@@ -265,7 +265,7 @@ def test_two_wings_are_two_fmus(wings, tmp_path):
 
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder, _: (folder / "report.html").touch())
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
 
 
 SHORT = ("steps = 50", "steps = 3")

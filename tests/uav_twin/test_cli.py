@@ -26,7 +26,7 @@ from uav_twin import cli
 
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder, _: (folder / "report.html").touch())
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
 
 
 def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]:

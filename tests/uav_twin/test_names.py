@@ -187,7 +187,7 @@ def test_a_policy_of_another_shape_costs_no_folder(tmp_path, library_file):
 def no_report_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fail where a report is drawn although none was asked for."""
 
-    def drawn(_folder: Path, _tree: object) -> Path:
+    def drawn(_folder: Path) -> Path:
         raise AssertionError("a report was drawn")
 
     monkeypatch.setattr("twin_master.workflow._report", drawn)

@@ -44,7 +44,7 @@ def mapped(*entries: tuple[str, str]) -> dict[str, str]:
 
 
 def test_export_check_and_run(monkeypatch, scenario, system, tmp_path):
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder, _: (folder / "report.html").touch())
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
     text, out = said("ssp", "check", system), tmp_path / "run"
     assert "no problem found; 8 connections, 2 parameters" in text
     assert "evaluated in the order heat_exchanger (HeatExchanger)" in text

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from reporting.arrays import Float
-from twin_master.learning.learning_filter import Hypotheses, LearningFilter, quantiles_of, shown_by
+from twin_master.learning.learning_filter import Hypotheses, LearningFilter, quantiles_of
 from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.rewards import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -77,13 +77,13 @@ class LearntExpectation:
     def filtered(self, carried: Sequence[Carried], observed: Float) -> Expected:
         """Return what is expected of T turns given the observations up to each; observed is (T, G)."""
         rows = zip(carried, observed, strict=True)
-        return stacked(self._known(self._counting(turn), turn, seen) for turn, seen in rows)
+        return stacked(self._known(self._learning.hypotheses(turn), turn, seen) for turn, seen in rows)
 
     def smoothed(self, carried: Sequence[Carried], observed: Float) -> Expected:
         """Return what is expected of T turns given all observations; observed is (T, G)."""
-        last = self._learning.hypotheses(carried[-1])
-        rows = zip(self._learning.smoothed_hypotheses(carried), carried, observed, strict=True)
-        return stacked(self._known(last.counting(weight), turn, seen) for weight, turn, seen in rows)
+        rows, own = zip(carried, observed, strict=True), self._learning.smoothed_hypotheses(carried)
+        last = (self._learning.hypotheses(carried[-1], weight) for weight in own)
+        return stacked(self._known(found, *row) for found, row in zip(last, rows, strict=True))
 
     def predicted(self, carried: Sequence[Carried], horizon: int) -> Expected:
         """Return what is expected after each of T turns of the H turns to come."""
@@ -146,17 +146,13 @@ class LearntExpectation:
         matrix = self._learning.model.transition.matrix
         return np.asarray(np.einsum("su,usn->sn", self._policy, matrix))
 
-    def _counting(self, turn: Carried) -> Hypotheses:
-        found = self._learning.hypotheses(turn)
-        return found.counting(found.weight)
-
     def _known(self, hypotheses: Hypotheses, turn: Carried, seen: Float) -> Expected:
         u = slice(turn.control_index, turn.control_index + 1)
         found = self._of(hypotheses, hypotheses.weight[None, :, :, None], u, seen)
         return Expected(**{name: values[0] for name, values in vars(found).items()})
 
     def _ahead(self, turn: Carried, horizon: int) -> Expected:
-        hypotheses = self._counting(turn)
+        hypotheses = self._learning.hypotheses(turn)
         rows, coming = hypotheses.weight, np.empty((horizon, *hypotheses.weight.shape))
         step = self._learning.model.transition.matrix[turn.control_index]
         for h in range(horizon):
@@ -167,9 +163,14 @@ class LearntExpectation:
     def _of(self, hypotheses: Hypotheses, weight: Float, controls: slice, seen: Float | None) -> Expected:
         """Return what is expected under B beliefs (B, K, S, U') over hypotheses, states and controls."""
         weight = weight / weight.sum(axis=(1, 2, 3), keepdims=True)
-        shown, shown_variance, noise2 = shown_by(
-            hypotheses, self._value[:, :, controls], self._deviation[:, controls]
+        own = self._value[:, :, controls][hypotheses.draw]
+        gain, offset, wide, scale2 = (
+            part[:, None, None]
+            for part in (hypotheses.gain, hypotheses.offset, hypotheses.covariance, hypotheses.scale2)
         )
+        shown = own * (1.0 + gain) + offset  # (K, S, U', G), normally distributed
+        shown_variance = wide[..., 0] + own * (2.0 * wide[..., 1] + own * wide[..., 2])
+        noise2 = np.broadcast_to(scale2 * self._deviation[:, controls] ** 2, shown.shape)
         beliefs, count = len(weight), shown.shape[-1]
         flat = weight.reshape(beliefs, -1)
         center = shown[0].mean(axis=(0, 1))  # near enough that squares do not cancel

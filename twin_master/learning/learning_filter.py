@@ -58,38 +58,6 @@ class Hypotheses:
     covariance: Float
     scale2: Float
 
-    def counting(self, weight: Float) -> "Hypotheses":
-        """Return those whose weight (K, S) tells something, with it."""
-        share = weight.sum(axis=1)
-        kept = np.flatnonzero(share > _NEGLIGIBLE * share.sum())
-        return Hypotheses(
-            weight[kept], self.draw[kept], self.offset[kept], self.gain[kept], self.covariance[kept],
-            self.scale2[kept],
-        )  # fmt: skip
-
-
-def shown_by(hypotheses: Hypotheses, value: Float, total_deviation: Float) -> tuple[Float, Float, Float]:
-    """Return mean and variance of what the sensors show, normally distributed, and the variance of noise.
-
-    Each is (K, S, U, G): of each hypothesis, state and control; the noise has the model error in it.
-
-    Parameters
-    ----------
-    hypotheses : Hypotheses
-    value : (E, S, U, G)
-        Predictions for each draw, SI.
-    total_deviation : (S, U, G)
-        Standard deviation of assumed noise and model error, SI.
-    """
-    own = value[hypotheses.draw]
-    gain, offset, spread, scale2 = (
-        part[:, None, None]
-        for part in (hypotheses.gain, hypotheses.offset, hypotheses.covariance, hypotheses.scale2)
-    )
-    mean = own * (1.0 + gain) + offset
-    variance = spread[..., 0] + own * (2.0 * spread[..., 1] + own * spread[..., 2])
-    return mean, variance, np.broadcast_to(scale2 * total_deviation**2, mean.shape)
-
 
 def quantiles_of(weight: Float, mean: Float, deviation: Float, levels: Float) -> Float:
     """Return quantiles (P, G) of mixtures of N normal distributions.
@@ -126,8 +94,6 @@ class LearntPriors:
         Degrees of freedom of the noise scale; 0 takes the assumed noise for known.
     gain, offset : float or (G,)
         Prior standard deviation of gain error [1] and offset [SI] of each sensor; 0 is not learnt.
-    transition_factors : (R,)
-        Factors on the probabilities to leave a state, equally probable at first.
     sensor_unit : str
         Unit of the offset.
     """
@@ -137,7 +103,6 @@ class LearntPriors:
     noise_degrees: float = 0.0
     gain: ArrayLike = 0.0
     offset: ArrayLike = 0.0
-    transition_factors: tuple[float, ...] = (1.0,)
     sensor_unit: str = "1"
 
 
@@ -154,8 +119,9 @@ class LearningFilter:
     sensor_model : GaussianSensorModel
         Predictions (E, S, U, G), weights of the draws, and the noise that is assumed.
     priors : LearntPriors
-    transitions : sequence of TransitionModel, optional
-        Transitions for each of `transition_factors`; those of the model if there is one factor.
+    transitions : mapping of float to TransitionModel, optional
+        Those of each factor on the probabilities to leave a state, equally probable at first; those of the
+        model if left out.
     name : str
         Name of the twin, for messages.
 
@@ -170,19 +136,16 @@ class LearningFilter:
         model: GraphicalModel,
         sensor_model: GaussianSensorModel,
         priors: LearntPriors,
-        transitions: Sequence[TransitionModel] | None = None,
+        transitions: Mapping[float, TransitionModel] | None = None,
         name: str = "twin",
     ) -> None:
         if sensor_model.averages_inside:
             raise InvalidModelError(said("learning.inside", what="learning"))
-        moves = transitions or [model.transition]
-        if len(moves) != len(priors.transition_factors):
-            counts = len(priors.transition_factors), len(moves)
-            raise InvalidModelError(said("learning.tables", counts=counts))
+        moves = transitions or {1.0: model.transition}
         self.model, self.sensor_model, self._name = model, sensor_model, name
-        self.priors = priors
+        self.priors, self._factors = priors, np.array([*moves])
         draws, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
-        blocks = zip(*(move.blocks for move in moves), strict=True)
+        blocks = zip(*(move.blocks for move in moves.values()), strict=True)
         self._transition = TransitionModel(tuple(map(np.concatenate, blocks)))  # one factor after the other
         self._draw: Index = np.tile(np.arange(draws), factors)
         self._first_control: Index = np.repeat(np.arange(factors), draws) * len(model.controls)
@@ -230,14 +193,12 @@ class LearningFilter:
             statistics = statistics + self._gauges.told(seen, self._draw, near.alone, scale, log_belief)
         count = count + ~np.isnan(seen)
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
-        carried = Carried(control_index, arrays)
         return Estimate(
             forecast=np.exp(forecast).sum(axis=0),
             filtered=filtered.sum(axis=0),
             log_evidence=evidence,
-            carried=carried,
+            carried=Carried(control_index, arrays),
             learnt=self._learnt(filtered, statistics, count),
-            expected=lambda: self._expected(carried),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
@@ -252,31 +213,24 @@ class LearningFilter:
             forecast = self._averaged_anew(forecast)
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
-    def hypotheses(self, carried: Carried) -> Hypotheses:
-        """Return what is believed of each hypothesis after a turn."""
-        weight = np.exp(carried.arrays["log_belief"])
-        statistics, count = carried.arrays["statistics"], carried.arrays["count"]
-        fitted = self._gauges.fitted(statistics)
-        scale2, offset, gain = self._gauges.scale2(fitted, count), self._gauges.offset, self._gauges.gain
+    def hypotheses(self, carried: Carried, weight: Float | None = None) -> Hypotheses:
+        """Return what is believed after a turn of each hypothesis that tells something.
+
+        Of other beliefs the weight (K, S) is given.
+        """
+        weight = np.exp(carried.arrays["log_belief"]) if weight is None else weight
+        share = weight.sum(axis=1)
+        kept = np.flatnonzero(share > _NEGLIGIBLE * share.sum())
+        fitted = self._gauges.fitted(carried.arrays["statistics"][kept])
+        offset, gain = self._gauges.offset, self._gauges.gain
+        scale2 = self._gauges.scale2(fitted, carried.arrays["count"])
         covariance = np.stack(
             [offset**2 * fitted[..., 2], offset * gain * fitted[..., 3], gain**2 * fitted[..., 4]], axis=-1
         )
         return Hypotheses(
-            weight, self._draw, offset * fitted[..., 0], gain * fitted[..., 1],
+            weight[kept], self._draw[kept], offset * fitted[..., 0], gain * fitted[..., 1],
             scale2[..., None] * covariance, scale2,
         )  # fmt: skip
-
-    def _expected(self, carried: Carried) -> tuple[Float, Float]:
-        """Return for each sensor what it shows in the mean, and the deviation of its noise: two of (G,)."""
-        own, control = self.hypotheses(carried), carried.control_index
-        own = own.counting(own.weight)
-        model = self.sensor_model
-        in_force = slice(control, control + 1)
-        mean, _, noise2 = shown_by(
-            own, model.value_per_draw[:, :, in_force], model.total_standard_deviation[:, in_force]
-        )
-        weight = own.weight.ravel() / own.weight.sum()
-        return weight @ mean.reshape(weight.size, -1), np.sqrt(weight @ noise2.reshape(weight.size, -1))
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
@@ -301,7 +255,7 @@ class LearningFilter:
 
     def _averaged_anew(self, log_belief: Float) -> Float:
         """Return a belief (K, S) in which the draws have their first weights again, whatever the state."""
-        factors = len(self.priors.transition_factors)
+        factors = len(self._factors)
         by_factor = log_belief.reshape(factors, -1, log_belief.shape[1])
         merged = np.repeat(np.logaddexp.reduce(by_factor, axis=1), by_factor.shape[1], axis=0)
         return np.asarray(merged + self._log_weight[:, None] + np.log(factors))
@@ -310,7 +264,7 @@ class LearningFilter:
         """Return the posterior of everything that is learnt."""
         weight = filtered.sum(axis=1)  # of each hypothesis
         result: dict[str, Learnt] = {}
-        factors = np.asarray(self.priors.transition_factors)
+        factors = self._factors
         if self.priors.parameter is not None and self.priors.draws is not None:
             own, prior = weight.reshape(len(factors), -1).sum(axis=0), self.sensor_model.draw_weight
             result[self.priors.parameter] = posterior_of_draws(self.priors.draws, prior, own)

@@ -73,7 +73,6 @@ def learning_filter(
     learning = scenario.learning
     if learning is None:
         return None
-    factors = learning.transition_factors or (1.0,)
     units = set(scenario.observation.sensor_units)
     priors = LearntPriors(
         parameter=scenario.calibration.parameter if learning.parameter else None,
@@ -81,8 +80,8 @@ def learning_filter(
         noise_degrees=learning.noise_degrees if learning.noise else 0.0,
         gain=learning.gauge_gain,
         offset=learning.gauge_offset,
-        transition_factors=factors,
         sensor_unit=units.pop() if len(units) == 1 else "",
     )
-    tables = [build_graphical_model(scenario, factor).transition for factor in factors]
-    return LearningFilter(model, sensor_model, priors, tables, scenario.mission.name)
+    factors = learning.transition_factors
+    moves = {factor: build_graphical_model(scenario, factor).transition for factor in factors}
+    return LearningFilter(model, sensor_model, priors, moves, scenario.mission.name)

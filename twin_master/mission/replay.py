@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from twin_master.errors import NotResumableError
+from twin_master.learning.expectation import expected_of
 from twin_master.mission.journal import array_of, damaged, reading_of, records_backwards
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
-from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.sentences import said
@@ -70,18 +70,20 @@ def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
     return told
 
 
-def gap_of(history: History, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:
+def gap_of(history: History, skipped: int, knowledge: Knowledge) -> dict[str, Any]:
     """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
 
     The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
     """
-    left = history.behind(skipped)
+    left, learns, sensors = history.behind(skipped), knowledge.expectation, knowledge.sensor_model
     if not left.turns or np.isnan(left.observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    residual = left.residual()
-    if not len(residual):
+    if learns is None:
         joint = known_control(left.filtered, left.control_index, sensors.control_count)
-        residual = (left.observed - sensors.moments(joint)[0]) / sensors.noise(joint)
+        expected = expected_of(sensors, knowledge.rewards, joint, None, quantiles=False)
+    else:
+        expected = learns.filtered([turn.concluded.carried for turn in left.turns], left.observed)
+    residual = (left.observed - expected.mean) / expected.noise
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
         "log_evidence": float(np.sum(left.log_evidence)),

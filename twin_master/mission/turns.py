@@ -192,12 +192,3 @@ class History:
         """The figures of each posterior (T, N, 4)."""
         figures = [[one.figures for one in turn.concluded.learnt.values()] for turn in self.turns]
         return np.array(figures).reshape(len(self.turns), len(self.learnt_names), 4)
-
-    def residual(self) -> Float:
-        """Return observations less what was learnt to expect, in standard deviations (T, G), or none."""
-        found = []
-        for turn in self.turns:
-            if turn.concluded.expected is not None:
-                mean, noise = turn.concluded.expected()
-                found.append((turn.reading.observed[: self.sensors] - mean) / noise)
-        return np.array(found)

@@ -5,7 +5,7 @@ estimate and is given back for the next: a twin that keeps them can smooth over 
 came late, and be stored and continued to the last bit.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -170,9 +170,6 @@ class Estimate:
         What the operator should know of this turn.
     suspicion : Suspicion or None
         How well the model explains the sensors, where that is watched.
-    expected : callable or None
-        Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
-        where the estimator knows more of the sensors than their model.
     hypotheses : tuple of Hypothesis
         What may hold, where more than the model is compared; those that are very improbable are left out.
     """
@@ -184,7 +181,6 @@ class Estimate:
     learnt: Mapping[str, Learnt] = field(default_factory=dict)
     notices: tuple[Notice, ...] = ()
     suspicion: Suspicion | None = None
-    expected: Callable[[], tuple[Float, Float]] | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
 
 

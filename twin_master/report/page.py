@@ -6,7 +6,7 @@ First the sentences with which it begins: what was decided, what is believed, wh
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,10 +28,6 @@ from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
 from twin_master.store.summary import Fallback, another_truth, control_changes, find_fallback
 from twin_master.store.writing import REPORT_NAME
-
-if TYPE_CHECKING:
-    import xarray as xr
-
 
 WORDS = Words("twin_master.report")
 
@@ -148,9 +144,7 @@ MAIN_FIGURE, NETWORK = "mission_now", "network"
 """The figure that is also written as PNG, and the one that is the same for all runs."""
 
 
-def write_report(
-    run_folder: Path | str, *, now: int | None = None, tree: "xr.DataTree | None" = None
-) -> Path:
+def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     """Write ``report.html`` and ``figures/`` of a run; return the path of the page.
 
     Equal runs give equal bytes: wall-clock figures stay in ``timing.json``.
@@ -161,8 +155,6 @@ def write_report(
         Holds ``run.nc`` and ``config.json`` and, where they exist, ``summary.json`` and ``calibration.json``.
     now
         The present turn of the first figure; by default shortly before the control first changes.
-    tree
-        What ``run.nc`` holds, where it need not be read.
 
     Raises
     ------
@@ -172,7 +164,7 @@ def write_report(
         The disk is full or the folder cannot be written.
     """
     folder = Path(run_folder)
-    run = read_run(folder, tree)
+    run = read_run(folder)
     drawings, figures = {}, {}
     for drawn in _figures(run, now, folder):  # one after the other: those of a long mission are large
         drawings[drawn.name] = to_svg(drawn.figure)

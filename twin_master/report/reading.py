@@ -151,15 +151,15 @@ class Run:
         return smooth(self.model, self.control_index[: now + 1], rows)
 
 
-def read_run(folder: Path, tree: "xr.DataTree | None" = None) -> Run:
-    """Read a run folder, but for `run.nc` where what it holds is given.
+def read_run(folder: Path) -> Run:
+    """Read a run folder.
 
     Raises
     ------
     RunFolderError
         There is no ``run.nc``, it is damaged, or of another version.
     """
-    tree = open_run(folder) if tree is None else tree
+    tree = open_run(folder)
     config, summary, calibration = (
         _read_json(folder / name) for name in (CONFIG_NAME, SUMMARY_NAME, "calibration.json")
     )

@@ -7,9 +7,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
-from reporting.toml_file import read_toml, shown
+from reporting.toml_file import checked, read_toml
 from reporting.words import brief
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, UnknownScenarioError
@@ -26,7 +24,7 @@ def from_format_1(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return a table of format 1 as one of format 2; what is wrong with it stays wrong."""
     given = table.get("asset")
     if not isinstance(given, Mapping):
-        return {**table, "format": 2}
+        return {**table, "format": 2, "belief": {"kind": "asset"}}
     asset = {key: value for key, value in given.items() if value not in (None, [], (), {})}
     believed, library = asset.pop("observation_model", None), asset.pop("library", None)
     design, effects = asset.pop("design", None), asset.pop("model_patch", None)
@@ -144,45 +142,4 @@ def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
     """
     if table.get("format") == 1 and table["format"] is not True and "belief" not in table:
         table = from_format_1(table)
-    try:
-        return Scenario.model_validate(table)
-    except ValidationError as error:
-        errors = error.errors(include_url=False, include_context=True)
-        # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
-        first = next((e for e in errors if e["type"] == "unknown_key"), errors[0])
-        raise ScenarioError(f"{source}: {_sentence(first, table)}") from None
-
-
-def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
-    kind, location = error["type"], tuple(error["loc"])
-    where, value = _written(location, table)
-    if kind in ("unknown_key", "missing_key"):  # of the table there; the missing one may carry a unit
-        key, told = error["ctx"]["key"], error["ctx"]["told"]
-        before = f"{where}." if where else ""
-        if kind == "missing_key":
-            return f"`{before}{told}` is missing."
-        return f"unknown key `{before}{key}`; the keys known there are {told}."
-    if kind == "missing":
-        return f"`{where}` is missing."
-    if kind == "value_error":
-        return f"{error['ctx']['error']}{f' (in `{where}`)' if where else ''}."
-    expected = str(error["msg"]).replace("Input should", "should", 1)
-    return f"`{where}` {expected}, and {shown(error['input'] if value is table else value)} came."
-
-
-def _written(location: tuple[int | str, ...], table: Mapping[str, Any]) -> tuple[str, Any]:
-    """Return a location as the file has it, and what stands there: keys with units, entries from 1."""
-    node: Any = table
-    text = ""
-    for index, part in enumerate(location):
-        key, keyed = part, isinstance(node, Mapping)
-        listed = isinstance(part, int) and isinstance(node, list | tuple) and part < len(node)
-        if keyed and part not in node:  # but perhaps with its unit
-            key = next((own for own in node if str(own).startswith(f"{part}_")), part)
-        found = listed or (keyed and key in node)
-        # Else the name of a branch of a union, which the file does not have.
-        if found or (keyed and isinstance(part, str) and index == len(location) - 1):
-            step = f"[{int(part) + 1}]" if listed else str(key)
-            text += step if listed or not text else f".{step}"
-        node = node[key] if found else node
-    return text, node
+    return checked(Scenario, table, source, ScenarioError, what="a scenario")

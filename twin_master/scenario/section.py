@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from reporting import toml_file
 from reporting.toml_file import Fault as Fault
@@ -86,12 +85,10 @@ class Section(toml_file.Section):
         bases = {base for base, _ in given.values()}
         for key, (base, _) in given.items():
             if base not in known:
-                told = {"key": key, "told": ", ".join(known.values())}
-                raise PydanticCustomError("unknown_key", "unknown key {key}", told)
+                raise ValueError(f"unknown key `{key}`; the keys known there are {', '.join(known.values())}")
         for name in cls.units:
             if cls.model_fields[name].is_required() and name not in bases:
-                told = {"key": name, "told": known[name]}
-                raise PydanticCustomError("missing_key", "{told} is missing", told)
+                raise ValueError(f"`{known[name]}` is missing")
         converted: dict[object, object] = {}
         for (key, (base, unit)), value in zip(given.items(), table.values(), strict=True):
             if base in table and unit:

@@ -2,8 +2,8 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,14 +73,6 @@ def open_run(folder: Path | str) -> "DataTree":
         raise RunFolderError(f"{error}: it is not a whole run, resume the run or fly it again.") from error
 
 
-def tree_of(groups: Mapping[str, Group], attributes: Mapping[str, Any]) -> "DataTree":
-    """Return groups as `open_run` returns them, without a file."""
-    import xarray as xr
-
-    sets = {name: xr.Dataset(one.variables, one.coords, one.attrs) for name, one in groups.items()}
-    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **sets})
-
-
 def store_flight(
     folder: Path,
     config: Mapping[str, Any],
@@ -92,8 +84,8 @@ def store_flight(
     attributes: Mapping[str, Any] | None = None,
     misfit: Float | None = None,
     write_field: Callable[[Path], object] | None = None,
-) -> Callable[[], "DataTree"]:
-    """Write all that a run or a watch leaves beside its report; return what gives its tree.
+) -> None:
+    """Write all that a run or a watch leaves beside its report.
 
     Parameters
     ----------
@@ -153,7 +145,6 @@ def store_flight(
     rewards = groups["filtered"]["reward_mean"].values
     shown = [asdict(figure) for figure in (*figures, *summarise(result, rewards, misfit))]
     atomic_write_text(folder / SUMMARY_NAME, to_json({**heading, "figures": shown}))
-    return partial(tree_of, groups, told)
 
 
 REPORT_NAME = "report.html"
@@ -182,8 +173,6 @@ class RunOutcome:
         When which control was left for which, in words.
     notices : tuple of str
         What the operator should know, a sentence each.
-    stored : callable or None
-        Gives `tree` where this process flew the run.
     """
 
     folder: Path
@@ -194,16 +183,15 @@ class RunOutcome:
     step_name: str
     control: str
     notices: tuple[str, ...] = ()
-    stored: Callable[[], "DataTree"] | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def tree(self) -> "DataTree":
-        """All that the run has stored, as of `open_run`; it is read where this process did not fly it."""
-        return open_run(self.folder) if self.stored is None else self.stored()
+        """All that the run has stored, as of `open_run`."""
+        return open_run(self.folder)
 
 
-def read_outcome(folder: Path, stored: Callable[[], "DataTree"] | None = None) -> RunOutcome:
-    """Return what came of the run in a folder; `stored` gives its `run.nc` without reading it.
+def read_outcome(folder: Path) -> RunOutcome:
+    """Return what came of the run in a folder.
 
     Raises
     ------
@@ -223,7 +211,6 @@ def read_outcome(folder: Path, stored: Callable[[], "DataTree"] | None = None) -
         str(read_config(folder)["scenario"]["mission"]["step_name"]),
         str(summary["control"]),
         tuple(str(notice["sentence"]) for notice in summary.get("notices", ())),
-        stored,
     )
 
 

@@ -300,7 +300,7 @@ class Watch:
             attributes = {"model_patch": model["patch"], "model_patch_from_step": model["from_turn"]}
         origin = FlownAndBelieved(WATCHED, self._source.origin.model)
         with self._progress.stage("Storing"):
-            stored = store_flight(
+            store_flight(
                 self.folder, self._config, result, origin, steps=turns,
                 figures=self._figures(counts, turns), attributes=attributes,
             )  # fmt: skip
@@ -308,7 +308,7 @@ class Watch:
             from twin_master.report.page import write_report
 
             with self._progress.stage("Writing the report"):
-                write_report(self.folder, tree=stored())
+                write_report(self.folder)
 
     def result(self, turns: int, last: int) -> MissionResult:
         """Return the last of so many turns, as a mission."""

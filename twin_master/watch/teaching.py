@@ -115,8 +115,8 @@ def judged(
         for found in (before, after)
     ]
     record = {
-        "before": gap_of(before, from_turn - before.first_turn, known.sensor_model),
-        "after": gap_of(after, from_turn - after.first_turn, last.sensor_model),
+        "before": gap_of(before, from_turn - before.first_turn, known),
+        "after": gap_of(after, from_turn - after.first_turn, last),
         "policy_change": policy_change(known, last),
     }
     return Outcome(patch, model, float(evidence[1] - evidence[0]), record)

@@ -4,9 +4,10 @@ import pytest
 
 from benchmarks.cantilever import Cantilever, campaign
 from discrepancy.catalogue.entry import Setting
+from tests.discrepancy.rigs import setting_of
 
 
 @pytest.fixture(scope="session")
 def setting() -> Setting:
     given, model = campaign(), Cantilever()
-    return Setting(given, model, model.scales(given))
+    return setting_of(given, model)

@@ -9,12 +9,12 @@ import pytest
 from benchmarks.cantilever import campaign
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
-from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
+from tests.discrepancy.rigs import setting_of
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
@@ -46,7 +46,7 @@ def setting():
     means = np.array([item.mean for item in model.parameters])
     for trial in trials:
         trial.values[:] = observe(model, chain, trial, ModelPatch(), Conditions(means)).values
-    return Setting(chain, model, model.scales(chain))
+    return setting_of(chain, model)
 
 
 ABSENT = ("local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief", "outflow", "overflow")

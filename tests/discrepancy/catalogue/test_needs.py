@@ -8,23 +8,21 @@ import pytest
 
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
-from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.library import effect_by_identifier, library
 from fe.runtime.patch import LoggerClock, ModelPatch
 from tests.discrepancy.asking import campaign, seen, trial
-from tests.discrepancy.rigs import INPUTS, model_of
+from tests.discrepancy.rigs import INPUTS, chosen, model_of, setting_of
 
 
 def test_flows_are_offered_at_states_and_forces_are_not() -> None:
     setting = tank_setting()
     what = setting.campaign.trials[0]
-    for effect in (effect_by_identifier(name, library()) for name in ("outflow", "overflow")):
+    for effect in chosen("outflow", "overflow"):
         assert effect.unavailable(setting) is None
         assert effect.places(setting) == ("outlet",)
         middle = {item.name: item.prior.value(0.0) for item in effect.parameters}
         shown = seen(setting.model, what, {"level": Quantity.LEVEL}, *effect.patch(setting, middle, "outlet"))
         assert 0.02 < np.abs(shown - what.values).max() / what.values.max() < 0.9
-    friction = effect_by_identifier("coulomb_friction", library())
+    (friction,) = chosen("coulomb_friction")
     assert "are of states, where flows act and no forces" in str(friction.unavailable(setting))
 
 
@@ -33,12 +31,12 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
     model = model_of(INPUTS.text("falling_body.toml"))
     falls = trial(TrialKind.DRIVEN, np.linspace(0.0, 1.0, 101), begins=Start.STILL)
     given = campaign(falls, height=Channel("height", Quantity.DISPLACEMENT, "height", None))
-    setting = Setting(given, model, model.scales(given))
+    setting = setting_of(given, model)
     assert not setting.scales.ports["air"].turns
     remember = "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"
-    for name in remember:
-        assert "motion that turns" in (effect_by_identifier(name, library()).unavailable(setting) or "")
-    assert effect_by_identifier("quadratic_damping", library()).unavailable(setting) is None
+    for effect in chosen(*remember):
+        assert "motion that turns" in (effect.unavailable(setting) or "")
+    assert chosen("quadratic_damping")[0].unavailable(setting) is None
     still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
     assert model.scales(still).ports["air"].turns
 
@@ -53,9 +51,9 @@ def test_each_logger_may_have_a_wrong_clock(loggers: dict[str, Any], places: Any
     model = model_of(INPUTS.text("shaken_mass.toml"))
     read = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
     what = trial(TrialKind.FORCED, 400, channels=tuple(read), force=np.ones(400), load_place="shaker")
-    shared, own = (effect_by_identifier(name, library()) for name in ("logger_clock", "clock_error"))
+    shared, own = chosen("logger_clock", "clock_error")
     given = replace(campaign(what, **read), loggers=loggers)
-    setting = Setting(given, model, model.scales(given))
+    setting = setting_of(given, model)
     assert shared.unavailable(setting) is None
     assert shared.places(setting) == places
     assert (own.unavailable(setting) is None) is motion

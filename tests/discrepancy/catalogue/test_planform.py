@@ -9,13 +9,13 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, TrialKind
-from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.library import library
 from discrepancy.catalogue.scales import loss_integral
 from discrepancy.models.structures import WingModel
 from tests.discrepancy.models.test_wing import RING
+from tests.discrepancy.rigs import chosen, setting_of
 
 RELEASE = 0.03
+DRAG, SPRING = chosen("quadratic_damping", "cubic_stiffness")
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +23,7 @@ def setting(coarse_patch_arrays):
     model = WingModel(coarse_patch_arrays)
     ring = replace(RING, kind=TrialKind.RINGDOWN, release=Release(displacement=RELEASE))
     campaign = Campaign("lab", {}, (ring,), None, {}, "")
-    return Setting(campaign, model, model.scales(campaign))
-
-
-def effect(identifier):
-    return next(item for item in library() if item.identifier == identifier)
+    return setting_of(campaign, model)
 
 
 def first_mode(setting):
@@ -42,11 +38,6 @@ def first_mode(setting):
     return arrays.station_weights, motion / mean, float(square[0]) / mean**2, float(np.sqrt(square[0]))
 
 
-def test_they_act_there(setting):
-    assert effect("quadratic_damping").places(setting) == ("planform",)
-    assert effect("cubic_stiffness").places(setting) == ("tip", "planform")
-
-
 @pytest.mark.parametrize(("velocity", "displacement"), [(2.0, 0.0), (1.4, 0.0), (2.0, 0.6)])
 def test_damping_takes_the_stated_share_of_the_first_mode(setting, velocity, displacement):
     """2 pi zeta k A^2 in a cycle, with every station of the mesh instead of six."""
@@ -56,7 +47,8 @@ def test_damping_takes_the_stated_share_of_the_first_mode(setting, velocity, dis
         "velocity_exponent": velocity,
         "displacement_exponent": displacement,
     }
-    (force,) = effect("quadratic_damping").patch(setting, values, "planform")
+    assert DRAG.places(setting) == ("planform",)
+    (force,) = DRAG.patch(setting, values, "planform")
     size = setting.scales.ports["planform"].displacement
     moved = np.abs(motion) * size
     at_place = (
@@ -71,7 +63,8 @@ def test_damping_takes_the_stated_share_of_the_first_mode(setting, velocity, dis
 
 def test_a_cubic_spring_has_the_stated_share_of_the_first_modes_force(setting):
     share, motion, stiffness, _ = first_mode(setting)
-    (force,) = effect("cubic_stiffness").patch(setting, {"stiffening": 0.2}, "planform")
+    assert SPRING.places(setting) == ("tip", "planform")
+    (force,) = SPRING.patch(setting, {"stiffening": 0.2}, "planform")
     size = setting.scales.ports["planform"].largest_displacement
     at_place = share * force.coefficient * (motion * size / force.reference_displacement) ** 3
     assert float(at_place @ motion) == pytest.approx(0.2 * stiffness * size, rel=1e-2)

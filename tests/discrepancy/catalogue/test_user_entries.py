@@ -1,21 +1,30 @@
-"""Effects of a user: TOML files and entry points."""
+"""Effects of a user: TOML files, entry points, `time` and the events of a campaign."""
 
+import re
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from discrepancy.campaign.protocol import Event
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.writing import write_campaign
+from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import PointMass
-from tests.refusals import Inputs
+from tests.discrepancy.rigs import campaign_folder, one_mass, setting_of
+from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
-PYLON = INPUTS.text("pylon.toml")
-
-BUFFER = INPUTS.text("buffer.toml")
+PYLON, BUFFER = INPUTS.text("pylon.toml"), INPUTS.text("buffer.toml")
+(PUMP_PULL,) = re.findall(
+    r"```toml\n(.*?)```", (Path(__file__).parents[3] / "docs" / "when.md").read_text("utf-8"), re.DOTALL
+)
 
 
 @pytest.fixture
@@ -64,13 +73,18 @@ def test_an_effect_whose_place_is_no_port(write, setting):
         buffer.patch(setting, {"share": 0.05}, "flap")
 
 
-@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("effect"))
-def test_a_bad_entry_is_refused_with_one_sentence(write, old, new, sentence):
-    assert old in PYLON
-    with pytest.raises(CatalogueError) as caught:
-        load_catalogue([write(PYLON.replace(old, new, 1))], installed=False)
-    assert sentence in str(caught.value)
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize(
+    ("good", "old", "new", "sentence"),
+    [
+        (good, *row)
+        for good, table in ((PYLON, "effect"), (PUMP_PULL, "in_time"))
+        for row in INPUTS.refused(table)
+    ],
+)
+def test_a_bad_entry_is_refused_with_one_sentence(write, good, old, new, sentence):
+    assert old in good
+    with refused(CatalogueError, re.escape(sentence)):
+        load_catalogue([write(good.replace(old, new, 1))], installed=False)
 
 
 def test_effects_as_objects(tmp_path):
@@ -118,3 +132,55 @@ def test_values_that_no_primitive_can_have(write, setting):
     assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1
     with pytest.raises(CatalogueError, match="side must be a number"):
         buffer.patch(setting, {"share": 0.05, "power": 2.5}, "tip")
+
+
+# ---------------------------------------------------------------- time and events
+
+MODEL, TIME = one_mass(free=True), np.linspace(0.0, 10.0, 101)
+
+
+@pytest.fixture(scope="module")
+def pump(tmp_path_factory):
+    return read_campaign(campaign_folder(tmp_path_factory.mktemp("pump"), "pump"))
+
+
+def test_the_example_of_the_page_pulls_as_it_says(pump, write):
+    """And says why it is not offered without its event."""
+    (effect,) = effects_of_file(write(PUMP_PULL))
+    setting = setting_of(pump, MODEL)
+    assert effect.unavailable(setting) is None
+    patch = effect.patch(setting, {"slope": 0.4}, "slide")
+    quiet, pumping = (
+        observe(MODEL, pump, trial, patch, Conditions(np.zeros(0))).values[:, 0] for trial in pump.trials
+    )
+    np.testing.assert_array_equal(quiet, 0.0)
+    # 2 x'' = 0.4 (t - 2.5) until 8 s, then it coasts
+    since, after = np.clip(TIME - 2.5, 0.0, 5.5), np.maximum(TIME - 8.0, 0.0)
+    expected = 0.2 * since**3 / 6.0 + 0.2 * 5.5**2 / 2.0 * after
+    np.testing.assert_allclose(pumping, expected, atol=1e-6 * expected.max())
+    without = replace(pump, events=())
+    assert effect.unavailable(setting_of(without, MODEL)) == (
+        "No trial to fit has pump_on and pump_on_until as [[event]]; those that are fitted have none."
+    )
+
+
+def test_an_effect_acts_from_a_parameter_after_an_event_on(pump, write):
+    text = PUMP_PULL.replace('kind = "port_load"', 'kind = "channel_offset"').replace("port = ", "channel = ")
+    text = text.replace(
+        'force = "slope * max(0, time - pump_on)"', 'offset = "slope"\nbegin = "pump_on + slope"'
+    )
+    (effect,) = effects_of_file(write(text.replace('places = "ports"', 'places = "channels"')))
+    patch = effect.patch(setting_of(pump, MODEL), {"slope": 0.75}, "x")
+    shown = observe(MODEL, pump, pump.trials[1], patch, Conditions(np.zeros(0))).values[:, 0]
+    np.testing.assert_array_equal(shown, np.where((TIME >= 3.25) & (TIME < 8.0), 0.75, 0.0))
+
+
+def test_events_survive_the_files(pump, tmp_path):
+    assert pump.events == (Event("pump_on", ("pumping",), time=2.5, until=8.0),)
+    assert pump.event_times("pumping") == {"pump_on": 2.5, "pump_on_until": 8.0}
+    assert pump.event_times("quiet") == {}
+    assert read_campaign(write_campaign(pump, tmp_path / "again")).events == pump.events
+    every = ("campaign.toml", 'trial = "pumping", time', "time")
+    assert read_campaign(campaign_folder(tmp_path / "a", "pump", every)).events[0].trials == (
+        "quiet", "pumping",
+    )  # fmt: skip

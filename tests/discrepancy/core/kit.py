@@ -10,7 +10,7 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
-from discrepancy.catalogue.library import effect_by_identifier, library
+from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
@@ -19,6 +19,9 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.scales import PortScale, Scales
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch, RunOffset, SensorDrift
+from tests.discrepancy.rigs import chosen, hiding, setting_of
+
+__all__ = ["chosen"]  # of all rooms
 
 OUTPUTS = ("y1", "y2", "y3")
 STATIC_SHAPES = np.array([[1.0, 0.6, 0.3], [0.02, -0.03, 0.05]])  # by parameter and output
@@ -27,11 +30,6 @@ MODES = np.array([[1.0, 0.5, 0.2], [0.7, -0.6, 0.3]])  # by mode and output
 FREQUENCIES, DECAYS = np.array([3.0, 11.0]), np.array([0.25, 0.6])
 CATALOGUE = library()
 NOISE = NoiseRecord(0.02, inf)
-
-
-def chosen(*identifiers: str) -> tuple[Effect, ...]:
-    """Return these effects of the catalogue."""
-    return tuple(effect_by_identifier(identifier, CATALOGUE) for identifier in identifiers)
 
 
 @dataclass(frozen=True)
@@ -229,7 +227,7 @@ def closed_problem(
 
 def problem_of(campaign: Campaign, model: Model) -> Problem:
     """Return the problem of a campaign beside a model."""
-    return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    return Problem(campaign, model, setting_of(campaign, model))
 
 
 def with_noise(problem: Problem, **records: NoiseRecord | None) -> Problem:
@@ -260,11 +258,11 @@ class Bench:
     @property
     def setting(self) -> Setting:
         """Scales of the campaign."""
-        return Setting(self.campaign, self.model, self.model.scales(self.campaign))
+        return setting_of(self.campaign, self.model)
 
     def patch(self, identifier, values, place="") -> ModelPatch:
         """Return the patch of an effect of the library."""
-        return effect_by_identifier(identifier, CATALOGUE).patch(self.setting, values, place)
+        return hiding(self.campaign, self.model, identifier, values, place)
 
     def measured(self, seed, patch=ModelPatch(), *, noise_scale=1.0, noise=None) -> Campaign:  # noqa: B008
         """Return the campaign with readings: nuisances and calibrated parameters drawn from their priors.

@@ -22,6 +22,7 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch, PowerDamping
+from tests.refusals import Inputs
 
 from . import kit
 
@@ -29,13 +30,10 @@ NOTHING, BELOW, UNEXPLAINED, GROUP, FAMILY, NAMED = (
     VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT, VerdictKind.UNEXPLAINED, VerdictKind.GROUP,
     VerdictKind.FAMILY, VerdictKind.NAMED,
 )  # fmt: skip
-FEW = kit.chosen(
-    "coulomb_friction", "quadratic_damping", "cubic_stiffness", "seating_offset", "gauge_gain", "load_cell",
-)  # fmt: skip
+CASES = Inputs(__file__).table("verdicts.toml")
+RIVALS = {name: kit.chosen(*effects) for name, effects in CASES["rivals"].items()} | {"all": kit.CATALOGUE}
+FEW, SLOW = RIVALS["few"], RIVALS["slow"]
 """Where more rivals would only take time."""
-EFFECTS = FEW + kit.chosen("point_mass", "root_compliance", "stiffness_drift", "load_place", "clock_error")
-SLOW = kit.chosen("coulomb_friction", "quadratic_damping", "gauge_gain", "unmodelled_mode", "high_pass")
-"""A law with its rival, and what else could take a slow remainder for itself."""
 HYSTERESIS = tuple(item for item in kit.CATALOGUE if item.family == "rate-independent hysteresis")
 
 SMALL = kit.chain_bench(amplitudes=(0.004, 0.002), samples=150)
@@ -55,12 +53,8 @@ TIP = static(
     static_channels=("x3",),
 )
 RUN = kit.chosen("seating_offset")[0].places(SMALL.setting)[0]
-GAIN = ("gauge_gain", {"gain_error": 0.10}, "g1")
 FRICTION = ("coulomb_friction", {"friction_ratio": 0.02}, "joint")
-DRAG = ("quadratic_damping", {"equivalent_damping_ratio": 0.01}, "end")
-MASS = ("point_mass", {"mass_ratio": 0.06, "station_ratio": 0.7}, "")
-WITHIN = ("gauge_gain", {"gain_error": 0.004}, "g1")
-CLOCK = ("clock_error", {"rate_error": 0.005, "phase_zero": 0.0}, "")
+BENCHES = {"small": SMALL, "rig": RIG, "tip": TIP, "laboratory": kit.BENCH}
 
 
 def coloured(generator, shape):
@@ -86,61 +80,26 @@ def remainder(size, share):
     return draw
 
 
-def case(label, kinds, *hidden, seed, rivals=EFFECTS, bench=SMALL, names=None, long=False, **how):
-    """Return a row: what is hidden where, what may be named, and which verdicts are right."""
-    marks = [pytest.mark.long] if long else []
-    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
-    return pytest.param(kinds, hidden, seed, rivals, bench, names, how, id=label, marks=marks)
-
-
-def rivals_of(hidden):
-    return tuple(effect for effect in FEW if effect.identifier != hidden[0])
+NOISES = {"coloured": coloured, "outliers": outliers, "remainder": remainder(5.0, 0.95)}
 
 
 @pytest.mark.parametrize(
-    ("kinds", "hidden", "seed", "rivals", "bench", "names", "how"),
+    ("case", "seed"),
     [
-        case("gain", NAMED, ("gauge_gain", {"gain_error": 0.08}, "g1"), seed=11),
-        case("friction", NAMED, FRICTION, seed=11),
-        case("drag", NAMED, DRAG, seed=11, long=True),
-        case("cell", NAMED, ("load_cell", {"gain_error": 0.05, "tare_ratio": 0.02}, ""), seed=11, long=True),
-        case("mass", NAMED, MASS, seed=11, long=True),
-        case("seat", NAMED, ("seating_offset", {"offset_ratio": 0.05}, RUN), seed=11, long=True),
-        case("two", NAMED, GAIN, DRAG, seed=5, rivals=FEW),
-        case("null", NOTHING, seed=1, rivals=kit.CATALOGUE),
-        *(case(f"null {n}", NOTHING, seed=n, rivals=kit.CATALOGUE, long=True) for n in (2, 3, 4)),
-        # all frequencies up by 0.5 %: the clock, or a stiffness 1 % up with a cell that reads 1 % wrong
-        case("clock", GROUP, CLOCK, seed=1, bench=kit.BENCH, names={"clock_error", "load_cell"}),
-        # the load cell is in reach too (test_separability), but pays for a tare that nothing asks for
-        case("tip", GROUP, ("root_compliance", {"compliance_share": 0.05}, ""), seed=2, bench=TIP,
-             names={"root_compliance", "load_place"}),
-        # what the catalogue lacks
-        case("no drag", (UNEXPLAINED, FAMILY), DRAG, seed=7, rivals=rivals_of(DRAG)),
-        case("no friction", (UNEXPLAINED, FAMILY), FRICTION, seed=7, rivals=rivals_of(FRICTION), long=True),
-        case("remainder", UNEXPLAINED, seed=3, rivals=SLOW, bench=RIG, noise=remainder(5.0, 0.95), long=True),
-        # a joint that slips at a ten-thousandth of its motion is a soft one; micro-slip alone fits it
-        case("soft", UNEXPLAINED, ("joint_micro_slip", {"stiffness_share": 0.2, "slip_ratio": 1e-4}, "joint"),
-             seed=11, rivals=kit.chosen("joint_micro_slip"), names={"beside its prior"}, long=True),
-        # records that say a third of the noise, or too much, or white where it is not
-        *(
-            case(f"{label} {seed}", (NOTHING, BELOW, UNEXPLAINED, GROUP, FAMILY), seed=seed,
-                 long=long or seed == 2, **how)
-            for seed in (1, 2)
-            for label, long, how in (
-                ("understated", True, {"noise_scale": 3.0}), ("overstated", False, {"noise_scale": 0.4}),
-                ("correlated", False, {"noise": coloured}), ("outliers", True, {"noise": outliers}),
-            )
-        ),
-        *(
-            case(f"gain, {label}", tuple(VerdictKind), GAIN, seed=3, rivals=FEW, long=True, **how)
-            for label, how in (("understated", {"noise_scale": 2.0}), ("correlated", {"noise": coloured}))
-        ),
-        # within the gauge's own gain error
-        *(case(f"gain below {seed}", (NOTHING, BELOW), WITHIN, seed=seed) for seed in (1, 2)),
+        pytest.param(case, seed, id=f"{label} {seed}", marks=[pytest.mark.long] * (where == "long"))
+        for label, case in CASES["case"].items()
+        for where in ("seeds", "long")
+        for seed in case.get(where, ())
     ],
-)  # fmt: skip
-def test_the_verdict_on_what_is_hidden(kinds, hidden, seed, rivals, bench, names, how):
+)
+def test_the_verdict_on_what_is_hidden(case, seed):
     """Right names with intervals that hold the truth, groups where data cannot tell, no wrong name."""
+    kinds = tuple(VerdictKind(kind) for kind in case.get("kinds", VerdictKind))
+    hidden, names = [], set(case.get("names", ()))
+    for values in (dict(CASES["hidden"][label]) for label in case.get("hidden", ())):
+        hidden.append((values.pop("effect"), values, values.pop("place", "")))
+    bench, rivals = BENCHES[case.get("bench", "small")], RIVALS[case.get("rivals", "most")]
+    how = {"noise": NOISES.get(case.get("noise")), "noise_scale": case.get("noise_scale", 1.0)}
     patch = sum((bench.patch(*item) for item in hidden), ModelPatch())
     verdict, found, fit = name(bench.problem(seed, patch, **how), rivals)
     assert verdict.kind in kinds, verdict.sentence
@@ -151,7 +110,7 @@ def test_the_verdict_on_what_is_hidden(kinds, hidden, seed, rivals, bench, names
         assert names <= set(verdict.group)
         assert bench is TIP or names == set(verdict.group)
     if verdict.kind is UNEXPLAINED:
-        assert all(words in verdict.sentence for words in names or ())
+        assert all(words in verdict.sentence for words in names)
     if kinds == (NOTHING,):
         assert verdict.log_bayes_factor < 3.0
         assert verdict.effects == ()

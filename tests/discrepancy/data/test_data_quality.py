@@ -8,17 +8,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.cantilever import Cantilever
+from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
+from discrepancy.errors import CatalogueError
+from discrepancy.models.interface import ACROSS, Conditions
+from discrepancy.models.sensing import observe
 from discrepancy.sources.examples import ExamplePlan, example_campaign
-from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
+from fe.runtime.patch import (
+    Clock,
+    DecayingLine,
+    HighPass,
+    ModelPatch,
+    SensorDrift,
+    SensorGain,
+    SensorRotation,
+)
 
 PLAN = ExamplePlan(
     (
-        Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(5e-5, 200.0), 0.0, 1e-4),
+        Channel("x", Quantity.DISPLACEMENT, "tip_displacement", NoiseRecord(5e-5, 200.0), 0.0, 1e-4),
         Channel("g0", Quantity.STRAIN, "strain[0]", NoiseRecord(2e-6, 200.0), 0.005, 2e-6),
         Channel("g1", Quantity.STRAIN, "strain[1]", NoiseRecord(1e-6, 200.0), 0.005, 1e-6),
         Channel("g2", Quantity.STRAIN, "strain[2]", NoiseRecord(5e-7, 200.0), 0.005, 1e-6),
@@ -60,21 +73,27 @@ def kinds_of(faults):
 
 
 @pytest.fixture(scope="module")
-def campaign(oscillator):
-    return example_campaign(oscillator, "complete", 7, PLAN)
+def cantilever():
+    """It flies, is pulled and is let go."""
+    return Cantilever()
+
+
+@pytest.fixture(scope="module")
+def campaign(cantilever):
+    return example_campaign(cantilever, "complete", 7, PLAN)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_sound_data_have_no_fault(oscillator, seed):
+def test_sound_data_have_no_fault(cantilever, seed):
     for patch in (
         ModelPatch(),
         ModelPatch((SensorGain("g0", 0.15), SensorDrift("g1", 2e-5, 5000.0))),
         ModelPatch((SensorGain("*", -0.2, "strain"), HighPass("x", 2.0))),
     ):
-        campaign = example_campaign(oscillator, "complete", seed, PLAN, patch)
+        campaign = example_campaign(cantilever, "complete", seed, PLAN, patch)
         assert campaign.channels["g0"].noise.degrees_of_freedom == 399
         assert check_data(campaign) == ()
-        assert check_against_model(campaign, oscillator) == ()
+        assert check_against_model(campaign, cantilever) == ()
         marked = mark_outliers(campaign)
         assert all(trial.used.mean() > 0.999 for trial in marked.trials)
 
@@ -95,7 +114,7 @@ def test_sound_data_have_no_fault(oscillator, seed):
         ("g0", -1e6, "microstrain"),
     ],
 )
-def test_unit_slips(oscillator, campaign, name, factor, guess):
+def test_unit_slips(cantilever, campaign, name, factor, guess):
     """The noise record slips with the channel, or stays in the right unit."""
     slipped = scaled(campaign, name, factor)
     channel = slipped.channels[name]
@@ -103,50 +122,50 @@ def test_unit_slips(oscillator, campaign, name, factor, guess):
     # where the unit is too small what is left is below the noise, and says nothing
     for record in (noise, channel.noise) if abs(factor) > 1.0 else (noise,):
         channels = {**slipped.channels, name: replace(channel, noise=record)}
-        faults = check_against_model(replace(slipped, channels=channels), oscillator)
+        faults = check_against_model(replace(slipped, channels=channels), cantilever)
         assert (FaultKind.UNIT_SLIP, name) in kinds_of(faults)
         assert {fault.channel for fault in faults} == {name}
         assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 9.80665, 30.0])
-def test_other_factors_are_no_unit_slips(oscillator, campaign, factor):
+def test_other_factors_are_no_unit_slips(cantilever, campaign, factor):
     """Strain that is 9.81 times too large is no strain in g, and beside ring-downs alone no fault at all."""
-    faults = kinds_of(check_against_model(scaled(campaign, "g0", factor), oscillator))
+    faults = kinds_of(check_against_model(scaled(campaign, "g0", factor), cantilever))
     assert FaultKind.UNIT_SLIP not in {kind for kind, _ in faults}
     if factor == 9.80665:
         released = scaled(campaign, "g0", factor, TrialKind.RINGDOWN)
-        assert not kinds_of(check_against_model(released, oscillator))
+        assert not kinds_of(check_against_model(released, cantilever))
 
 
-def test_slips_of_inputs(oscillator, campaign):
+def test_slips_of_inputs(cantilever, campaign):
     def kilo(trial):
         return replace(trial, force=trial.force * 1e-3)
 
-    (fault,) = check_against_model(every(campaign, kilo, name="loading"), oscillator)
+    (fault,) = check_against_model(every(campaign, kilo, name="loading"), cantilever)
     assert (fault.kind, fault.trial) == (FaultKind.INPUT_SLIP, "loading")
     assert "about 1000 times" in fault.sentence
-    (fault,) = check_against_model(every(campaign, kilo, TrialKind.STATIC), oscillator)
+    (fault,) = check_against_model(every(campaign, kilo, TrialKind.STATIC), cantilever)
     assert fault.kind is FaultKind.INPUT_SLIP
     assert "check the units of forces" in fault.sentence
 
     def in_millimetres(trial):
         return replace(trial, release=replace(trial.release, displacement=1e3 * trial.release.displacement))
 
-    faults = check_against_model(every(campaign, in_millimetres, kind=TrialKind.RINGDOWN), oscillator)
+    faults = check_against_model(every(campaign, in_millimetres, kind=TrialKind.RINGDOWN), cantilever)
     assert {fault.kind for fault in faults} == {FaultKind.INPUT_SLIP}
     assert {fault.trial for fault in faults} == {f"release {number}" for number in range(1, 5)}
     assert all("about 0.001 times" in fault.sentence for fault in faults)
 
 
-def test_signs(oscillator, campaign):
+def test_signs(cantilever, campaign):
     """A temperature that falls while the load factor rises turns the slope, not the readings."""
     turned = {(FaultKind.SIGN, "g1")}
     for kinds in ((), (TrialKind.FLIGHT,)):
-        faults = check_against_model(scaled(campaign, "g1", -1.0, *kinds), oscillator)
+        faults = check_against_model(scaled(campaign, "g1", -1.0, *kinds), cantilever)
         assert kinds_of(faults) == turned
     backwards = every(campaign, lambda t: replace(t, force=-t.force), TrialKind.STATIC)
-    (fault,) = check_against_model(backwards, oscillator)
+    (fault,) = check_against_model(backwards, cantilever)
     assert "sign of the forces" in fault.sentence
 
     def cool(trial, values):
@@ -154,36 +173,36 @@ def test_signs(oscillator, campaign):
         values[:, column] = 2.0 * np.sum(values[[0, -1], column]) - values[:, column]
         return values
 
-    assert not check_against_model(shown(campaign, cool, TrialKind.FLIGHT), oscillator)
+    assert not check_against_model(shown(campaign, cool, TrialKind.FLIGHT), cantilever)
 
 
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
 @pytest.mark.parametrize("pair", [("g0", "g1"), ("g1", "g2")])
-def test_swapped_channels(oscillator, campaign, kind, pair):
+def test_swapped_channels(cantilever, campaign, kind, pair):
     def swap(trial, values):
         columns = [trial.channels.index(name) for name in pair]
         values[:, columns] = values[:, columns[::-1]]
         return values
 
-    faults = check_against_model(shown(campaign, swap, *([kind] if kind else [])), oscillator)
+    faults = check_against_model(shown(campaign, swap, *([kind] if kind else [])), cantilever)
     fault = next(fault for fault in faults if fault.kind is FaultKind.SWAPPED)
     assert all(name in fault.sentence for name in pair)
 
 
-def test_outputs_and_lengths(oscillator, campaign):
+def test_outputs_and_lengths(cantilever, campaign):
     for output, quantity, kind in (
         ("strain[9]", Quantity.STRAIN, FaultKind.MISSING_OUTPUT),
-        ("x", Quantity.STRAIN, FaultKind.WRONG_QUANTITY),
+        ("tip_displacement", Quantity.STRAIN, FaultKind.WRONG_QUANTITY),
     ):
         channel = replace(campaign.channels["g0"], output=output, quantity=quantity)
         other = replace(campaign, channels={**campaign.channels, "g0": channel})
-        assert kinds_of(check_against_model(other, oscillator)) == {(kind, "g0")}
+        assert kinds_of(check_against_model(other, cantilever)) == {(kind, "g0")}
     release = next(trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN)
 
     def cut(count, step=1, unit=1.0):
         part = release.rows(slice(0, count, step))
         return check_against_model(
-            replace(campaign, trials=(replace(part, time=unit * part.time),)), oscillator
+            replace(campaign, trials=(replace(part, time=unit * part.time),)), cantilever
         )
 
     assert (FaultKind.TOO_SHORT, "") in kinds_of(cut(100))
@@ -208,7 +227,7 @@ def test_clipped_and_dead_channels(campaign):
         (FaultKind.CLIPPED, "g0", "release 1")
     ]
     assert "smallest value -0.0003" in faults[0].sentence
-    saturated = check_data(shown(campaign, limited(-1.0, 0.02, 0), kind=TrialKind.STATIC))
+    saturated = check_data(shown(campaign, limited(-1.0, 0.01, 0), kind=TrialKind.STATIC))
     assert (FaultKind.CLIPPED, "x") in kinds_of(saturated)
     unplugged = check_data(shown(campaign, limited(1e-6, 1e-6, 2), name="loading"))
     assert kinds_of(unplugged) == {(FaultKind.DEAD, "g1")}
@@ -216,8 +235,8 @@ def test_clipped_and_dead_channels(campaign):
 
 @given(st.floats(1e-7, 3e-5), st.integers(0, 100))
 @settings(max_examples=40, deadline=None)
-def test_few_digits_are_not_clipping(oscillator, digit, seed):
-    campaign = example_campaign(oscillator, "laboratory", seed, PLAN)
+def test_few_digits_are_not_clipping(cantilever, digit, seed):
+    campaign = example_campaign(cantilever, "laboratory", seed, PLAN)
 
     def rounded(_, values):
         values[:, 1:] = np.round(values[:, 1:] / digit) * digit
@@ -372,3 +391,58 @@ def test_what_a_wrong_model_leaves_has_no_wrong_ends(seed):
         assert not sample_outliers(noise[0, :5]).any()
     assert not sample_outliers(np.zeros(50)).any()
     assert ends(np.array([30.0, 0.1, -0.2, 0.1, 0.0, 0.2, -0.1])) == []
+
+
+# ---------------------------------------------------------------- seen through sensors
+
+
+TIME = 0.005 * np.arange(200)
+TRIALS = tuple(
+    Trial.plain(name, kind, names, TIME, load_place="x", start=60.0, run="A", **more)
+    for name, kind, names, more in (
+        ("ring", TrialKind.RINGDOWN, ("g1", "tip"), {"release": Release(0.05)}),
+        ("pull", TrialKind.STATIC, ("g0",), {"force": np.linspace(0, 10, 200)}),
+    )
+)
+RING, PULL = TRIALS
+CHANNELS = {
+    "tip": Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", None),
+    "g0": Channel("g0", Quantity.STRAIN, "strain[0]", None),
+    "g1": Channel("g1", Quantity.STRAIN, "strain[1]", None),
+}
+CAMPAIGN = Campaign("mass", CHANNELS, TRIALS, 20.0, {}, "")
+
+
+def test_observations_are_responses_through_the_sensors_of_a_patch(cantilever):
+    def seen(trial, *items, **conditions):
+        given = Conditions(np.ones(1), **conditions)
+        return observe(cantilever, CAMPAIGN, trial, ModelPatch(items), given)
+
+    for trial in TRIALS:
+        outputs = tuple((CHANNELS[name].output, CHANNELS[name].quantity) for name in trial.channels)
+        response = cantilever.respond(trial, outputs, ModelPatch(), Conditions(np.ones(1)))
+        assert np.array_equal(seen(trial).values, response.values)
+        assert (seen(trial).rates is None) == (not trial.is_dynamic)
+    plain = seen(RING).values
+    # clocks of patch and conditions add up
+    one = seen(RING, Clock(0.004, 0.001), clock=(0.001, 0.002)).values
+    assert one == pytest.approx(seen(RING, clock=(0.005, 0.003)).values, rel=1e-12)
+    assert np.abs(one - plain).max() > 1e-5
+    # a turned gauge asks for components
+    c, s = np.cos(0.2), np.sin(0.2)
+    parts = tuple((f"strain[0]{part}", Quantity.STRAIN) for part in ("", *ACROSS))
+    strains = cantilever.respond(PULL, parts, ModelPatch(), Conditions(np.ones(1))).values
+    assert np.abs(strains[-1]).min() > 1e-6
+    expected = strains @ [c**2, s**2, s * c]
+    assert seen(PULL, SensorRotation("g0", 0.2)).values[:, 0] == pytest.approx(expected)
+    # a decaying line scales with the release
+    for initial in (np.zeros((0, 2)), np.array([[0.1, 0.0]])):
+        values = [seen(RING, *items, initial=initial).values for items in ((), (LINE,))]
+        assert (values[1] - values[0])[0, 1] == pytest.approx(0.2 * 0.05 * (1.0 + initial[:, 0].sum()))
+    # a channel of another trial changes nothing, one of none is refused
+    assert np.array_equal(plain, seen(RING, SensorGain("g0", 0.2)).values)
+    with pytest.raises(CatalogueError, match="'g7', which does not exist; there are tip, g0, g1"):
+        seen(RING, SensorGain("g7", 0.2))
+
+
+LINE = DecayingLine("tip", 7.0, 0.01, 0.2, 0.0)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.document import PRIMITIVE_UNITS, Origin, shipped_schema
+from discrepancy.document import PRIMITIVE_UNITS, shipped_schema
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import read_residuals, write_residuals
 from discrepancy.files.verdict import (
@@ -29,27 +29,11 @@ from discrepancy.files.verdict import (
 )
 from discrepancy.files.verdict import read_verdict_file as read_verdict
 from discrepancy.judgement.proof import prove
-from discrepancy.verdict import (
-    CalibratedParameter,
-    Estimate,
-    Experiment,
-    ExplainedShare,
-    ForceAtPort,
-    ForceMoment,
-    Gate,
-    Hypothesis,
-    NamedEffect,
-    NotFitted,
-    RemainderEstimate,
-    ShareOfForce,
-    Verdict,
-    VerdictKind,
-)
+from discrepancy.verdict import VerdictKind
 from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness, Window
 from reporting.errors import FileNotWrittenError
-from reporting.provenance import collect_provenance
 from tests.discrepancy.bench import Bench
-from tests.refusals import refused
+from tests.refusals import Inputs, refused
 
 
 @pytest.fixture(scope="module")
@@ -58,48 +42,12 @@ def fitted():
     return bench.fit(np.random.default_rng(7))
 
 
-ORIGIN = Origin(
-    "Wing in the laboratory", "wing", "ab" * 32, "cd" * 32, "uav-twin discrepancy campaign --out verdict",
-    collect_provenance(7, input_hashes={"campaign": "ab" * 32}), "/home/user/wing.toml",
-)  # fmt: skip
-FRICTION = NamedEffect(
-    "coulomb_friction", "Coulomb friction", "root", "damping |v|^p |x|^a",
-    (Estimate("friction", 0.0123456789012345678, 0.011, 0.014, "1", "Fc / (k A)"),),
-    (Estimate("velocity_exponent", 0.03, -0.1, nan, "1"),),
-    ModelPatch((PowerDamping("root", 1.0 / 3.0, 0.0, 0.0, 0.1, 5e-324),)),
-)  # fmt: skip
-MASS = NamedEffect(
-    "point_mass", "Unmodelled point mass", "", "mass", (), (),
-    ModelPatch((PointMass(0.1 + 0.2, 1.7), PowerStiffness("tip", -3.0, 3.0, -1, 0.05))),
-)  # fmt: skip
-STIFFNESS = CalibratedParameter("young_modulus_factor", 1.01, nan, "1")
-VERDICT = Verdict(
-    kind=VerdictKind.NAMED,
-    sentence="Coulomb friction at the root (Fc/(kA) = 0.0123 ± 0.0015).",
-    probability=0.998,
-    log_bayes_factor=inf,
-    effects=(FRICTION, MASS),
-    group=("coulomb_friction",),
-    family="damping |v|^p |x|^a",
-    gates=(Gate("absolute fit", None, nan, 1.2, "No noise record."), Gate("shape", True, 0.4, 2.0, "")),
-    hypotheses=(
-        Hypothesis((FRICTION,), -12.5, 0.99, 812.0, 800.0, (STIFFNESS,)),
-        Hypothesis((), -inf, 0.0, nan, 806.0),
-    ),
-    inclusion={"coulomb_friction": 0.998},
-    next_experiments=(Experiment("Release at half the amplitude", 0.6, 1.0, "Tells A from 1/A."),),
-    remarks=("Trial 3 was clipped.",),
-    resembles=("a line at 50 Hz",),
-    explained=ExplainedShare(0.94, 0.92, 0.95, 3.1, 0.9, 0.06, 0.04, "held-out"),
-    remainders=(RemainderEstimate("x1", 2.5, 0.3, 0.0),),
-    not_fitted=(NotFitted("free_play", "screened out", 0.3), NotFitted("washout", "no flight")),
-    parameters=(STIFFNESS,),
-    force=ForceAtPort(
-        "root", "N m", 0.31, 0.02, 0.5, ForceMoment("release", 0.4, -0.6, 0.01, -1.1), {"root": 812.5},
-        0.04, {"displacement": 0.1, "velocity": 0.97}, ("velocity",), "Coulomb friction",
-        ShareOfForce(0.99, 0.98, 0.995, 0.03, 0.31, False, 3, True), None,
-    ),
-)  # fmt: skip
+GOLDEN = Inputs(__file__).folder / "verdict.json"
+"""A verdict with one of everything, written by this version."""
+STORED = read_verdict(GOLDEN)
+VERDICT, ORIGIN = STORED.verdict, STORED.origin
+FRICTION, MASS = VERDICT.effects
+(STIFFNESS,) = VERDICT.parameters
 
 
 def same(first, second):
@@ -108,18 +56,20 @@ def same(first, second):
 
 
 def test_a_verdict_comes_back_equal(tmp_path, fitted):
+    assert (VERDICT.kind, VERDICT.log_bayes_factor) == (VerdictKind.NAMED, inf)
+    assert FRICTION.parameters[0].value == 0.0123456789012345678
+    assert FRICTION.patch == ModelPatch((PowerDamping("root", 1.0 / 3.0, 0.0, 0.0, 0.1, 5e-324),))
+    law = PowerStiffness("tip", -3.0, 3.0, -1, 0.05)
+    assert MASS.patch == ModelPatch((PointMass(0.1 + 0.2, 1.7), law))
+    assert np.isnan([FRICTION.shape[0].high, STIFFNESS.deviation, VERDICT.gates[0].statistic]).all()
+    again = write_verdict(tmp_path / "again.json", VERDICT, None, ORIGIN)
+    assert again.read_bytes() == GOLDEN.read_bytes()
     proof = prove(fitted, fitted)
-    for number, content in enumerate((proof, None, replace(proof, held_out_before=None))):
-        path = write_verdict(tmp_path / str(number) / "verdict.json", VERDICT, content, ORIGIN)
-        back = read_verdict(path)
+    for number, content in enumerate((proof, replace(proof, held_out_before=None))):
+        back = read_verdict(write_verdict(tmp_path / f"{number}.json", VERDICT, content, ORIGIN))
         assert same(back.verdict, VERDICT)
         assert same(back.proof, content)
         assert back.origin == ORIGIN
-    text = path.read_text(encoding="utf-8")
-    assert json.loads(text)["schema"] == "uav-twin verdict 4"
-    assert "NaN" not in text
-    again = write_verdict(tmp_path / "again.json", VERDICT, content, ORIGIN)
-    assert again.read_bytes() == path.read_bytes()
 
 
 def stored_patch(*effects, draws=()):
@@ -217,8 +167,8 @@ def test_the_shipped_schema_is_that_of_the_records_and_every_key_in_the_page(nam
 
 
 def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_it_cannot_be(tmp_path):
-    path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
-    whole = path.read_text(encoding="utf-8")
+    path = tmp_path / "verdict.json"
+    whole = GOLDEN.read_text(encoding="utf-8")
     mass = '"family": "mass",'
     nested = f'"remarks": [{"[" * 3000}{"]" * 3000}, '
     for old, new, words in (
@@ -314,8 +264,8 @@ def test_residual_file_carries_units_and_refuses_damage(tmp_path, fitted):
 
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_files_of_earlier_numbers_are_read(number, tmp_path):
-    path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
-    content = json.loads(path.read_text(encoding="utf-8"))
+    path = tmp_path / "verdict.json"
+    content = json.loads(GOLDEN.read_text(encoding="utf-8"))
     content["schema"] = f"uav-twin verdict {number}"
     later = {"force": None}
     if number < 3:

@@ -1,10 +1,7 @@
 """Proof: scores of calibrated predictions, gaps, standard errors over trials."""
 
-import ast
-import re
 from dataclasses import replace
 from math import isnan, log, pi
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -138,23 +135,3 @@ def test_correlation_time_of_an_autoregression():
     assert np.mean(found) == pytest.approx(1.8 / 0.2, rel=0.15)
     assert correlation_time(np.ones(10)) == 1.0
     assert correlation_time(np.array([1.0, -1.0] * 50)) == 1.0
-
-
-def test_what_people_read_spells_chi_square_in_one_way():
-    """Pages, and the texts of the code that are no docstrings, say χ² and χ²/dof."""
-    root = Path(__file__).parents[3]
-    other = re.compile(r"chi-square|chi\^2|chi2|chi²|χ² / dof|χ2", re.IGNORECASE)
-    for page in (root / "README.md", *(root / "docs").glob("*.md")):
-        if page.name != "glossary.md":  # which lists what is not to be written
-            assert not other.search(page.read_text(encoding="utf-8")), page.name
-    checked = 0
-    for package in ("calibration", "discrepancy", "uav_twin", "twin_master", "fe", "reporting"):
-        for file in (root / package).rglob("*.py"):
-            tree = ast.parse(file.read_text(encoding="utf-8"))
-            aside = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
-            for node in ast.walk(tree):
-                if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in aside:
-                    words = [word for word in node.value.split() if not word.isidentifier()]
-                    checked += 1
-                    assert not other.search(" ".join(words)), (file.name, node.value)
-    assert checked > 1000

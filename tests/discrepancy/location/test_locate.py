@@ -1,24 +1,20 @@
 """Locating: calibration under the null, discoveries, and the words for known disagreements."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.optimize import least_squares
 
-from calibration.dynamics.records import read_records
 from discrepancy.campaign.noise_tests import holm
-from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import modal_motion
 from discrepancy.location.locate import locate, outlier_remarks
 from discrepancy.location.map import residual_map
 from discrepancy.location.omnibus_tests import serial_tests, variance_test
-from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
-from tests.discrepancy.bench import SHAPES, Bench, sensitivity, with_noise
+from discrepancy.location.residuals import ResidualSet, quadratic_moments
+from tests.discrepancy.bench import SHAPES, Bench, with_noise
 
 # ---------------------------------------------------------------- calibration of the whole
 
@@ -243,59 +239,6 @@ def test_one_channel_and_few_static_points():
     assert not found.disagrees
     assert not found.disagreements
     assert all(np.isfinite(cell.p_value) for cell in found.cells)
-
-
-# ---------------------------------------------------------------- the real wing
-
-
-def test_one_linear_mode_does_not_explain_the_real_ring_downs():
-    reference = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
-    if not reference.is_dir():
-        pytest.skip(f"the published ring-downs are not at {reference}")
-    records = read_records(reference)
-    first = 30  # 0.25 s: the second bending mode has died away
-    time = [record.time[first:] - record.time[first] for record in records]
-    signal = [record.signal[first:] for record in records]
-    noise = 1e-4  # V, of the readings
-
-    def motion(shared, own, t):
-        wave = np.exp((-shared[0] + 1j * shared[1]) * t)
-        return own[0] * wave.real + own[1] * wave.imag + own[2] + own[3] * t
-
-    def predicted(theta):
-        return [motion(theta[:2], theta[2 + 4 * n : 6 + 4 * n], t) for n, t in enumerate(time)]
-
-    def difference(theta):
-        return np.concatenate([(s - p) / noise for s, p in zip(signal, predicted(theta), strict=True)])
-
-    start = np.array([0.9, 2 * np.pi * 5.6, *([1e-3, 1e-3, 0.0, 0.0] * len(records))])
-    scale = np.array([0.1, 0.1, *([1e-3] * 4 * len(records))])
-    found = least_squares(difference, start, x_scale=scale)
-    covariance = np.linalg.inv(found.jac.T @ found.jac)
-    rows = np.split(-noise * found.jac, np.cumsum([t.size for t in time])[:-1])
-    items = []
-    prediction = predicted(found.x)
-    rates = map(np.gradient, prediction, time)
-    for record, t, s, p, rate, jacobian in zip(records, time, signal, prediction, rates, rows, strict=True):
-        S = sensitivity(jacobian[:, np.newaxis], covariance, np.array([noise]))
-        ring = TrialKind.RINGDOWN
-        values = s[:, np.newaxis]
-        trial = Trial.plain(record.source, ring, ("strain",), t, values=values, release=Release(1.0))
-        leverage = np.sum(S**2, axis=2)
-        items.append(
-            FittedTrial(
-                trial, p[:, np.newaxis], (s - p)[:, np.newaxis], np.array([noise]),
-                noise * np.sqrt(1.0 + leverage), leverage, rate[:, np.newaxis], S,
-            )
-        )  # fmt: skip
-    channel = Channel("strain", Quantity.SIGNAL, "strain", NoiseRecord(noise, 100.0))
-    located = locate(ResidualSet({"strain": channel}, tuple(items)))
-    assert located.disagrees
-    told = located.disagreements[0]
-    assert (told.subject, told.trials) == ("mode 1", "ring-down")
-    assert told.share > 0.7
-    # All five releases have one amplitude.
-    assert "by amplitude or time (these releases do not tell the two apart)" in told.sentence
 
 
 # -------------------------------- the hand-over record, and the split of a motion into its modes

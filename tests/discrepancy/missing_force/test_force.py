@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.library import effect_by_identifier, library
+from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
@@ -26,7 +26,8 @@ from discrepancy.sources.examples import example_campaign, plan_for, plan_of
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness
-from tests.discrepancy.rigs import fmu_rig
+from tests.discrepancy.core.kit import problem_of
+from tests.discrepancy.rigs import chosen, fmu_rig, hiding
 from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
@@ -66,16 +67,12 @@ def write_drive(folder):
     (folder / "campaign.toml").write_text(DRIVEN, "utf-8")
 
 
-def asked(campaign, model):
-    return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-
-
 def read(folder):
     """Read a folder with a campaign and its model."""
     model = load_model(folder / "model.toml")
     campaign, faults = checked(read_campaign(folder), model)
     assert not faults
-    return asked(campaign, model)
+    return problem_of(campaign, model)
 
 
 def available(problem):
@@ -92,7 +89,7 @@ def show(problem, gain=1.0):
         data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
 
 
-def problem_of(folder, number):
+def blind(folder, number):
     """Write a campaign of the blind rigs and return it with its model."""
     folder = folder / "campaign"
     bench, truth, _ = drawn(number, 1)
@@ -111,7 +108,7 @@ def problem_of(folder, number):
 )
 def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypatch, number, effect, port):
     monkeypatch.setattr("discrepancy.missing_force.naming.WIDTHS", (WIDTHS[0],))  # each law alone
-    problem = problem_of(tmp_path, number)
+    problem = blind(tmp_path, number)
     search = ForceSearch(problem)
     assert max(search.at, key=lambda name: search.at[name].log_evidence) == port
     ranked = [item for item in search.name(available(problem)) if item.candidate.terms]
@@ -127,7 +124,7 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypat
 
 
 def test_a_report_opens_with_the_missing_force(tmp_path):
-    problem_of(tmp_path, CART)
+    blind(tmp_path, CART)
     found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml")
     missing = found.missing
     assert missing.told.port == "rail"
@@ -160,7 +157,7 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
 @pytest.mark.parametrize("gain", [1.0, 1.05])
 def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
     """The same campaign with the model's own response and noise alone as its readings; a gain is no law."""
-    problem = problem_of(tmp_path, CART)
+    problem = blind(tmp_path, CART)
     show(problem, gain)
     assert gain != 1.0 or seen_force(problem) is None
     found = investigate(problem.campaign, problem.model)
@@ -170,7 +167,7 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
 
 
 def test_ports_move_the_same_at_finer_samples(tmp_path):
-    problem = problem_of(tmp_path, SERVO)
+    problem = blind(tmp_path, SERVO)
     data, start = problem.trials[0], problem.start(Candidate())
     conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(start.shared), start.local[0])
     coarse, fine = (problem.model.port_motion(data.trial, conditions, parts)[0] for parts in (1, 4))
@@ -215,7 +212,7 @@ def test_an_fmu_whose_system_is_not_known_shows_no_force(foreign_fmu, tmp_path):
     unknown = ("isolated = false", "isolated = false\nsuperposition = false")
     fmu = FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2"), unknown))
     try:
-        problem = asked(released(ModelPatch((STIFF,))), fmu)
+        problem = problem_of(released(ModelPatch((STIFF,))), fmu)
         assert not Search(problem, (), fit(problem, Candidate(), problem.start(Candidate()))).by_force()
     finally:
         fmu.close()
@@ -248,7 +245,7 @@ def seen_force(problem, effect=None, place=""):
 @pytest.mark.parametrize("number", [CART, SERVO, SHAKEN, STORES])
 def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, number):
     """To first order: a heavier body moves less under the same force, and a reaction shows another part."""
-    problem = problem_of(tmp_path, number)
+    problem = blind(tmp_path, number)
     point = problem.start(Candidate())
     here = seen_trial(problem, 0, point)
     forces = {0: np.sin(0.7 * np.arange(len(here.fine_time)) / here.parts)}
@@ -268,7 +265,7 @@ def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, numb
         np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
 
 
-FRICTION = effect_by_identifier("coulomb_friction", library())
+(FRICTION,) = chosen("coulomb_friction")
 
 
 def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
@@ -290,12 +287,8 @@ def chain(kind, effect, place, **values):
     """Return an example of the three-mass chain that hides an effect."""
     model = LumpedModel.load("three_mass_chain")
     plan = replace(plan_of(model), duration=0.5 * plan_of(model).duration)
-    plain = example_campaign(model, kind, 3, plan)
-    patch = effect_by_identifier(effect, library()).patch(
-        Setting(plain, model, model.scales(plain)), values, place
-    )
-    campaign = example_campaign(model, kind, 3, plan, patch)
-    return asked(campaign, model)
+    patch = hiding(example_campaign(model, kind, 3, plan), model, effect, values, place)
+    return problem_of(example_campaign(model, kind, 3, plan, patch), model)
 
 
 def test_friction_that_holds_is_the_law_of_the_missing_force():

@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from benchmarks.public_rigs.__main__ import BLOWN, RIGS, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, TrialKind
-from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import load_model
@@ -23,13 +22,13 @@ from discrepancy.sources.measured_rigs import (
     READING_ERROR,
     SIGNAL,
     TIP,
-    trial_scatter,
     wing_campaign,
     write_rig_campaign,
     write_wing_campaign,
 )
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
+from tests.discrepancy.rigs import chosen
 from uav_twin.cli import app
 
 PUBLIC = os.environ.get("UAV_TWIN_PUBLIC_RIGS")
@@ -53,8 +52,7 @@ def rig(tmp_path_factory):
 
 
 def judged(rig, *effects):
-    chosen = [effect_by_identifier(name, library()) for name in effects]
-    return investigate(*rig, chosen, thorough=False).verdict
+    return investigate(*rig, chosen(*effects), thorough=False).verdict
 
 
 def is_sound(campaign, model):
@@ -245,20 +243,6 @@ def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path):
     assert averaged.trials[0].interval == pytest.approx(4.0 * STEP, rel=1e-4)
     slow = [np.mean(wing_campaign(tmp_path, detrended=on).trials[0].values) for on in (False, True)]
     assert abs(slow[1]) < 0.1 * abs(slow[0])
-
-
-def test_the_scatter_between_trials_is_the_noise(tmp_path):
-    generator = np.random.default_rng(5)
-    time = 0.03 * np.arange(400, dtype=np.float64)
-    # a motion of no law that a model could have, the same in all trials but for size, delay and zero
-    motion = np.sin(30.0 * np.sqrt(1.0 + time)) / (1.0 + time)
-    windows = []
-    for k in range(5):
-        shown = (1.0 + 0.02 * k) * motion + 1e-3 * k * np.gradient(motion) + 0.1 * k
-        windows.append((time, np.asarray(shown + 1e-2 * generator.normal(size=400))))
-    noise = trial_scatter(windows)
-    assert noise.shape == (1600,)
-    assert np.std(noise) == pytest.approx(1e-2, rel=0.06)
 
 
 def test_the_noise_record_holds_scatter_and_reading_error(tmp_path):

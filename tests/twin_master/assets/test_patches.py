@@ -60,11 +60,11 @@ def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str
 def test_combinations_that_mean_nothing_are_refused(tmp_path):
     design = 'kind = "design"\ndesign = "uav_wing"'
     for lines, old, new, key in (
-        (PATCH, design, 'kind = "fmu"\nfile = "w.fmu"', "asset.patch"),
-        ("", f"[belief]\n{design}", f'[belief]\nkind = "asset"\n{PATCH}', "belief.patch"),
+        (PATCH, design, 'kind = "fmu"\nfile = "w.fmu"', "asset"),
+        ("", f"[belief]\n{design}", f'[belief]\nkind = "asset"\n{PATCH}', "belief"),
     ):
         text = scenario_of(tmp_path, lines).read_text(encoding="utf-8")
-        with pytest.raises(ScenarioError, match=f"unknown key `{key}`"):
+        with pytest.raises(ScenarioError, match=f"{key}: unknown key `patch`"):
             load_scenario(written(tmp_path, text, (old, new)))
     loaded = load_scenario(scenario_of(tmp_path, PATCH))  # a patch is not dropped where another FMU is flown
     with pytest.raises(MissionInputError, match=r"`asset\.patch` goes into the FMU"):

@@ -74,8 +74,8 @@ def enumerated(turns: int) -> Float:
 
 
 def learner_of_all() -> LearningFilter:
-    priors = LearntPriors("e", [0.9, 1.0, 1.1], transition_factors=FACTORS)
-    return LearningFilter(model(), sensors(), priors, [model(f).transition for f in FACTORS])
+    moves = {factor: model(factor).transition for factor in FACTORS}
+    return LearningFilter(model(), sensors(), LearntPriors("e", [0.9, 1.0, 1.1]), moves)
 
 
 def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories():
@@ -197,8 +197,6 @@ def test_a_belief_that_underflows_comes_back():
 def test_an_average_inside_the_product_is_refused():
     with pytest.raises(InvalidModelError, match="learning needs"):
         LearningFilter(model(), sensors(average="inside"), LearntPriors("e", [1, 2, 3]))
-    with pytest.raises(InvalidModelError, match="one transition table for each"):
-        LearningFilter(model(), sensors(), LearntPriors(transition_factors=(1.0, 2.0)))
 
 
 SETTINGS = RewardSettings(2.0, (-0.1, 0.1), 0.8, (2.0, 3.0))
@@ -303,14 +301,6 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     assert found.reward_standard_deviation[-1, 2] == pytest.approx(folded.std() / 0.8)
     low, high = norm(found.mean[-1, 0], spread).ppf([0.025, 0.975])
     assert (found.lower[-1, 0], found.upper[-1, 0]) == pytest.approx((low, high), abs=1e-3 * spread)
-
-
-def test_a_turn_says_what_the_store_says(turns, expectation):
-    found = expectation.filtered([turn.carried for turn in turns], observations())
-    for t, turn in enumerate(turns):
-        mean, noise = turn.expected()
-        np.testing.assert_allclose(found.mean[t], mean, atol=1e-12)
-        np.testing.assert_allclose(found.noise[t], noise)
 
 
 def test_quantiles_are_those_of_the_mixture():

@@ -194,7 +194,7 @@ def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario, run):
     observed = run["observed"].to_dataset()
     for row, control in zip(observed["strain"].values, observed["control_index"].values, strict=True):
         history.add(Turn(Reading(row), twin.turn(row, int(control))))
-    gap = gap_of(history, 4, knowledge.sensor_model)
+    gap = gap_of(history, 4, knowledge)
     residual = run["filtered"]["residual"].values[4:]
     assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))
 
