@@ -329,7 +329,8 @@ def test_shares_and_their_interval():
 def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_of_the_gap():
     """The best name, a law with a shape of its own and a longer set are no rivals, nor what is far off."""
     friction, drag, cubic = (
-        Term(*one) for one in zip(kit.chosen(FRICTION[0], DRAG[0], "cubic_stiffness"), "aab", strict=True)
+        Term(*one)
+        for one in zip(kit.chosen(FRICTION[0], "quadratic_damping", "cubic_stiffness"), "aab", strict=True)
     )
 
     def held(score, share, *terms):
