@@ -171,11 +171,8 @@ class Court:
 
     def told(self, item: Any) -> Share:
         """Return the share that counts: in trials not fitted, if there are any that can test it."""
-        if self.has_held_out:
-            outside = self.share(item, held_out=True)
-            if outside.tested:
-                return outside
-        return self.share(item, held_out=False)
+        outside = self.share(item, held_out=True) if self.has_held_out else None
+        return outside if outside is not None and outside.tested else self.share(item, held_out=False)
 
     def against(self, item: Any) -> str:
         """Return why a hypothesis is no name; empty where nothing speaks against it."""
