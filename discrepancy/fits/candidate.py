@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 
@@ -51,6 +52,19 @@ class Term:
     def patch(self, setting: Setting, normal: Sequence[float] | FloatArray) -> ModelPatch:
         """Return the patch at standard normal variables, one for each parameter."""
         return self.effect.patch(setting, self.values(normal), self.place)
+
+    def sized(
+        self, normal: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
+    ) -> FloatArray:
+        """Return standard normal variables with the magnitudes so many times as large, between ends."""
+        found = normal.copy()
+        for number, item in enumerate(self.parameters):
+            if item.magnitude:
+                value = factor * item.prior.value(float(normal[number]))
+                if item.prior.shape == "log_normal":  # it cannot change its sign
+                    value = max(value, item.prior.value(lowest))
+                found[number] = np.clip(item.prior.normal(value), lowest, highest)
+        return found
 
     def start(self) -> FloatArray:
         """Return the standard normal variables at prior medians and canonical shapes."""

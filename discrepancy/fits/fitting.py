@@ -246,7 +246,7 @@ def _ahead(candidate: Candidate, point: Point, step: Point, share: float) -> Poi
     """Return the point a share of a step ahead."""
     parameters = [item for term in candidate.terms for item in term.parameters]
     effect = [
-        item.prior.stepped(u, du) if getattr(item, "magnitude", False) else u + du
+        item.prior.stepped(u, du) if item.magnitude else u + du
         for item, u, du in zip(parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True)
     ]
     return _bounded(

@@ -149,7 +149,7 @@ def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...
 def _estimate(item: EffectParameter | ShapeParameter, *scaled: float) -> Estimate:
     """Return an estimate at a scaled value and the ends of its interval."""
     value, *ends = (item.prior.value(float(u)) for u in scaled)
-    return Estimate(item.name, value, min(ends), max(ends), getattr(item, "unit", "1"), item.description)
+    return Estimate(item.name, value, min(ends), max(ends), item.unit, item.description)
 
 
 def calibrated_parameters(problem: Problem, found: Hypothetic) -> tuple[CalibratedParameter, ...]:

@@ -25,7 +25,7 @@ from discrepancy.fits.candidate import Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.normal_equations import trial_rows
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Screen, is_magnitude
+from discrepancy.fits.screening import Screen
 from discrepancy.fits.trial_data import TrialData
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
@@ -281,9 +281,7 @@ def sizes_by_trial(problem: Problem, found: CandidateFit) -> dict[str, dict[str,
     """
     precision = problem.precisions(found.sums)
     parameters = [(term, item) for term in found.candidate.terms for item in term.parameters]
-    sizes = {
-        term.effect.name: k for k, (term, item) in reversed([*enumerate(parameters)]) if is_magnitude(item)
-    }
+    sizes = {term.effect.name: k for k, (term, item) in reversed([*enumerate(parameters)]) if item.magnitude}
     rows: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in sizes}
     for number, data in enumerate(problem.trials):
         item = trial_rows(problem, number, found, found.candidate, precision)

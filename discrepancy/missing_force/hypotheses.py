@@ -49,7 +49,7 @@ def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
 
 def variants(term: Term) -> list[FloatArray]:
     """Return standard normal values (E,) of a term's parameters at which it is tried."""
-    free = [number for number, item in enumerate(term.parameters) if not getattr(item, "magnitude", False)]
+    free = [number for number, item in enumerate(term.parameters) if not item.magnitude]
     levels = [LEVELS if len(free) < 2 else LEVELS[::3]] * len(free)
     found = []
     for chosen in list(product(*levels))[:MOST_VARIANTS]:
@@ -62,16 +62,6 @@ def variants(term: Term) -> list[FloatArray]:
 def both_signs(term: Term) -> bool:
     """Whether an effect's size may be negative."""
     return any(item.prior.low < 0.0 for item in term.effect.parameters if item.magnitude)
-
-
-def sized(term: Term, values: FloatArray, factor: float) -> FloatArray:
-    """Return values of a term's unknowns (E,) with its magnitudes taken `factor` times."""
-    found = values.copy()
-    for number, item in enumerate(term.effect.parameters):
-        if item.magnitude and (factor > 0.0 or item.prior.low < 0.0):
-            value = factor * item.prior.value(float(values[number]))
-            found[number] = np.clip(item.prior.normal(value), -LARGEST, LARGEST)
-    return found
 
 
 def stepped(candidate: Candidate, effect: FloatArray, step: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from discrepancy.fits.problem import Problem
 
 from .columns import Columns
 from .filtered import Process, Solution
-from .hypotheses import both_signs, log_prior, scaled, sized, stepped, variants
+from .hypotheses import LARGEST, both_signs, log_prior, scaled, stepped, variants
 from .trial import seen_trial
 from .view import Column, Motion, Processes, View, combined
 
@@ -304,7 +304,7 @@ class ForceSearch:
             term, values = tried[number]
             key = (term.label, term.place)
             if key not in best or best[key][0] < value:
-                best[key] = (value, term, sized(term, values, size))
+                best[key] = (value, term, term.sized(values, size, -LARGEST, LARGEST))
         return sorted(best.values(), key=lambda item: -item[0])
 
     def _weighed(

@@ -15,7 +15,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.fits.screening import Change, Screen
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS
 
@@ -68,7 +68,7 @@ def are_related(one: Effect, other: Effect) -> bool:
 
 def _worth(change: Change) -> float:
     """Order of changes: misfit gained, less what the scale costs in the prior."""
-    scaled = rescaled(change)
+    scaled = change.best
     return -change.gain + 0.5 * float(scaled @ scaled)
 
 

@@ -15,7 +15,7 @@ from discrepancy.fits.candidate import Candidate, Key
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Screen, rescaled
+from discrepancy.fits.screening import Screen
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
@@ -168,7 +168,7 @@ class Search:
                 self.promised[effect.identifier] = max((change.gain for change in changes), default=0.0)
             rows.append([change for change in changes if change.gain >= least])
         rows.sort(key=lambda row: -max((change.gain for change in row), default=0.0))
-        begun = [[beside(base, change.term, rescaled(change)) for change in row] for row in rows if row]
+        begun = [[beside(base, change.term, change.best) for change in row] for row in rows if row]
         return self._best_of(begun, base, least if base.candidate.terms else 0.0)
 
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
@@ -331,7 +331,7 @@ class Search:
         begun = []
         for _, first, second in pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
             candidate = Candidate((first.term, second.term))
-            effect = np.concatenate((rescaled(first), rescaled(second)))
+            effect = np.concatenate((first.best, second.best))
             if candidate.key not in self.exact:
                 begun.append([(candidate, replace(self.none.point, effect=effect))])
         rough = self._best_of(begun, self.none, 0.0)
