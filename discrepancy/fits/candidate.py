@@ -117,17 +117,18 @@ class Candidate:
         owners = [term for term in self.terms for _ in term.parameters]
         return owners[index].effect.acts_on
 
-    def parts(self, normal: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the standard normal variables of each term."""
+    def parts(self, normal: FloatArray) -> list[tuple[Term, FloatArray]]:
+        """Return each term with its own of the standard normal variables (size,)."""
         ends = np.cumsum([len(term.parameters) for term in self.terms])
-        return tuple(np.split(normal, ends[:-1])) if self.terms else ()
+        return list(zip(self.terms, np.split(normal, ends[:-1]), strict=True)) if self.terms else []
+
+    def patches(self, setting: Setting, normal: FloatArray) -> list[ModelPatch]:
+        """Return the patch of each term at standard normal variables (size,)."""
+        return [term.patch(setting, part) for term, part in self.parts(normal)]
 
     def patch(self, setting: Setting, normal: FloatArray) -> ModelPatch:
         """Return the patch at standard normal variables (size,)."""
-        patch = ModelPatch()
-        for term, part in zip(self.terms, self.parts(normal), strict=True):
-            patch = patch + term.patch(setting, part)
-        return patch
+        return sum(self.patches(setting, normal), ModelPatch())
 
     def start(self) -> FloatArray:
         """Return the standard normal variables at which a fit may begin."""
@@ -139,8 +140,9 @@ class Candidate:
 
     def some(self, kept: Iterable[int], normal: FloatArray) -> tuple["Candidate", FloatArray]:
         """Return some of the effects with their standard normal variables, of those of all (size,)."""
-        chosen, parts = tuple(kept), self.parts(normal)
-        return Candidate(tuple(self.terms[k] for k in chosen)), np.concatenate([parts[k] for k in chosen])
+        parts = self.parts(normal)
+        terms, values = zip(*(parts[number] for number in kept), strict=True)
+        return Candidate(terms), np.concatenate(values)
 
 
 PARAMETER_STEP = 1e-2

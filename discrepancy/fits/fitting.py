@@ -15,7 +15,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.sentences import said
 
-from .candidate import Candidate, Linearisation, Point, Remainder, State, Term
+from .candidate import Candidate, Linearisation, Point, Remainder, State
 from .normal_equations import finite, normal_equations, solved, upper_factor
 from .problem import Problem
 
@@ -280,11 +280,11 @@ def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateF
     CandidateFit or None
         None where no shape is to free, or the structure cannot follow.
     """
-    terms, parts = list(named.candidate.terms), list(named.candidate.parts(named.point.effect))
-    effect = terms[number].effect
-    if not effect.shape:
+    parts = named.candidate.parts(named.effect)
+    term, values = parts[number]
+    if not term.effect.shape:
         return None
-    terms[number] = Term(effect, terms[number].place, free_shape=True)
-    parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
-    start = replace(named.point, effect=np.concatenate(parts))
-    return attempt(problem, Candidate(tuple(terms)), start)
+    canonical = [item.prior.normal(item.canonical) for item in term.effect.shape]
+    parts[number] = replace(term, free_shape=True), np.append(values, canonical)
+    terms, begin = zip(*parts, strict=True)
+    return attempt(problem, Candidate(terms), replace(named.point, effect=np.concatenate(begin)))

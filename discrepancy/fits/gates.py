@@ -88,12 +88,10 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
         "gains beside their priors": fit.point.shared[count:][proper],
     }
     tests = [(name, float(chi2.sf(u @ u, u.size))) for name, u in groups.items() if u.size]
-    for term, part in zip(fit.candidate.terms, fit.candidate.parts(fit.point.effect), strict=True):
-        count = len(term.effect.parameters)
-        forms = zip(term.effect.parameters, part[:count].tolist(), strict=True)
+    for term, part in fit.candidate.parts(fit.effect):
         tests += [
             (f"{item.name} of {term.effect.identifier} beside its prior", float(chi2.sf(u**2, 1)))
-            for item, u in forms
+            for item, u in zip(term.effect.parameters, part.tolist(), strict=False)
             if not item.magnitude and item.prior.shape != "uniform"  # whose ends are no less likely
         ]
     return tests

@@ -137,7 +137,7 @@ def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...
         low, high = np.minimum(ends[0], found.effect), np.maximum(ends[1], found.effect)
     bounds = iter(zip(low, high, strict=True))
     named = []
-    for term, part in zip(found.candidate.terms, found.candidate.parts(found.effect), strict=True):
+    for term, part in found.candidate.parts(found.effect):
         rows = [_estimate(item, u, *next(bounds)) for item, u in zip(term.parameters, part, strict=True)]
         effect, count = term.effect, len(term.effect.parameters)
         patch = term.patch(problem.setting, part)

@@ -85,11 +85,10 @@ def without_sliver(found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
     """
     court, problem = Court(found), found.problem
     one_channel = is_one_driven_channel(problem)
-    parts = zip(fit.candidate.terms, fit.candidate.parts(fit.effect), strict=True)
+    patches = fit.candidate.patches(problem.setting, fit.effect)
     kept = {
-        (term.label, term.place) for term, part in parts
-        if not is_small(problem, term.patch(problem.setting, part), unstated=UNSTATED_GAIN)
-        and (court.acts(term) or not one_channel)
+        (term.label, term.place) for term, patch in zip(fit.candidate.terms, patches, strict=True)
+        if not is_small(problem, patch, unstated=UNSTATED_GAIN) and (court.acts(term) or not one_channel)
     }  # fmt: skip
     whole_key, share = set(fit.candidate.key), court.told(fit).value
     less = [item for key, item in found.exact.items() if key and set(key) < whole_key]

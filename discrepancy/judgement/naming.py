@@ -123,8 +123,7 @@ class Case:
         """
         candidate = self.best.candidate
         family = None if candidate.is_family else self.shape[1]
-        parts = zip(candidate.terms, candidate.parts(self.best.effect), strict=True)
-        patches = [term.patch(self.problem.setting, part) for term, part in parts]
+        patches = candidate.patches(self.problem.setting, self.best.effect)
         laws = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
         if family is None or laws > 1 or len(patches) == SEARCH.largest_set:
             return None

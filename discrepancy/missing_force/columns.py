@@ -96,7 +96,7 @@ class Columns:
     ) -> Column | None:
         """Return what a candidate does at standard normal values (E,) of its unknowns; None: it cannot be."""
         found = []
-        for term, part in zip(candidate.terms, candidate.parts(values), strict=True):
+        for term, part in candidate.parts(values):
             try:
                 patch = term.patch(self.problem.setting, part)
             except DiscrepancyError:
