@@ -1,9 +1,9 @@
-"""Where fits begin: the most promising changes of each effect and of pairs, from a screen or a grid."""
+"""Where fits begin: the most promising changes of each effect, from a screen or a grid."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -70,29 +70,6 @@ def _worth(change: Change) -> float:
     """Order of changes: misfit gained, less what the scale costs in the prior."""
     scaled = change.best
     return -change.gain + 0.5 * float(scaled @ scaled)
-
-
-def pairs(changes: Sequence[Change], sign: FloatArray) -> list[tuple[float, Change, Change]]:
-    """Return misfit and changes, scaled together, of all pairs of effects, the best first."""
-    best: dict[tuple[str, str], tuple[float, Change, Change]] = {}
-    for one, other in combinations(changes, 2):
-        key = (one.term.effect.identifier, other.term.effect.identifier)
-        overlap = float(one.vector * sign @ other.vector)
-        gram, fits = np.array([[one.size, overlap], [overlap, other.size]]), np.array([one.fits, other.fits])
-        if key[0] == key[1] or np.linalg.cond(gram) > 1e8:
-            continue
-        scale = np.linalg.solve(gram, fits)
-        # a size that cannot be negative: the other one alone
-        able = [size >= 0.0 or item.may_turn for size, item in zip(scale, (one, other), strict=True)]
-        misfit = -0.5 * float(fits @ scale)
-        if all(able) and (key not in best or misfit < best[key][0]):
-            best[key] = (misfit, _scaled(one, scale[0]), _scaled(other, scale[1]))
-    return sorted(best.values(), key=lambda row: row[0])
-
-
-def _scaled(change: Change, scale: float) -> Change:
-    """Return the change whose best scale alone is the given one."""
-    return Change(change.term, change.start, change.vector, scale * change.size, change.size)
 
 
 def beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:

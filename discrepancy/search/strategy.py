@@ -1,4 +1,4 @@
-"""The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
+"""The search for the set of effects that explains a campaign: screen, fit, add."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +20,7 @@ from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
-from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, starts, tried
+from .starts import Starts, Tell, acts_within, beside, each, in_silence, starts, tried
 
 
 @dataclass
@@ -227,18 +227,15 @@ class Search:
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, one law of free shape, more effects, any two. The best candidate is computed finely
-        before what rests on its evidence.
+        One effect, one law of free shape, more effects. The best candidate is computed finely before what
+        rests on its evidence.
         """
         self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
         self.settle()
         self.families()
         self.settle()
-        # beside a law whose shape is free further effects would be anything
-        if not self.best().candidate.is_family:
+        if not self.best().candidate.is_family:  # beside one further effects would be anything
             self.longer()
-        if not self.best().candidate.is_family and self.unexplained():
-            self.fit_pairs()
         self.settle()
 
     @property
@@ -323,22 +320,6 @@ class Search:
                 kept[key] = family
         for family in kept.values():
             self.keep(family, exact=True)
-
-    def fit_pairs(self) -> None:
-        """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
-        screen = Screen(self.problem, self.none)
-        changes = [change for effect in self.effects for change in starts(screen, effect)]
-        begun = []
-        for _, first, second in pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
-            candidate = Candidate((first.term, second.term))
-            effect = np.concatenate((first.best, second.best))
-            if candidate.key not in self.exact:
-                begun.append([(candidate, replace(self.none.point, effect=effect))])
-        rough = self._best_of(begun, self.none, 0.0)
-        for item in rough:
-            self.keep(item, exact=False)
-        rough.sort(key=lambda item: -self.score(item))
-        self.refine(rough, self.score(self.best()) - SEARCH.close)
 
 
 def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
