@@ -8,6 +8,7 @@ from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
+from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.problem import Problem
 from discrepancy.models.sensing import observe
 from discrepancy.models.structures import WingModel
