@@ -5,7 +5,7 @@ derivatives and H the Hessian of the fit, the misfit after the nuisances have ad
 
     F(d) = F(0) - b(d) + G(d, d) / 2,   G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
 
-Changes of several effects add, so pairs and scales cost inner products only. G is also what separates two
+Changes are scaled, so that their best size costs inner products only. G is also what separates two
 effects before data are looked at.
 """
 
@@ -62,15 +62,9 @@ class Change:
     @property
     def gain(self) -> float:
         """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
-        if self.fits < 0.0 and not self.may_turn:
-            return 0.0
-        return 0.5 * self.fits * self.scale
-
-    @property
-    def may_turn(self) -> bool:
-        """Whether its scale may be negative."""
         sizes = [item.prior.shape for item in self.term.parameters if item.magnitude]
-        return not sizes or any(shape != "log_normal" for shape in sizes)
+        turns = not sizes or any(shape != "log_normal" for shape in sizes)
+        return 0.5 * self.fits * self.scale if self.fits > 0.0 or turns else 0.0
 
     @property
     def best(self) -> FloatArray:
