@@ -1,26 +1,98 @@
 """The search for the set of effects that explains a campaign: screen, fit, add."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from math import exp
+from typing import TypeVar
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import logsumexp, ndtri
 
-from discrepancy.catalogue.entry import Effect
+from discrepancy.campaign.records import FloatArray
+from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import in_events
-from discrepancy.errors import ModelError
-from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
+from discrepancy.errors import DiscrepancyError, ModelError
+from discrepancy.fits.candidate import Candidate, Key, Point, Term
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape, objective
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Screen
+from discrepancy.fits.screening import Change, Screen
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
+from fe.runtime.patch import SENSORS
 
-from .starts import Starts, Tell, acts_within, beside, each, in_silence, starts, tried
+T = TypeVar("T")
+Tell = Callable[[str], None]
+Start = tuple[Candidate, Point]
+Starts = list[Start]
+
+
+def in_silence(what: str) -> None:
+    """Tell nobody."""
+
+
+def each(tell: Tell, items: Sequence[T], words: Callable[[T], str]) -> Iterator[T]:
+    """Yield items, and tell of each what is done with it and how many are left."""
+    for number, item in enumerate(items):
+        tell(f"{words(item)}, {len(items) - number - 1} more")
+        yield item
+
+
+def starts(screen: Screen, effect: Effect) -> list[Change]:
+    """Return the most promising changes of an effect; more of them where a box is to be placed.
+
+    Misfit gained, less what the scale costs in the prior.
+    """
+    places = effect.places(screen.problem.setting)
+    few, box = len(places) <= SEARCH.few_places, sum(not item.magnitude for item in effect.parameters) > 1
+    changes = (change for place in places for change in screen.changes(Term(effect, place), fine=few))
+    worth = [(0.5 * float(one.best @ one.best) - one.gain, one) for one in changes if one.size > 0.0]
+    worth.sort(key=lambda row: row[0])
+    return [change for _, change in worth[: SEARCH.starts * (3 if box else 1)]]
+
+
+def acts_within(effect: Effect, setting: Setting) -> bool:
+    """Whether an effect acts within the structure or on its loads, not on readings only."""
+    term = Term(effect, effect.places(setting)[0])
+    try:
+        patch = term.patch(setting, term.start() + 1.0)
+    except DiscrepancyError:  # a law that cannot be so large
+        return True
+    return not all(isinstance(item, SENSORS) for item in patch)
+
+
+def are_related(one: Effect, other: Effect) -> bool:
+    """Whether one of two different effects is easily taken for the other."""
+    if one.identifier == other.identifier:
+        return False
+    named = one.identifier in other.confusable or other.identifier in one.confusable
+    return named or one.family == other.family
+
+
+def beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:
+    """Return a base with one more effect, and where a fit of it begins."""
+    effect = np.concatenate((base.effect, values))
+    return base.candidate.plus(term), replace(base.point, effect=effect)
+
+
+def tried(problem: Problem, base: CandidateFit, effect: Effect) -> Starts:
+    """Return the most promising points of a grid of an effect's parameters, beside a base."""
+    found = []
+    for place in effect.places(problem.setting):
+        term = Term(effect, place)
+        known, size = SEARCH.far_levels, len(term.parameters)
+        count = known[min(size, len(known) - 1)]
+        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
+        for values in product(levels, repeat=size):
+            candidate, start = beside(base, term, np.array(values))
+            with suppress(DiscrepancyError):  # more than the structure can carry
+                found.append((objective(problem, candidate, start), candidate, start))
+    found.sort(key=lambda row: row[0])
+    return [row[1:] for row in found[: SEARCH.far_starts]]
 
 
 @dataclass
