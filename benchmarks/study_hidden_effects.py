@@ -258,7 +258,7 @@ def undone(item: Primitive) -> Primitive | None:
 
 def investigated(folder: Path, seed: int, effects: Sequence[Effect] | None = None) -> Verdict:
     """Return the verdict on the run in a folder, by the whole catalogue or some of its effects."""
-    return investigate(run_campaign(folder), run_model(folder), effects, seed=seed, thorough=False).verdict
+    return investigate(run_campaign(folder), run_model(folder)[0], effects, seed=seed, thorough=False).verdict
 
 
 def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:

@@ -14,7 +14,7 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.sentences import said
-from discrepancy.sources import from_run
+from discrepancy.sources.from_run import run_model
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure
@@ -188,10 +188,8 @@ def choice_of_run(folder: Path) -> ModelChoice:
     CampaignFileError, ModelError
         As `run_model`.
     """
-    model, tailored = from_run.run_model(folder), from_run.is_calibrated_wing(folder)
-    kind = ModelKind.CALIBRATION if tailored else ModelKind.WING
-    choice = _wing(model, kind, folder / (from_run.CALIBRATION_FILE if tailored else from_run.DESIGN_FILE))
-    patch = from_run.patch_of_run(folder)
+    model, wing, patch = run_model(folder)
+    choice = _wing(model, ModelKind.CALIBRATION if wing.suffix == ".nc" else ModelKind.WING, wing)
     if patch is None:
         return choice
     return replace(choice, source_hash=hash_record({"model": choice.source_hash, "patch": hash_file(patch)}))

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
 from calibration.sentences import said
-from calibration.static.posterior import PRIOR_DEVIATION
-from calibration.static.stiffness_curve import StiffnessCurve, stiffness_curve_of
+from calibration.static.posterior import PRIOR_DEVIATION, StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 

@@ -12,8 +12,14 @@ from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.sentences import said
 from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
 from calibration.static.experiments import LoadDisplacementData, published_measurements
-from calibration.static.posterior import GaussianPrior, ScalarPosterior, Seed, child_seed
-from calibration.static.stiffness_curve import PUBLISHED_LINE, StiffnessCurve
+from calibration.static.posterior import (
+    PUBLISHED_LINE,
+    GaussianPrior,
+    ScalarPosterior,
+    Seed,
+    StiffnessCurve,
+    child_seed,
+)
 
 DEFAULT_PARTICLE_COUNT = 1_000_000
 """Particles, and samples of each measured pair, in the authors' script."""

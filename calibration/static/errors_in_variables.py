@@ -38,8 +38,7 @@ from calibration.errors import OutsideValidityError
 from calibration.sentences import said
 
 from .experiments import LoadDisplacementData
-from .posterior import GaussianPrior, ScalarPosterior
-from .stiffness_curve import PUBLISHED_LINE, StiffnessCurve
+from .posterior import PUBLISHED_LINE, GaussianPrior, ScalarPosterior, StiffnessCurve
 
 Measure = Literal["displacement", "load", "ratio"]
 """In which quantity of a pair the prior is flat: true displacement, true load, or the paper's ratio."""
@@ -213,15 +212,10 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
     for (first, offset, error), (second, other, other_error) in pairwise(runs):
         difference, deviation = abs(offset - other), math.hypot(error, other_error)
         if difference > NOTICEABLE_SCORE * deviation:
-            remarks.append(
-                f"Loading runs {first} and {second} differ by {difference * 1e3:.2f} mm "
-                f"({difference / deviation:.1f} standard deviations): their offsets are "
-                f"{offset * 1e3:+.2f} mm and {other * 1e3:+.2f} mm, as if the zero of "
-                "the displacement had moved between them.".replace("-", "−")
-            )
-    remarks.extend(
-        f"Pair {pair + 1} ({data.load[pair]:.3g} N, {data.displacement[pair] * 1e3:.3g} mm) lies "
-        f"{abs(standardised[pair]):.1f} standard deviations from the calibrated line."
-        for pair in np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE)
-    )
+            apart = difference * 1e3, difference / deviation, offset * 1e3, other * 1e3
+            told = said("disagreements.runs", runs=(first, second), apart=apart)
+            remarks.append(told.replace("-", "−"))
+    for pair in np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE):
+        read = pair + 1, data.load[pair], data.displacement[pair] * 1e3
+        remarks.append(said("disagreements.pair", read=read, off=abs(standardised[pair])))
     return FitQuality(standardised, tuple(remarks))

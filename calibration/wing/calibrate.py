@@ -39,8 +39,7 @@ from calibration.result.record import (
 )
 from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import LoadDisplacementData
-from calibration.static.posterior import child_seed
-from calibration.static.stiffness_curve import PUBLISHED_LINE
+from calibration.static.posterior import PUBLISHED_LINE, child_seed
 from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import reduced_model, wing_fields
 from fe.runtime.reduced import Modes, ReducedModel

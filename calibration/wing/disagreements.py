@@ -4,9 +4,10 @@ import numpy as np
 
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence, average
 from calibration.result.record import Calibration
+from calibration.sentences import said
 from calibration.static.errors_in_variables import FitQuality
 from calibration.static.experiments import published_measurements
-from reporting.words import plus_minus
+from reporting.words import capital, plus_minus
 
 from .lab_data import LabData
 
@@ -31,18 +32,16 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
         far = name.startswith("frequency") and abs(relative) > NOTICEABLE_FREQUENCY
         if not far and abs(result.score(reading)) <= NOTICEABLE:
             continue
-        unit = "" if figure.unit == "1" else f" {figure.unit}"
-        model = plus_minus(result.mean(name), result.standard_deviation(name))
-        found.append(
-            f"{figure.title[0].upper()}{figure.title[1:]}: measured "
-            f"{plus_minus(reading.value, reading.deviation)}{unit}, calibrated model {model}{unit}, "
-            f"{_percent(relative)} off ({abs(result.score(reading)):.1f} standard deviations)."
+        both = (
+            plus_minus(reading.value, reading.deviation),
+            plus_minus(result.mean(name), result.standard_deviation(name)),
         )
+        measured, model = (f"{text} {figure.shown_unit}".rstrip() for text in both)
+        off = _percent(relative), abs(result.score(reading))
+        told = {"title": capital(figure.title), "measured": measured, "model": model, "off": off}
+        found.append(said("disagreements.figure", **told))
         if name == "frequency_2" and the_papers:
-            found[-1] += (
-                f" The authors' own model, too, has {AUTHORS_SECOND_FREQUENCY:.2f} Hz after its calibration, "
-                "4.5 % below what they measured."
-            )
+            found[-1] += said("disagreements.authors", frequency=AUTHORS_SECOND_FREQUENCY)
     return found + list(quality.remarks) + _of_the_ring_down(lab, the_papers=the_papers)
 
 
@@ -54,11 +53,8 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
     second = average(trials, "damping_ratio", 1).mean
     published = PUBLISHED_DAMPING_RATIOS[1]
     if the_papers and abs(second / published - 1.0) > 0.1:
-        found.append(
-            f"The damping ratio of the second mode is {100 * second:.2f} % in these records and "
-            f"{100 * published:.2f} % in the paper ({_percent(second / published - 1.0)}); it depends on "
-            "where a record begins, see the documentation."
-        )
+        off = _percent(second / published - 1.0)
+        found.append(said("disagreements.damping", second=100 * second, published=100 * published, off=off))
     points = sorted(
         (point for fit in trials for point in amplitude_dependence(fit)),
         key=lambda point: point.amplitude,
@@ -68,11 +64,7 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
         third = len(points) // 3
         large, small = figures[-third:].mean(axis=0).tolist(), figures[:third].mean(axis=0).tolist()
         if abs(small[0] / large[0] - 1.0) > 0.003:
-            found.append(
-                f"The wing is not linear: in windows of 0.8 s the first mode has {large[0]:.3f} Hz and "
-                f"{large[1]:.1f} % damping at {large[2]:.2g} mV, and {small[0]:.3f} Hz and {small[1]:.1f} % "
-                f"at {small[2]:.2g} mV. The linear model has one frequency."
-            )
+            found.append(said("disagreements.not_linear", large=large, small=small))
     return found
 
 

@@ -9,7 +9,7 @@ from discrepancy.campaign.reading import TABLE_ERRORS, assemble
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
-from discrepancy.campaign.units import UNITS, Conversion, conversion, conversion_of, quantities_of
+from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from reporting.provenance import hash_record
@@ -46,8 +46,8 @@ class Column:
         As written or said, and in SI.
     quantity : Quantity or None
         Of a channel or an input.
-    to_si : Conversion or None
-        From the unit.
+    to_si : float or None
+        What one of the unit is in SI.
     """
 
     sheet: Sheet
@@ -56,7 +56,7 @@ class Column:
     unit: str
     si: str = ""
     quantity: Quantity | None = None
-    to_si: Conversion | None = None
+    to_si: float | None = None
 
     @property
     def title(self) -> str:
@@ -68,7 +68,12 @@ class Column:
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
         cells = self.sheet.numbers(self.head, decimal)
-        return tuple(cell and self.to_si.si_text(cell) for cell in cells)
+        # one digit less than a float can have, and no rounding shows
+        return (
+            cells
+            if self.to_si == 1.0
+            else tuple(cell and f"{float(cell) * self.to_si:.16g}" for cell in cells)
+        )
 
 
 class Understanding:
@@ -150,8 +155,8 @@ class Understanding:
         given = self._said("release", file, question) or "1m"
         if found := re.fullmatch(r"\s*([-+]?\d+\.?\d*(?:e[-+]?\d+)?)\s*(\S+)\s*", given, re.ASCII):
             for quantity in (item for item in _HELD if item in quantities_of(found[2])):
-                size = conversion_of(quantity, found[2]).si_text(found[1])
-                return {"displacement": float(size), "unit": UNITS[quantity].si}
+                size = float(found[1]) * conversion_of(quantity, found[2])
+                return {"displacement": size, "unit": UNITS[quantity].si}
         raise CampaignFileError(said("campaign.release", given=given))
 
     # ---------------------------------------------------------------- columns

@@ -4,7 +4,7 @@ Coloured noise is whitened by an autoregression fitted to the record, so that sa
 are not counted as evidence. Lines of the mains are taken out first: they are an effect, not noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil, inf
@@ -15,7 +15,7 @@ from scipy.signal import lfilter, zoom_fft
 from scipy.stats import chi2
 
 from discrepancy.campaign.noise_tests import ljung_box
-from discrepancy.campaign.records import Channel, FloatArray, NoiseRecord, Trial
+from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRecord, Trial
 from discrepancy.errors import CampaignDataError
 from discrepancy.sentences import said
 from reporting.words import counted
@@ -248,12 +248,8 @@ def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | No
     degrees of freedom are no record.
     """
     squares, degrees = 0.0, 0
-    for group in repeated(trials, channel.name):
-        # Repeats are weighed alike here, so they have one noise factor (`_repeats`).
-        columns = [trial.channels.index(channel.name) for trial in group]
-        pairs = [*zip(group, columns, strict=True)]
-        used = np.all([trial.used[:, column] for trial, column in pairs], axis=0)
-        stack = np.stack([trial.values[used, column] for trial, column in pairs]) / group[0].noise_factor
+    for group, stack, used in repeated(trials, channel.name):
+        stack = stack[:, used.all(axis=0)] / group[0].noise_factor
         rest = stack - stack.mean(axis=0)
         rows = stack.shape[1]
         if channel.offset_deviation > 0.0:
@@ -266,8 +262,11 @@ def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | No
     return NoiseRecord(float(np.sqrt(squares / degrees)), float(degrees), None, None, "repeats")
 
 
-def repeated(trials: Sequence[Trial], channel: str) -> list[list[Trial]]:
-    """Return the groups of two or more trials with a channel that repeat each other."""
+def repeated(trials: Sequence[Trial], channel: str) -> Iterator[tuple[list[Trial], FloatArray, BoolArray]]:
+    """Yield groups of R > 1 trials that repeat each other, what a channel read (R, N), and what counts of it.
+
+    Repeats are weighed alike, so they have one noise factor.
+    """
     groups: list[list[Trial]] = []
     for trial in trials:
         if not trial.is_dynamic and channel in trial.channels:
@@ -275,7 +274,11 @@ def repeated(trials: Sequence[Trial], channel: str) -> list[list[Trial]]:
             if group is None:
                 groups.append(group := [])
             group.append(trial)
-    return [group for group in groups if len(group) > 1]
+    for group in groups:
+        if len(group) > 1:
+            of = [(trial, trial.channels.index(channel)) for trial in group]
+            values, used = [item.values[:, at] for item, at in of], [item.used[:, at] for item, at in of]
+            yield group, np.array(values), np.array(used)
 
 
 def _repeats(first: Trial, second: Trial) -> bool:

@@ -226,7 +226,7 @@ def _inputs(
 
 def _numbers(table: TextTable, item: InTables, user: str, *, empty_allowed: bool = False) -> FloatArray:
     numbers = table.numbers(item.table_column, user, empty_allowed=empty_allowed)
-    return conversion_of(item.quantity, item.unit).to_si(numbers)
+    return numbers * conversion_of(item.quantity, item.unit)
 
 
 def _times(section: schema.TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:
@@ -302,11 +302,10 @@ def _health(
     section: schema.TrialSection, table: TextTable, user: str
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     """Return damage regions, and their losses and deviations (N, K), from columns, keys, or healthy."""
-    stated = {name: loss for name, loss in section.health.items() if name != "deviation"}
-    columns = [
-        name.removeprefix(schema.OF_REGION) for name in table.columns if name.startswith(schema.OF_REGION)
-    ]
-    losses = (name for name in columns if name.removesuffix("_deviation") not in {*columns, *stated} - {name})
+    stated = dict(section.health)
+    doubt = stated.pop("deviation", 0.0)
+    columns = [name.removeprefix(schema.OF_REGION) for name in table.columns if schema.OF_REGION in name]
+    losses = (name.removesuffix("_deviation") for name in columns)
     regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated, *losses)))
     health, deviation = np.zeros((2, len(table), len(regions)))
     for index, name in enumerate(regions):
@@ -314,13 +313,10 @@ def _health(
         if column in table.columns and name in stated:
             raise CampaignFileError(said("campaign.health_twice", trial=section, region=name, table=table))
         for values, key, most, what, usual in (
-            (health, column, 1.0, "a fraction from 0 to 1", stated.get(name)),
-            (deviation, f"{column}_deviation", inf, "a standard deviation", section.health.get("deviation")),
+            (health, column, 1.0, "a fraction from 0 to 1", stated.get(name, 0.0)),
+            (deviation, f"{column}_deviation", inf, "a standard deviation", doubt),
         ):
-            if key not in table.columns:
-                values[:, index] = usual or 0.0
-                continue
-            values[:, index] = table.numbers(key, user)
+            values[:, index] = table.numbers(key, user) if key in table.columns else usual
             if (outside := np.flatnonzero((values[:, index] < 0.0) | (values[:, index] > most))).size:
                 row = int(outside[0])
                 place = f"{table.name}, line {table.lines[row]}"

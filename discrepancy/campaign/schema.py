@@ -1,7 +1,7 @@
 """The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
@@ -26,7 +26,7 @@ from discrepancy.campaign.records import (
     TrialKeys,
     TrialKind,
 )
-from discrepancy.campaign.units import Conversion, conversion, conversion_of
+from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
@@ -56,28 +56,28 @@ class NoiseFileSection(Section):
     interval: Positive | None = None
 
 
-def _factor(item: InTables) -> Conversion:
+def _factor(item: InTables) -> float:
     try:
         return conversion_of(item.quantity, item.unit)
     except ValueError as cause:
         raise ValueError(f"the unit of {item.name!r}: {cause}") from None
 
 
-def _scaled(channel: Channel, scale: Callable[[float], float]) -> Channel:
+def _scaled(channel: Channel, scale: float) -> Channel:
     """Return a channel with its deviations in another unit."""
     noise = channel.noise
-    noise = noise and replace(noise, standard_deviation=scale(noise.standard_deviation))
-    return replace(channel, noise=noise, offset_deviation=scale(channel.offset_deviation))
+    noise = noise and replace(noise, standard_deviation=scale * noise.standard_deviation)
+    return replace(channel, noise=noise, offset_deviation=scale * channel.offset_deviation)
 
 
 def _read(channel: Channel) -> Channel:
     if channel.name == EVERY_CHANNEL or channel.name.startswith("#"):
         raise ValueError(f"a channel cannot be called {channel.name!r}")
-    return _scaled(channel, _factor(channel).to_si)
+    return _scaled(channel, _factor(channel))
 
 
 def _written(channel: Channel, dump: SerializerFunctionWrapHandler) -> object:
-    return dump(_scaled(channel, _factor(channel).from_si))
+    return dump(_scaled(channel, 1.0 / _factor(channel)))
 
 
 ChannelInFile = Annotated[Channel, AfterValidator(_read), WrapSerializer(_written)]
@@ -85,7 +85,7 @@ ChannelInFile = Annotated[Channel, AfterValidator(_read), WrapSerializer(_writte
 
 
 def _read_input(item: RecordedInput) -> RecordedInput:
-    held = _factor(item).to_si(item.offset_deviation)
+    held = _factor(item) * item.offset_deviation
     if item.table_column in INPUT_COLUMNS and item.table_column != "force":
         raise ValueError(said("campaign.reserved", item=item))
     smooth = item.quantity.moving and not item.reference
@@ -98,8 +98,7 @@ def _in_si(release: Release) -> Release:
     """Return a release in metres, volts or as a plain number."""
     unit: Literal["m", "V", "1"]
     unit = "m" if release.unit.endswith("m") else "V" if release.unit.endswith("V") else "1"
-    held = conversion(release.unit, unit).to_si(release.displacement)
-    return replace(release, displacement=held, unit=unit)
+    return replace(release, displacement=conversion(release.unit, unit) * release.displacement, unit=unit)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,36 +1,16 @@
 """Units of a campaign's files as pint knows them, and their conversion to SI."""
 
 import re
-import unicodedata
 from contextlib import suppress
-from decimal import Decimal
-from fractions import Fraction
 from functools import cache
-from math import isfinite, pi
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
-from discrepancy.campaign.records import FloatArray, Quantity
+from discrepancy.campaign.records import Quantity
+from reporting.units import exact_meaning
 from reporting.words import listing
-
-if TYPE_CHECKING:
-    from pint import UnitRegistry
-
-_Value = TypeVar("_Value", float, FloatArray)
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2 in one g, exact by definition."""
-_ALIASES = {"kp": "kgf", "rev": "turn", "U": "turn", "%": "percent", "‰": "permille", "°": "degree"}
-"""Names of units that pint does not know, or reads as something else."""
-_LONGEST = 40
-"""Letters of a unit: pint takes long over more."""
-_PART = re.compile(r"([^\W\d_]+|[%‰°]|1)(?:\^?([+-]?\d))?")
-"""One factor of a unit: a name and its power."""
-_WORDS = {
-    "chain", "chains", "dB", "decade", "hand", "hands", "link", "links", "octave", "point", "points", "rod",
-    "rods",
-}  # fmt: skip
-"""What pint takes for lengths and ratios, and measuring programmes do not."""
 _NEVER_CONVERTED = {"degC", "°C", "K"}
 """Temperatures: a campaign has one of the two for all."""
 
@@ -79,63 +59,9 @@ UNITS = {
 """All that files, tables and figures know of a quantity: a new kind of sensor is one more row."""
 
 
-class Conversion(NamedTuple):
-    """What makes SI of a unit: a fraction, so that a power of ten rounds once."""
-
-    numerator: float = 1.0
-    denominator: float = 1.0
-
-    @property
-    def factor(self) -> float:
-        """What one of the unit is in SI."""
-        return self.numerator / self.denominator
-
-    def to_si(self, value: _Value) -> _Value:
-        """Return numbers of the unit in SI."""
-        return value * self.numerator / self.denominator
-
-    def si_text(self, number: str) -> str:
-        """Return the text of a printed number in SI, rounded once."""
-        value = float(number)
-        if value == 0.0 or not isfinite(value * self.factor):  # also what is too large or small for a number
-            return repr(value * self.factor)
-        return repr(float(Fraction(number) * Fraction(self.numerator) / Fraction(self.denominator)))
-
-    def from_si(self, value: _Value) -> _Value:
-        """Return numbers of SI in the unit."""
-        return value * self.denominator / self.numerator
-
-
 @cache
-def _known_units() -> "UnitRegistry[Any]":
-    """Return the units of pint in fractions of integers; pi is that of floats, and so are its multiples."""
-    import pint
-
-    known: UnitRegistry[Any] = pint.UnitRegistry(None, non_int_type=Fraction, on_redefinition="ignore")
-    known.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
-    known.define(f"pi = {Decimal(pi)} = π")
-    return known
-
-
-def _expression(unit: str, *, acceleration: bool) -> str:
-    """Return a unit as pint reads it; raises ValueError if it is not made of names and powers."""
-    text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST]).replace("**", "^")
-    parts = re.split(r"\s*([*/.·⋅]|\s)\s*", text)
-    for at in range(0, len(parts), 2):
-        found = _PART.fullmatch(parts[at])
-        if found is None or found[1] in _WORDS or len(unit) > _LONGEST:
-            raise ValueError(f"{unit!r} is no unit")
-        name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", _ALIASES.get(found[1], found[1]))
-        name = re.sub(r"^([mμ]?)g$", r"\1g_0", name) if acceleration else name
-        parts[at] = name if found[2] is None else f"({name})**{found[2]}"
-        if at:
-            parts[at - 1] = "/" if parts[at - 1] == "/" else "*"
-    return "".join(parts)
-
-
-@cache
-def conversion(unit: str, si: str) -> Conversion:
-    """Return what makes a unit of SI of another; an angle is no number here, and a hertz no rad/s.
+def conversion(unit: str, si: str) -> float:
+    """Return what one of a unit is in a unit of SI; an angle is no number here, and a hertz no rad/s.
 
     Raises
     ------
@@ -143,31 +69,20 @@ def conversion(unit: str, si: str) -> Conversion:
         pint does not know the unit, or it is of another quantity.
     """
     if unit == si:
-        return Conversion()  # pint takes a third of a second to load
-    from pint.errors import PintError
-
-    known = _known_units()
-    factors, roots = [], []
-    for text in (unit, si):
-        try:
-            expression = _expression(text, acceleration=si == UNITS[Quantity.ACCELERATION].si)
-            factor, root = known.get_root_units(known.parse_units(expression))
-        except (PintError, AttributeError, TypeError, ArithmeticError) as cause:
-            raise ValueError(f"{text!r} is no unit") from cause
-        factors.append(Fraction(str(factor)))
-        roots.append(root)
-    if roots[0] != roots[1]:
+        return 1.0  # pint takes a third of a second to load
+    gravity = si == UNITS[Quantity.ACCELERATION].si
+    (dimension, one, _), (wanted, other, _) = (exact_meaning(text, gravity=gravity) for text in (unit, si))
+    if dimension != wanted:
         raise ValueError(f"{unit!r} cannot become {si}")
-    factor = factors[0] / factors[1]
-    return Conversion(float(factor.numerator), float(factor.denominator))
+    return float(one / other)
 
 
 @cache
-def conversion_of(quantity: Quantity, unit: str) -> Conversion:
-    """Return what makes SI of a quantity's unit; raises ValueError with what is expected."""
+def conversion_of(quantity: Quantity, unit: str) -> float:
+    """Return what one of a quantity's unit is in SI; raises ValueError with what is expected."""
     try:
         if quantity is Quantity.TEMPERATURE and unit in _NEVER_CONVERTED:
-            return Conversion()
+            return 1.0
         if quantity is Quantity.TEMPERATURE:
             raise ValueError
         if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):

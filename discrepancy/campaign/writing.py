@@ -104,7 +104,7 @@ def _unit(channel: Channel, si: bool) -> str:
 
 
 def _in_unit(values: FloatArray, channel: Channel, si: bool) -> FloatArray:
-    return conversion_of(channel.quantity, _unit(channel, si)).from_si(values)
+    return values / conversion_of(channel.quantity, _unit(channel, si))
 
 
 def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:

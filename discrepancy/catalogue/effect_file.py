@@ -42,9 +42,8 @@ Time and events of the campaign (`docs/when.md`)::
     end = "pump_on_until"                               # until then; in trials with these events only
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -63,7 +62,6 @@ from .needs import DYNAMIC, NEEDS, PLACES, USUAL, Asked, Target
 from .scales import SCALES, Here, names_with
 
 Text = Annotated[str, Field(min_length=0)]
-Ask = Callable[[Setting], Asked]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,28 +107,13 @@ def _effect(row: object, where: str) -> Effect:
     timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
     if timed and (still := [kind for kind in TrialKind if kind in section.acts_on - DYNAMIC]):
         raise CatalogueError(said("effects.no_course", where=timed[0].where, kind=still[0].value))
-    asked = partial(
-        Asked,
-        identifier=section.identifier,
-        kinds=section.acts_on,
-        primitives=tuple(PRIMITIVES[recipe.kind] for recipe in recipes),
-        moments=frozenset().union(*(recipe.moments for recipe in recipes)),
-        **{key: getattr(section, key) for key in ("places", "preferred", "needs")},
-    )
+    law = _Law(section, recipes)
     return Effect(
-        build=partial(_build, recipes, asked),
-        places=partial(_places, asked),
-        unavailable=partial(_reason, asked),
+        build=law.build,
+        places=law.places,
+        unavailable=law.unavailable,
         **{key: getattr(section, key) for key in EffectKeys.__dataclass_fields__},
     )
-
-
-def _places(ask: Ask, setting: Setting) -> tuple[str, ...]:
-    return ask(setting).found_places()
-
-
-def _reason(ask: Ask, setting: Setting) -> str | None:
-    return ask(setting).reason()
 
 
 def _check_words(section: EffectSection, names: frozenset[str], where: str) -> None:
@@ -252,19 +235,38 @@ def _recipe(
     return _Recipe(where, kind, values, when, used & SCALES.keys() - names, used & moments)
 
 
-def _build(
-    recipes: tuple[_Recipe, ...], ask: Ask, setting: Setting, values: Mapping[str, float], place: str
-) -> ModelPatch:
-    primitives: list[Primitive] = []
-    asked = ask(setting)
-    for target in asked.targets(place):
-        here = Here(asked, target, values)
-        for recipe in recipes:
-            try:
-                primitives += recipe.built(here)
-            except InvalidPatchError as cause:
-                raise CatalogueError(f"{recipe.where}: {cause}") from cause
-    return ModelPatch(tuple(primitives))
+@dataclass(frozen=True)
+class _Law:
+    """What an effect of a file does in a setting."""
+
+    section: EffectSection
+    recipes: tuple[_Recipe, ...]
+
+    def _asked(self, setting: Setting) -> Asked:
+        section = self.section
+        return Asked(
+            setting, section.identifier, section.acts_on, section.places, section.preferred, section.needs,
+            primitives=tuple(PRIMITIVES[recipe.kind] for recipe in self.recipes),
+            moments=frozenset().union(*(recipe.moments for recipe in self.recipes)),
+        )  # fmt: skip
+
+    def places(self, setting: Setting) -> tuple[str, ...]:
+        return self._asked(setting).found_places()
+
+    def unavailable(self, setting: Setting) -> str | None:
+        return self._asked(setting).reason()
+
+    def build(self, setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
+        primitives: list[Primitive] = []
+        asked = self._asked(setting)
+        for target in asked.targets(place):
+            here = Here(asked, target, values)
+            for recipe in self.recipes:
+                try:
+                    primitives += recipe.built(here)
+                except InvalidPatchError as cause:
+                    raise CatalogueError(f"{recipe.where}: {cause}") from cause
+        return ModelPatch(tuple(primitives))
 
 
 def _primitive_of(kind: str, row: Mapping[str, str | float]) -> Primitive:

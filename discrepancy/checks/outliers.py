@@ -217,10 +217,9 @@ def _repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArra
     result: dict[str, BoolArray] = {}
     if channel.noise is None:
         return result
-    for group in repeated(campaign.trials, channel.name):
+    for group, stack, _ in repeated(campaign.trials, channel.name):
         if len(group) < 3:
             continue
-        stack = np.stack([trial.values[:, trial.channels.index(channel.name)] for trial in group])
         if channel.offset_deviation > 0.0:
             stack = stack - np.median(stack - np.median(stack, axis=0), axis=1, keepdims=True)
         rest = stack - np.median(stack, axis=0)
@@ -240,16 +239,17 @@ def _row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Cha
     rows = np.flatnonzero(used)
     if channel.noise is None or len(rows) < 8 or np.ptp(load[rows]) == 0.0:
         return found
-    basis = np.vander(load[rows] / np.max(np.abs(load[rows])), 3)
-    noise = channel.noise.standard_deviation * trial.noise_factor
-    best, worst = np.inf, -1
-    for index in range(len(rows)):
-        others = np.arange(len(rows)) != index
-        coefficients, _, rank, _ = np.linalg.lstsq(basis[others], values[rows][others], rcond=None)
-        rest = values[rows] - basis @ coefficients
-        spread = float(np.sqrt(np.sum(rest[others] ** 2) / max(len(rows) - 1 - rank, 1)))
-        if spread < best and abs(rest[index]) > SIGNIFICANT_ROW * noise:
-            best, worst = spread, index
-    if worst >= 0 and best < 2.0 * noise:
-        found[rows[worst]] = True
+    left, singular, _ = np.linalg.svd(
+        np.vander(load[rows] / np.max(np.abs(load[rows])), 3), full_matrices=False
+    )
+    left = left[:, singular > 1e-12 * singular[0]]
+    rest = values[rows] - left @ (left.T @ values[rows])
+    free = np.maximum(1.0 - np.sum(left**2, axis=1), 1e-12)
+    # what the parabola through the others misses a row by, and how far these lie from it
+    missed, degrees = np.abs(rest / free), len(rows) - 1 - left.shape[1]
+    spread = np.sqrt(np.maximum(rest @ rest - rest**2 / free, 0.0) / degrees)
+    noise = channel.noise_in(trial)
+    spread[missed <= SIGNIFICANT_ROW * noise] = np.inf
+    worst = int(np.argmin(spread))
+    found[rows[worst]] = spread[worst] < 2.0 * noise
     return found

@@ -80,7 +80,7 @@ def slip_between(scale: float, quantity: Quantity, stated: str = "", *, drive: b
     if abs(log(abs(scale))) < log(LEAST / 1.1):
         return None
     units = {*UNITS[quantity].usual, *([stated] if stated else [])}
-    sizes = {unit: conversion_of(quantity, unit).factor for unit in sorted(units)}
+    sizes = {unit: conversion_of(quantity, unit) for unit in sorted(units)}
     sizes |= FOREIGN.get(quantity, {})
     slips = [
         Slip(sizes[meant] / size if drive else size / sizes[meant], meant, unit)

@@ -153,7 +153,7 @@ class Columns:
         for law in (item for item in at_ports if isinstance(item, PortForce)):
             port = trial.system.ports.index(law.port)
             position, speed = motion.positions[:, port], motion.speeds[:, port]
-            doubt, holding = motion.speed_deviations.get(port, 0.0), motion.forces.get(port, 0.0)
+            doubt, holding = motion.deviations.get(port, (0.0, 0.0))[1], motion.forces.get(port, 0.0)
             course = law_course(law, trial.fine_time, position, speed, doubt, holding)
             state = trial.pushed(port, course)
             added += state

@@ -1,10 +1,10 @@
 """Since when, until when: stretches of a record in which a force acts that does not act otherwise.
 
 Beside a force of small size that may be missing throughout, a second one, larger, is on or off. Which it is
-in a stretch is weighed with all unknowns of the records: a filter tells what is known before a moment, its
-counterpart backwards what the readings after it say (Fraser and Potter 1969, IEEE Transactions on Automatic
-Control 14, 387-390), so that the evidence of an event with any begin and any end costs no pass of its own.
-Stretches are turned on or off, one after the other, while that gains more than the places of its ends cost.
+in a stretch is weighed with all unknowns of the records: what the readings before a moment tell and what
+those after it do are joined, so that the evidence of an event with any begin and any end costs no pass of its
+own. Stretches are turned on or off, one after the other, while that gains more than the places of its ends
+cost.
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,8 @@ from scipy.optimize import minimize
 from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.campaign.sampling import IntArray
 
-from .event_steps import Steps, joined
 from .filtered import Filtered, Process, without
-from .kalman_kernels import discretised
+from .kalman import Steps, discretised, joined
 from .view import SIZE_DOUBT, TIME_DOUBT, View
 
 CHANGE_PRICE = 4.0
@@ -50,12 +49,10 @@ RANGE = 12.0
 """Evidence below the largest [nat] at which a place is out of the question."""
 
 
-@dataclass(frozen=True)
-class Acting:
-    """The force of events, and what may be missing throughout."""
-
-    event: Process
-    rest: Process
+Forces = tuple[Process, Process]
+"""The force of events, and what may be missing throughout."""
+Told = tuple[FloatArray, FloatArray]
+"""Products of residual and shared unknowns, and half log determinants."""
 
 
 class EventSearch:
@@ -69,21 +66,94 @@ class EventSearch:
         Number of the port.
     process : Process
         A force that acts throughout: the scale of both forces' priors.
+    turning : bool
+        Whether the force of events turns its sign with the speed of its port.
+
+    Attributes
+    ----------
     flips : sequence of (N,) ndarray of bool
-        By trial, the samples at which the force of events turns its sign.
+        By trial, the samples at which it does.
     """
 
-    def __init__(self, view: View, port: int, process: Process, flips: Sequence[BoolArray]) -> None:
-        self.view, self.port, self.process, self.flips = view, port, process, flips
+    def __init__(self, view: View, port: int, process: Process, *, turning: bool = False) -> None:
+        self.view, self.port, self.process, self.turning = view, port, process, turning
+        self.flips = [np.zeros(len(trial.time), dtype=bool) for trial in view.trials]
+        if turning and view.motions:  # of readings alone nothing moves
+            speeds = [motion.speeds[:, port] for motion in view.motions]
+            fine = zip(view.trials, speeds, strict=True)
+            self.flips = [np.r_[False, np.diff(speed[:: trial.parts] > 0.0)] for trial, speed in fine]
         self.columns = [
             np.concatenate((residual[None], columns, trial.local))
             for trial, residual, columns in zip(view.trials, view.residuals, view.columns, strict=True)
         ]
 
-    def steps(self, number: int, acting: Acting, parts: int = 1) -> Steps:
-        """Return a trial as the kernels take it."""
-        trial = self.view.trials[number]
-        one = Filtered(trial, ((self.port, acting.event), (self.port, acting.rest)))
+    def told(self, forces: Forces, paths: Sequence[BoolArray]) -> list[Told]:
+        """Return what each trial tells of the shared unknowns."""
+        return [SwitchedRecord(self, k, forces).whole(on) for k, on in enumerate(paths)]
+
+    def evidence(self, told: Sequence[Told]) -> FloatArray:
+        """Return ln evidence (...) of what trials tell together."""
+        products, halves = (sum(items) for items in zip(*told, strict=True))
+        left, halves = without(products, halves, self.view.shared_precision)
+        return -0.5 * left[..., 0, 0] - halves
+
+    def fitted(self, about: Forces, paths: Sequence[BoolArray], passes: int) -> tuple[Forces, float]:
+        """Return the most probable forces beside events, from some on, and ln evidence less all prices."""
+        process = self.process
+        scale = np.tile((process.size, process.time), 2)
+        first = np.log(np.array([value for one in about for value in (one.size, one.time)]) / scale)
+
+        def forces(move: FloatArray) -> Forces:
+            size, time, rest, slow = (np.exp(np.clip(first + move * REACH, -14.0, 14.0)) * scale).tolist()
+            return replace(process, size=size, time=time), replace(process, size=rest, time=slow)
+
+        def objective(move: FloatArray) -> float:
+            prior = float(0.5 * np.sum(((first + move * REACH) / DOUBTS) ** 2))
+            return prior - float(self.evidence(self.told(forces(move), paths)))
+
+        simplex = np.vstack((np.zeros(4), np.eye(4)))
+        options = {"xatol": 0.05, "fatol": 0.2, "maxfev": passes, "initial_simplex": simplex}
+        found = minimize(objective, simplex[0], method="Nelder-Mead", options=options)
+        return forces(found.x), -float(found.fun) - prices(paths)
+
+    def turned(self, forces: Forces, paths: Sequence[BoolArray]) -> list[BoolArray]:
+        """Return paths with stretches turned on or off, one after the other, each of which pays."""
+        found, told = list(paths), self.told(forces, paths)
+        for number, on in enumerate(paths):
+            one = SwitchedRecord(self, number, forces, told[:number] + told[number + 1 :])
+            better: BoolArray | None = on
+            for _ in range(2 * MOST_EVENTS):
+                if better is None:
+                    break
+                found[number] = one.placed(better)
+                better = one.turned(found[number])
+            told[number] = one.whole(found[number])
+        return found
+
+
+class SwitchedRecord:
+    """A trial in which the force of events is on or off.
+
+    Parameters
+    ----------
+    search : EventSearch
+        Whose trial it is.
+    number : int
+        Which.
+    forces : (Process, Process)
+        That of events, and what may be missing throughout.
+    others : sequence of Told
+        What the other trials tell of the shared unknowns.
+    parts : int
+        How many times smaller its steps are than those of the record.
+    """
+
+    def __init__(
+        self, search: EventSearch, number: int, forces: Forces, others: Sequence[Told] = (), parts: int = 1
+    ) -> None:
+        self.search, self.others, trial = search, others, search.view.trials[number]
+        self.local_precision = trial.local_precision
+        one = Filtered(trial, [(search.port, force) for force in forces])
         generator, intensity, rows, start = one.system
         f = len(trial.system.generator)  # where the event's force stands
         lengths, which = trial.steps
@@ -99,141 +169,66 @@ class EventSearch:
         noises[:3, :, f], noises[:3, :, :, f] = 0.0, 0.0
         noises[1, :, f, f] = 1.0
         moves, noises = (np.concatenate((items, items), axis=1) for items in (moves, noises))
-        half = moves.shape[1] // 2
+        self.size, half = moves.shape[1], moves.shape[1] // 2
         moves[:, half:, f] *= -1.0  # the force turns with the motion
         noises[:, half:, f] *= -1.0
         noises[:, half:, :, f] *= -1.0
-        fine = (len(trial.time) - 1) * parts + 1
-        used = np.zeros((fine, trial.used.shape[1]), dtype=bool)
+        used = np.zeros(((len(trial.time) - 1) * parts + 1, trial.used.shape[1]), dtype=bool)
         used[::parts] = trial.used
-        columns = np.zeros((*used.shape, len(self.columns[number])))
-        columns[::parts] = np.moveaxis(self.columns[number] * one.white, 0, -1)
-        length = np.concatenate((which[:1], np.repeat(which[1:], parts)))
-        length[::parts] += half * self.flips[number]
-        begun = np.stack((still, start))
-        return Steps(
-            moves.reshape(-1, *start.shape),
-            noises.reshape(-1, *start.shape),
-            length,
-            rows,
-            used,
-            columns,
-            begun,
+        columns = np.zeros((*used.shape, len(search.columns[number])))
+        columns[::parts] = np.moveaxis(search.columns[number] * one.white, 0, -1)
+        self.length = np.concatenate((which[:1], np.repeat(which[1:], parts)))
+        self.length[::parts] += half * search.flips[number]
+        moves, noises = (items.reshape(-1, *start.shape) for items in (moves, noises))
+        self.steps = Steps(moves, noises, rows, used, columns)
+        self.begun = [self.steps.begin(cover) for cover in (still, start)]
+
+    def which(self, on: BoolArray) -> IntArray:
+        """Return the step (N,) that leads to each sample, the force acting from some on."""
+        return np.asarray((2 * np.r_[False, on[:-1]] + on) * self.size + self.length)
+
+    def whole(self, on: BoolArray) -> Told:
+        """Return what the trial tells of the shared unknowns."""
+        end = np.array([len(on)])
+        *_, products, halves = self.steps.before(self.which(on), 0, self.begun[int(on[0])], end)
+        return without(products[0], halves[0], self.local_precision)
+
+    def ways(self, on: BoolArray, starts: IntArray, ends: IntArray) -> FloatArray:
+        """Return ln evidence (A, B) with the event the other way from each start to each end after it."""
+        steps, which, last = self.steps, self.which(on), ends == len(on)
+        after = steps.after(which, ends)
+        width = 1 + len(self.search.view.shared_precision)
+        products, halves = (
+            np.zeros((len(starts), len(ends), width, width)),
+            np.full((len(starts), len(ends)), np.inf),
         )
-
-    def whole(self, number: int, steps: Steps, on: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return products of residual and shared unknowns of a trial, and half log determinants."""
-        begin = [item[None] for item in steps.begin(bool(on[0]))]
-        found = joined(begin, steps.after(on, np.array([0])))
-        products, halves = without(*found, self.view.trials[number].local_precision)
-        return products[0], halves[0]
-
-    def ways(
-        self, number: int, steps: Steps, on: BoolArray, starts: IntArray, ends: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the same (A, B, ..) with the event the other way from each start to each end after it."""
-        after, size, shape = steps.after(on, ends), len(steps.moves) // 4, (len(starts), len(ends))
-        width = 1 + len(self.view.shared_precision)
-        products, halves = np.zeros((*shape, width, width)), np.full(shape, np.inf)
-        states = steps.before(on, 0, steps.begin(bool(on[0])), starts)
-        last = ends == len(on)
+        states = steps.before(which, 0, self.begun[int(on[0])], starts)
         to = np.where(last, 0, ends)
-        at = (2 * ~on[ends - 1] + on[to]) * size + steps.length[to]
+        at = (2 * ~on[ends - 1] + on[to]) * self.size + self.length[to]
         moves = np.where(last[:, None, None], np.eye(len(steps.rows[0])), steps.moves[at])
         noises = np.where(last[:, None, None], 0.0, steps.noises[at])
-        for k, start in enumerate(starts):
-            state = [item[k] for item in states] if start else steps.begin(not on[0])
+        for k, start in enumerate(starts.tolist()):
+            state = [item[k] for item in states] if start else self.begun[int(not on[0])]
             there = ends > start
             other = on.copy()
             other[start:] ^= True
-            cover, mean, *sums = steps.before(other, int(start), state, ends[there])
+            cover, mean, *sums = steps.before(self.which(other), start, state, ends[there])
             move = moves[there]
             arrived = move @ cover @ np.swapaxes(move, -1, -2) + noises[there], move @ mean, *sums
             found = joined(arrived, [item[there] for item in after])
-            products[k, there], halves[k, there] = without(*found, self.view.trials[number].local_precision)
-        return products, halves
-
-    def evidence(self, products: FloatArray, halves: FloatArray) -> FloatArray:
-        """Return ln evidence (...) from products and half log determinants summed over trials."""
-        left, halves = without(products, halves, self.view.shared_precision)
-        return -0.5 * left[..., 0, 0] - halves
-
-    def total(self, acting: Acting, paths: Sequence[BoolArray]) -> float:
-        """Return ln evidence of events in all trials."""
-        parts = [self.whole(k, self.steps(k, acting), on) for k, on in enumerate(paths)]
-        products, halves = (np.sum(items, axis=0) for items in zip(*parts, strict=True))
-        return float(self.evidence(products, halves))
-
-    def fitted(self, about: Acting, paths: Sequence[BoolArray], passes: int) -> tuple[Acting, float]:
-        """Return the most probable forces beside events, from some on, and ln evidence less all prices."""
-        process = self.process
-        scale = np.tile((process.size, process.time), 2)
-        given = (about.event.size, about.event.time, about.rest.size, about.rest.time)
-        first = np.log(np.array(given) / scale)
-
-        def acting(move: FloatArray) -> Acting:
-            size, time, rest, slow = np.exp(np.clip(first + move * REACH, -14.0, 14.0)) * scale
-            event = replace(process, size=float(size), time=float(time))
-            return Acting(event, replace(process, size=float(rest), time=float(slow)))
-
-        def objective(move: FloatArray) -> float:
-            prior = float(0.5 * np.sum(((first + move * REACH) / DOUBTS) ** 2))
-            try:
-                return prior - self.total(acting(move), paths)
-            except np.linalg.LinAlgError:  # a force far larger than what is read
-                return np.inf
-
-        simplex = np.vstack((np.zeros(4), np.eye(4)))
-        options = {"xatol": 0.05, "fatol": 0.2, "maxfev": passes, "initial_simplex": simplex}
-        found = minimize(objective, simplex[0], method="Nelder-Mead", options=options)
-        return acting(found.x), -float(found.fun) - prices(paths)
-
-    def turned(self, acting: Acting, paths: Sequence[BoolArray]) -> list[BoolArray]:
-        """Return paths with stretches turned on or off, one after the other, each of which pays."""
-        steps = [self.steps(number, acting) for number in range(len(paths))]
-        alone = [self.whole(*item) for item in zip(range(len(paths)), steps, paths, strict=True)]
-        found = list(paths)
-        for number, on in enumerate(paths):
-            one = _Record(self, number, steps[number], [item for k, item in enumerate(alone) if k != number])
-            better: BoolArray | None = on
-            for _ in range(2 * MOST_EVENTS):
-                if better is None:
-                    break
-                found[number] = one.placed(better)
-                better = one.turned(found[number])
-            alone[number] = self.whole(number, steps[number], found[number])
-        return found
-
-    def record(self, number: int, acting: Acting, paths: Sequence[BoolArray], parts: int) -> "_Record":
-        """Return a trial in finer steps, beside the others as they are."""
-        others = [self.whole(k, self.steps(k, acting), on) for k, on in enumerate(paths) if k != number]
-        return _Record(self, number, self.steps(number, acting, parts), others)
-
-
-class _Record:
-    """A trial whose changes are looked for, beside what the others tell of the shared unknowns."""
-
-    def __init__(
-        self, search: EventSearch, number: int, steps: Steps, others: Sequence[tuple[FloatArray, FloatArray]]
-    ) -> None:
-        self.search, self.number, self.steps, self.others = search, number, steps, others
-
-    def _evidence(self, products: FloatArray, halves: FloatArray) -> FloatArray:
-        for more, half in self.others:
-            products, halves = products + more, halves + half
-        return self.search.evidence(products, halves)
+            products[k, there], halves[k, there] = without(*found, self.local_precision)
+        return self.search.evidence([(products, halves), *self.others])
 
     def turned(self, on: BoolArray) -> BoolArray | None:
         """Return a path with the stretch turned on or off that gains most; None where none pays."""
         count = len(on)
         size = min(max(MOST_STEPS // count, 12), STARTS, count)
         grid = np.unique(np.r_[np.linspace(0, count, size + 1).round(), changes(on)]).astype(np.int64)
-        values = self._evidence(*self.search.ways(self.number, self.steps, on, grid[:-1], grid[1:]))
         cost = change_price(count) * np.where(np.isin(grid, changes(on)), -1.0, 1.0)
         cost[[0, -1]] = 0.0
-        gains = values - cost[:-1, None] - cost[None, 1:]
+        gains = self.ways(on, grid[:-1], grid[1:]) - cost[:-1, None] - cost[None, 1:]
         a, b = np.unravel_index(np.argmax(gains), gains.shape)
-        if gains[a, b] <= self._evidence(*self.search.whole(self.number, self.steps, on)):
+        if gains[a, b] <= self.search.evidence([self.whole(on), *self.others]):
             return None
         found = on.copy()
         found[grid[a] : grid[b + 1]] ^= True
@@ -263,8 +258,7 @@ class _Record:
             new = np.setdiff1d(np.linspace(first, last, PLACES).round().astype(np.int64), places)
             if not len(new):
                 return places, values
-            found = self.search.ways(self.number, self.steps, later, np.array([low]), new)
-            places, values = np.r_[places, new], np.r_[values, self._evidence(*found)[0]]
+            places, values = np.r_[places, new], np.r_[values, self.ways(later, np.array([low]), new)[0]]
             order = np.argsort(places)
             places, values = places[order], values[order]
             near = np.flatnonzero(values >= values.max() - RANGE)
@@ -294,8 +288,8 @@ class Events:
     ----------
     search : EventSearch
         What they were looked for in.
-    acting : Acting
-        The forces.
+    forces : (Process, Process)
+        That of events, and what may be missing throughout.
     paths : sequence of (N,) ndarray of bool
         By trial.
     score : float
@@ -303,15 +297,20 @@ class Events:
     """
 
     search: EventSearch
-    acting: Acting
+    forces: Forces
     paths: Sequence[BoolArray]
     score: float
+
+    def record(self, number: int, parts: int) -> SwitchedRecord:
+        """Return a trial in finer steps, beside the others."""
+        told = self.search.told(self.forces, self.paths)
+        return SwitchedRecord(self.search, number, self.forces, told[:number] + told[number + 1 :], parts)
 
     def moments(self, number: int) -> FloatArray:
         """Return median and both ends of the 90 % interval (C, 3) of each change in a trial [s]."""
         on, time = self.paths[number], self.search.view.trials[number].time
         parts = max(1, FINE // len(on))
-        one = self.search.record(number, self.acting, self.paths, parts)
+        one = self.record(number, parts)
         fine = np.repeat(on, parts)[: (len(on) - 1) * parts + 1]
         found = np.zeros((len(changes(on)), 3))
         for k in range(len(found)):
@@ -345,44 +344,43 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
     every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
     coarse = thinned(view, every)
     off = [np.zeros(len(trial.time), dtype=bool) for trial in coarse.trials]
-    always, tried = [], []
-    for with_speed, flips in enumerate(turns(coarse, port)):
-        search = EventSearch(coarse, port, process, flips)
-        always.append((_throughout(search, off), with_speed))
-        event = Process(LARGER * process.size, process.time, rough=True)
-        acting = Acting(event, replace(process, size=LITTLE * process.size))
-        tried.append((_round(search, acting, off, FEW_PASSES), with_speed))
-    best, turning = max(tried, key=lambda item: item[0].score)
+    event = Process(LARGER * process.size, process.time, rough=True)
+    forces = event, replace(process, size=LITTLE * process.size)
+    searches = [EventSearch(coarse, port, process, turning=turning) for turning in (False, True)]
+    searches = searches[: 1 + any(flips.any() for flips in searches[1].flips)]
+    steady = max((_throughout(search, off) for search in searches), key=lambda found: found.score)
+    best = max(
+        (_round(search, forces, off, FEW_PASSES) for search in searches), key=lambda found: found.score
+    )
     for _ in range(ROUNDS):
-        again = _round(best.search, best.acting, best.paths, MOST_PASSES)
+        again = _round(best.search, best.forces, best.paths, MOST_PASSES)
         if again.score < best.score + LEAST_GAIN:
             break
         best = again
-    steady, never = max(always, key=lambda item: item[0].score)
     if every > 1:
-        best, steady = _in_full(best, view, turning, every), _in_full(steady, view, never, every)
+        best, steady = _in_full(best, view, every), _in_full(steady, view, every)
     changed = any(len(changes(on)) for on in best.paths)
     return best if changed and best.score > max(least, steady.score) else steady
 
 
 def throughout(view: View, port: int, process: Process) -> Events:
     """Return a force that acts in all records from the first sample to the last, nothing being weighed."""
-    search = EventSearch(view, port, process, turns(view, port)[0])
     always = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
-    return Events(search, Acting(process, process), always, -np.inf)
+    return Events(EventSearch(view, port, process), (process, process), always, -np.inf)
 
 
-def _in_full(found: Events, view: View, turning: int, every: int) -> Events:
+def _in_full(found: Events, view: View, every: int) -> Events:
     """Return events found in a part of the readings, placed among all."""
-    search = EventSearch(
-        view, found.search.port, found.search.process, turns(view, found.search.port)[turning]
-    )
+    part = found.search
+    search = EventSearch(view, part.port, part.process, turning=part.turning)
     paths = [
         np.repeat(on, every)[: len(trial.time)] for on, trial in zip(found.paths, view.trials, strict=True)
     ]
+    whole = Events(search, found.forces, paths, -np.inf)
     for number in range(len(paths)):
-        paths[number] = search.record(number, found.acting, paths, 1).placed(paths[number])
-    return Events(search, found.acting, paths, search.total(found.acting, paths) - prices(paths))
+        paths[number] = whole.record(number, 1).placed(paths[number])
+    score = float(search.evidence(search.told(found.forces, paths)))
+    return replace(whole, score=score - prices(paths))
 
 
 def thinned(view: View, every: int) -> View:
@@ -408,26 +406,16 @@ def _throughout(search: EventSearch, off: Sequence[BoolArray]) -> Events:
     """Return a force that acts throughout the records in which there is one."""
     rest = replace(search.process, size=NONE * search.process.size)
     paths = [~on for on in off]
-    acting, score = search.fitted(Acting(search.process, rest), paths, FEW_PASSES)
-    acting = replace(acting, rest=rest)
+    (event, _), score = search.fitted((search.process, rest), paths, FEW_PASSES)
+    forces = event, rest
     for number, on in enumerate(off):
         fewer = [*paths[:number], on, *paths[number + 1 :]]
-        if search.total(acting, fewer) > search.total(acting, paths) - GROUND:
-            paths = fewer
-    return Events(search, acting, paths, score)
+        less, more = (search.evidence(search.told(forces, each)) for each in (fewer, paths))
+        paths = fewer if less > more - GROUND else paths
+    return Events(search, forces, paths, score)
 
 
-def _round(search: EventSearch, acting: Acting, paths: Sequence[BoolArray], passes: int) -> Events:
-    paths = search.turned(acting, paths)
-    acting, score = search.fitted(acting, paths, passes)
-    return Events(search, acting, paths, score)
-
-
-def turns(view: View, port: int) -> list[list[BoolArray]]:
-    """Return where a force may turn its sign, by trial (N,): nowhere, or with the speed of its port."""
-    never = [np.zeros(len(trial.time), dtype=bool) for trial in view.trials]
-    turning = []
-    for trial, motion in zip(view.trials, view.motions, strict=False):  # of readings alone nothing moves
-        speed = motion.speeds[:: trial.parts, port]
-        turning.append(np.r_[False, np.diff(speed > 0.0)])
-    return [never, turning] if any(flips.any() for flips in turning) else [never]
+def _round(search: EventSearch, forces: Forces, paths: Sequence[BoolArray], passes: int) -> Events:
+    paths = search.turned(forces, paths)
+    forces, score = search.fitted(forces, paths, passes)
+    return Events(search, forces, paths, score)

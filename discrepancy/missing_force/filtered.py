@@ -6,21 +6,17 @@ Unknowns that act in proportion follow from what whitened readings and columns s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from discrepancy.campaign.records import BoolArray, FloatArray
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import FloatArray
 
-from . import kalman_kernels as kernels
+from .kalman import Steps, discretised, forward, later
 from .trial import SeenTrial
-
-LATER = 200
-"""Samples after which more of them tell nothing of a moment."""
 
 
 @dataclass(frozen=True)
@@ -55,22 +51,6 @@ class Process:
         return 2.0 / self.time if self.rough else 4.0 * np.sqrt(3.0) / self.time
 
 
-class Passed(NamedTuple):
-    """A pass of the filter over covariances, see `kalman_kernels`."""
-
-    moves: FloatArray
-    which: IntArray
-    rows: FloatArray
-    used: BoolArray
-    slot: IntArray
-    gains: FloatArray
-    sizes: FloatArray
-
-
-Covered = tuple[Passed, FloatArray, FloatArray]
-"""What the other passes take, and predicted and filtered covariances (S, n, n) by slot."""
-
-
 @dataclass(frozen=True, eq=False)
 class Filtered:
     """A trial with missing forces at ports.
@@ -81,13 +61,10 @@ class Filtered:
         Which.
     processes : sequence of (int, Process)
         Forces, each with the number of its port; there may be several at one.
-    passes : dict
-        Passes over covariances by what they depend on: trials of one system and grid share theirs.
     """
 
     trial: SeenTrial
     processes: Sequence[tuple[int, Process]]
-    passes: dict[tuple[bytes, ...], Covered] = field(default_factory=dict)
 
     @cached_property
     def _scale(self) -> FloatArray:
@@ -145,68 +122,62 @@ class Filtered:
         rows *= self.white[:, None]
         return generator, intensity, rows, start
 
-    def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (J, n, n) of steps (J,) [s]."""
-        return kernels.discretised(*self.system[:2], lengths)
-
-    @cached_property
-    def _passed(self) -> Covered:
-        (lengths, which), used = self.trial.steps, self.trial.used
-        key = tuple(item.tobytes() for item in (*self.system, lengths, which, used))
-        if key not in self.passes:
-            moves, noises = self._steps(lengths)
-            rows, start = self.system[2:]
-            covers = kernels.covariances(moves, noises, which, rows, used, start)
-            self.passes[key] = Passed(moves, which, rows, used, *covers[:3]), *covers[3:]
-        return self.passes[key]
-
     @property
-    def is_sound(self) -> bool:
-        """Whether no variance has been lost to rounding, as under forces far larger than what is read."""
-        return bool(np.all(self._passed[0].sizes > 0.5))
+    def key(self) -> tuple[bytes, ...]:
+        """What trials of one system and grid have alike, which are filtered together."""
+        return tuple(item.tobytes() for item in (*self.system, *self.trial.steps, self.trial.used))
 
-    @property
-    def log_determinant(self) -> float:
-        """Half the sum of the logarithms of the readings' variances given those before [nat]."""
-        one = self._passed[0]
-        return float(np.sum((0.5 * np.log(one.sizes[one.slot]) - np.log(self.white)) * one.used))
+    def steps(self, columns: FloatArray) -> Steps:
+        """Return the record with columns (K, N, C) to be filtered."""
+        generator, intensity, rows, _ = self.system
+        lengths, _ = self.trial.steps
+        given = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
+        return Steps(*discretised(generator, intensity, lengths), rows, self.trial.used, given)
 
-    def whitened(self, columns: FloatArray) -> FloatArray:
-        """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
-        given = np.moveaxis(columns, 0, -1)
-        given = np.ascontiguousarray(given * self.white[:, None] if self.trial.coloured else given)
-        found = kernels.whitened(*self._passed[0], given)
-        return np.asarray(found.reshape(-1, found.shape[-1]))
+    def products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return products (K, K) of columns (K, N, C), whitened, and what they take from the evidence [nat].
 
-    def smoothed(self, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the added state (F, n) and the missing forces (P, F) at the fine stamps, given readings."""
-        one, _, filtered = self._passed
-        means, later = kernels.smoothed(*one, np.ascontiguousarray(readings * self.white))
-        parts = self.trial.parts
-        fine = self._steps(self.trial.steps[0] / parts)
-        found = kernels.between(parts, *fine, one.which, one.slot, filtered, means, later)
-        sizes = np.array([one.size for _, one in self.processes])
-        forces = found[:, self._places].T * sizes[:, None]
-        return np.asarray(found[:, : len(self._scale)] * self._scale), np.asarray(forces)
+        Half the sum of the logarithms of the readings' variances given those before: infinite under forces
+        far larger than what is read.
+        """
+        steps, which = self.steps(columns), self.trial.steps[1]
+        end = np.array([len(which)])
+        _, _, products, halves = steps.before(which, 0, steps.begin(self.system[3]), end)
+        return products[0], halves[0] - np.sum(np.log(self.white) * self.trial.used)
 
-    def deviation(self, port: int) -> FloatArray:
-        """Return the deviation (N,) of the missing force of a port at the samples, columns being known."""
-        shown = np.zeros(len(self.system[0]))
-        at = [number for number, _ in self.processes].index(port)
-        shown[self._places[at]] = self.processes[at][1].size
-        return self._deviations(shown, slice(None))
+    def smoothed(self, readings: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what readings (N, C) show: state, forces, and how well forces and speeds are known.
 
-    def speed_deviation(self, port: int) -> float:
-        """Return that of a port's speed, at a sample with many that follow."""
-        shown = np.zeros(len(self.system[0]))
-        shown[: len(self._scale)] = self.trial.system.speeds[port] * self._scale
-        return float(self._deviations(shown, slice(-LATER, None))[0])
-
-    def _deviations(self, shown: FloatArray, at: slice) -> FloatArray:
-        """Return the smoothed deviation of a row (n,) of the state at last samples."""
-        one, predicted, _ = self._passed
-        last = one._replace(which=one.which[at], used=one.used[at], slot=one.slot[at])
-        return np.asarray(np.sqrt(kernels.variances(*last, predicted, shown)))
+        The added state (F, n) and the missing forces (P, F) are at the fine stamps, the deviations (2 P, N)
+        of these forces, and of the speeds of their ports, at the samples.
+        """
+        steps, parts = self.steps(readings[None]), self.trial.parts
+        lengths, which = self.trial.steps
+        cover, mean, *_ = steps.begin(self.system[3])
+        every = np.arange(1, len(readings) + 1)
+        given = steps.moves, steps.noises, which, steps.rows, steps.used
+        covers, means, white, _, gains, sizes = forward(*given, steps.columns, 0, cover, mean, every)
+        adds, knows = later(steps.moves, *given[2:], white, gains, sizes)
+        fine, more = discretised(*self.system[:2], lengths / parts)
+        step = which[1:]
+        moves = fine[step]
+        back = [adds[1:, :, None]]
+        for _ in range(parts):
+            back.append(np.swapaxes(moves, 1, 2) @ back[-1])
+        state, noise, found = means[:-1] + covers[:-1] @ back[-1], np.zeros_like(fine), []
+        for add in back[:0:-1]:
+            found.append(state + noise[step] @ add)
+            state, noise = moves @ state, fine @ noise @ np.swapaxes(fine, 1, 2) + more
+        states = np.concatenate((np.stack(found, axis=1).reshape(-1, len(mean)), means[-1:, :, 0]))
+        sizes_of = np.array([one.size for _, one in self.processes])
+        n, count = len(self._scale), len(self.processes)
+        shown = np.zeros((2 * count, len(mean)))
+        for number, (port, one) in enumerate(self.processes):
+            shown[number, self._places[number]] = one.size
+            shown[count + number, :n] = self.trial.system.speeds[port] * self._scale
+        squares = np.sum((shown @ (covers - covers @ knows @ covers)) * shown, axis=-1)
+        forces = states[:, self._places].T * sizes_of[:, None]
+        return states[:, :n] * self._scale, forces, np.sqrt(np.maximum(squares, 0.0)).T
 
 
 ROUNDING = 1e-12
@@ -272,10 +243,14 @@ def regression(
     """Return the products of residuals (N, C) and columns (K, N, C), one of a trial each, whitened alike."""
     total: FloatArray | float = 0.0
     log_determinant = 0.0
+    alike: dict[tuple[bytes, ...], list[tuple[Filtered, FloatArray]]] = {}
     for one, residual, given in zip(filtered, residuals, columns, strict=True):
-        trial = one.trial
-        whole = one.whitened(np.concatenate((residual[None], given, trial.local)))
-        products, half = without(whole.T @ whole, np.zeros(()), trial.local_precision)
-        total = total + products
-        log_determinant += one.log_determinant + float(half)
+        alike.setdefault(one.key, []).append((one, np.concatenate((residual[None], given, one.trial.local))))
+    for group in alike.values():
+        whole, half_of = group[0][0].products(np.concatenate([given for _, given in group]))
+        ends = np.cumsum([0, *(len(given) for _, given in group)]).tolist()
+        for (one, _), (begin, end) in zip(group, pairwise(ends), strict=True):
+            products, half = without(whole[begin:end, begin:end], half_of, one.trial.local_precision)
+            total = total + products
+            log_determinant += float(half)
     return Regression(np.asarray(total), log_determinant)

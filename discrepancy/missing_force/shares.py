@@ -313,13 +313,13 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
         found = search.at[port]
     named = " and ".join(term.effect.name for term in found.candidate.terms if term.place == port)
     courses = []
-    filters = found.view.filtered(found.processes)
-    for trial, motion, one in zip(found.view.trials, found.motions, filters, strict=True):
+    for trial, motion in zip(found.view.trials, found.motions, strict=True):
         samples = slice(None, None, trial.parts)
         position, speed = motion.positions[samples, at], motion.speeds[samples, at]
         force, left = motion.forces[at][samples], motion.left[at][samples]
         law = force - left if named else None
-        courses.append(ForceCourse(trial.name, trial.time, position, speed, force, one.deviation(at), law))
+        deviation = motion.deviations[at][0]
+        courses.append(ForceCourse(trial.name, trial.time, position, speed, force, deviation, law))
     whole = [
         np.concatenate([getattr(item, name) for item in courses])
         for name in ("force", "position", "speed", "time")

@@ -22,7 +22,7 @@ from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import PortedSystem
 
-from .kalman_kernels import driven
+from .kalman import driven
 
 Outputs = tuple[tuple[str, Quantity], ...]
 

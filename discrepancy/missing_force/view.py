@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 
-from .filtered import LEAST_PRECISION, Covered, Filtered, Process, Regression, Solution, regression
+from .filtered import LEAST_PRECISION, Filtered, Process, Regression, Solution, regression
 from .trial import Part, SeenTrial
 
 Processes = Mapping[int, Process]
@@ -24,6 +24,8 @@ a law is a part of what was missing."""
 NEAR, LONGEST, AT_TOP, MOST_STEPS = 0.02, 1.5, 1e-4, 20
 """Of Newton's method: difference of logarithms by which slopes are found, the longest step that is taken, the
 shortest, and how many are taken."""
+LATER = 200
+"""Samples after which more of them tell nothing of a moment."""
 FARTHEST = 5.0
 """Prior deviations within which processes are looked for."""
 
@@ -44,8 +46,8 @@ class Motion:
         State that parameters and laws add: without what is left.
     positions, speeds : (F, P) ndarray
         Of the ports.
-    speed_deviations : mapping of int to float
-        How well the speeds of ports of missing forces are known.
+    deviations : mapping of int to ((N,) ndarray, float)
+        How well missing forces are known at the samples, and the speeds of their ports.
     """
 
     added: FloatArray
@@ -54,7 +56,7 @@ class Motion:
     explained: FloatArray
     positions: FloatArray
     speeds: FloatArray
-    speed_deviations: Mapping[int, float]
+    deviations: Mapping[int, tuple[FloatArray, float]]
 
     def part(self, at: slice) -> "Motion":
         """Return the motion at some of the fine stamps."""
@@ -161,8 +163,7 @@ class View:
 
     def filtered(self, processes: Processes) -> list[Filtered]:
         """Return the filters of missing forces."""
-        passes: dict[tuple[bytes, ...], Covered] = {}
-        return [Filtered(trial, tuple(processes.items()), passes) for trial in self.trials]
+        return [Filtered(trial, tuple(processes.items())) for trial in self.trials]
 
     def products(self, processes: Processes) -> Regression:
         """Return the products of all columns beside missing forces."""
@@ -241,11 +242,7 @@ class View:
             np.log((one.size / about[port].size, one.time / about[port].time)) / DOUBTS
             for port, one in processes.items()
         ]
-        filters = self.filtered(processes)
-        if not all(one.is_sound for one in filters):
-            return -np.inf
-        products = regression(filters, self.residuals, self.columns)
-        value = products.solve(range(len(self.precisions)), self.precisions).evidence
+        value = self.solve(processes).evidence
         return float(value - 0.5 * np.sum(np.square(away)))
 
     def smoothed(
@@ -258,12 +255,11 @@ class View:
         for number, one in enumerate(self.filtered(processes)):
             trial = one.trial
             left = self.residuals[number] - np.tensordot(solution.mean, self.columns[number], 1)
-            whole = one.whitened(np.concatenate((left[None], trial.local)))
-            shown, own = whole[:, 0], whole[:, 1:].T
+            products, _ = one.products(np.concatenate((left[None], trial.local)))
             prior = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
-            values = np.linalg.solve(own @ own.T + prior, own @ shown)
+            values = np.linalg.solve(products[1:, 1:] + prior, products[1:, 0])
             left = left - np.tensordot(values, trial.local, 1)
-            free, forces = one.smoothed(left)
+            free, forces, deviations = one.smoothed(left)
             remaining = dict(zip(processes, forces, strict=True))
             what = Part(left, free, remaining)
             for k, turned in self.turned[number].items():
@@ -274,7 +270,8 @@ class View:
             moved = what if self.own is None else what.plus(self.own[number], 1.0)
             assert moved.added is not None
             moving = trial.port_motion(np.concatenate((solution.mean[:count], values)), moved.added)
-            doubts = {port: one.speed_deviation(port) for port in processes}
+            known = zip(processes, *np.split(deviations, 2), strict=True)
+            doubts = {port: (force, float(speed[-LATER:][0])) for port, force, speed in known}
             motions.append(Motion(moved.added, what.forces, remaining, moved.added - free, *moving, doubts))
             local.append(values)
         return solution, local, motions

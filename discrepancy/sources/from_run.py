@@ -150,11 +150,11 @@ def _campaign(
     )
 
 
-def run_model(folder: Path | str) -> WingModel:
-    """Return the model that the twin of a run believed: the wing of its design or calibration, patched.
+def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
+    """Return the model that the twin of a run believed, and the files of its wing and of its patch, if any.
 
-    The whole patch of the twin's model is in it, sensors too: they act in
-    `discrepancy.models.sensing.observe`.
+    The wing is that of a calibration or a design. The whole patch of the twin's model is in it, sensors too:
+    they act in `discrepancy.models.sensing.observe`.
 
     Raises
     ------
@@ -165,25 +165,25 @@ def run_model(folder: Path | str) -> WingModel:
     """
     folder = Path(folder)
     _config(folder)
-    if is_calibrated_wing(folder):
-        model = WingModel.of_calibration(folder / CALIBRATION_FILE)
-    elif (folder / DESIGN_FILE).is_file():
-        model = WingModel.of_design(folder / DESIGN_FILE)
-    else:
+    wing = folder / (CALIBRATION_FILE if _is_calibrated_wing(folder) else DESIGN_FILE)
+    if not wing.is_file():
         raise CampaignFileError(said("runs.no_design", folder=folder, file=DESIGN_FILE))
-    patch = patch_of_run(folder)
+    model = WingModel.of_calibration(wing) if wing.suffix == ".nc" else WingModel.of_design(wing)
+    run = _run(folder)
+    file = folder / str(run.attrs.get(PATCH_NAME, MODEL_PATCH_FILE))  # of the last one
+    patch = file if file.is_file() else None
     if patch is not None:
         try:
-            sensors = len(_run(folder)["observed"]["sensor"])
+            sensors = len(run["observed"]["sensor"])
             effects = load_patch(patch).for_gauges(sensors).effects
         except FmuError as cause:
             raise CampaignFileError(f"The patch of the twin's model cannot be read: {cause}") from cause
         for effect in effects:
             model = model.patched(effect.patch)
-    return model
+    return model, wing, patch
 
 
-def is_calibrated_wing(folder: Path) -> bool:
+def _is_calibrated_wing(folder: Path) -> bool:
     """Return whether a run flew with the calibration of a wing; one of a model's parameters has no design."""
     file = folder / CALIBRATION_FILE
     if not file.is_file():
@@ -192,18 +192,6 @@ def is_calibrated_wing(folder: Path) -> bool:
         return load_calibration(file).design is not None
     except CalibrationError:  # said where it is used
         return True
-
-
-def patch_of_run(folder: Path) -> Path | None:
-    """Return the file of the patch that the twin of a run believed last; None where it had none.
-
-    Raises
-    ------
-    CampaignFileError
-        If the run is not whole.
-    """
-    file = folder / str(_run(folder).attrs.get(PATCH_NAME, MODEL_PATCH_FILE))
-    return file if file.is_file() else None
 
 
 def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ import numpy as np
 from fmu_asset.errors import FmuInputError, FmuUnsupportedError, visible
 from fmu_asset.instances.plan import FmuIdentity, Interface
 from fmu_asset.sentences import said
+from reporting.units import BASE_UNITS
 
 NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
@@ -21,8 +22,6 @@ NUMERIC_KINDS = frozenset(
 )
 _LARGEST_ARRAY = 10_000_000
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
-BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-"""In the order of `UnitInfo.exponents`."""
 READABLE = ("output", "local", "calculatedParameter")
 """Causalities of what can be the source of a connection."""
 
@@ -151,7 +150,7 @@ class VariableInfo:
 
 @dataclass(frozen=True)
 class UnitInfo:
-    """A unit as the FMU defines it: SI exponents (or None), factor and offset to SI, display units."""
+    """A unit as the FMU defines it: exponents of `BASE_UNITS` (or None), factor, offset, display units."""
 
     name: str
     exponents: tuple[int, ...] | None

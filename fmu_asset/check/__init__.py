@@ -10,10 +10,11 @@ from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.experiment import whole_binding
-from fmu_asset.door.units import contradictions, meaning_of
+from fmu_asset.door.units import contradictions
 from fmu_asset.errors import BindingError, FmuError, visible
 from fmu_asset.packing.structure_fmu import recorded_content_hash
 from reporting.progress import Progress, reporter
+from reporting.units import meaning_of
 
 from .flight import Flights, Told, Verdict
 

@@ -1,114 +1,19 @@
-"""Units: what a text such as `W/(m2.K)` means in SI, and a binding's units against those of an FMU."""
+"""A binding's units against those of an FMU."""
 
 import math
-import re
-import tomllib
-from collections import deque
 from collections.abc import Sequence
-from functools import cache, lru_cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from fmu_asset.archive.declared import BASE_UNITS, UnitInfo, VariableInfo
+from fmu_asset.archive.declared import UnitInfo, VariableInfo
 from fmu_asset.errors import BindingError
 from fmu_asset.sentences import said
-
-Exponents = tuple[int, ...]
-"""Of kg, m, s, A, K, mol, cd, rad, as FMI orders them."""
-_TOKEN = re.compile(r"\s*(?:([A-Za-zµμΩ°%]+)\^?([+-]?\d+)?|(1)|([().*/]))")
-
-
-class Meaning(NamedTuple):
-    """SI value = `factor` * value + `offset`, in the SI unit with these exponents."""
-
-    exponents: Exponents
-    factor: float
-    offset: float = 0.0
-
-
-_BASE = {
-    symbol.replace("kg", "g"): Meaning(
-        tuple(int(s == symbol) for s in BASE_UNITS), 1e-3 if symbol == "kg" else 1.0
-    )
-    for symbol in BASE_UNITS
-}
-_BASE["1"] = Meaning((0,) * len(BASE_UNITS), 1.0)
-
-
-@cache
-def _definitions() -> dict[str, Any]:
-    """Return the tables of `units.toml`."""
-    return tomllib.loads(Path(__file__).with_name("units.toml").read_text(encoding="utf-8"))
-
-
-@lru_cache(maxsize=1024)
-def meaning_of(text: str) -> Meaning | None:
-    """Return what a unit text means, or None if it is not understood.
-
-    Symbols with SI prefixes are joined by `.`, `*` or `/`; an exponent follows its symbol (`m2`, `m^2`,
-    `s-1`); a `/` divides by the next symbol or parenthesis only, as in Modelica.
-
-    Parameters
-    ----------
-    text : str
-        Such as `kN`, `kg/m3`, `1/s`, `degC`.
-    """
-    single = _symbol(text)
-    if single is not None:
-        return single
-    found = list(_TOKEN.finditer(text))
-    if "".join(item[0] for item in found) != text:
-        return None
-    tokens = deque(item.groups(default="") for item in found)
-    try:
-        meaning = _product(tokens)
-    except (ValueError, IndexError, ArithmeticError, RecursionError):
-        return None
-    return None if tokens or not 0.0 < meaning.factor < math.inf else meaning
-
-
-def _symbol(text: str) -> Meaning | None:
-    tables = _definitions()
-    defined = tables["prefixed"].get(text) or tables["plain"].get(text)
-    if defined is not None:
-        factor, product, *offset = (1.0, defined) if isinstance(defined, str) else defined
-        same = meaning_of(product)
-        assert same is not None  # the file is ours
-        return Meaning(same.exponents, factor * same.factor, *offset or [same.offset])
-    if text in _BASE:
-        return _BASE[text]
-    for prefix, factor in tables["prefixes"].items():
-        rest = text.removeprefix(prefix)
-        if rest != text and (rest in tables["prefixed"] or rest in _BASE) and rest != "1":
-            meaning = meaning_of(rest)
-            return meaning and Meaning(meaning.exponents, factor * meaning.factor)
-    return None
-
-
-def _product(tokens: deque[tuple[str, ...]]) -> Meaning:
-    """Take a product from the beginning of the tokens; raises `ValueError` or `IndexError` if it is none."""
-    exponents, factor, power = _BASE["1"].exponents, 1.0, 1
-    while True:
-        symbol, exponent, one, mark = tokens.popleft()
-        if mark == "(":
-            meaning: Meaning | None = _product(tokens)
-            if tokens.popleft()[3] != ")":
-                raise ValueError(mark)
-        else:
-            meaning = _symbol(symbol or one)
-        # A temperature with an offset has no powers and takes part in no product.
-        if meaning is None or meaning.offset:
-            raise ValueError(symbol)
-        own = power * int(exponent or 1)
-        exponents = tuple(a + own * b for a, b in zip(exponents, meaning.exponents, strict=True))
-        factor *= meaning.factor**own
-        if not tokens or tokens[0][3] not in (".", "*", "/"):
-            return Meaning(exponents, factor)
-        power = -1 if tokens.popleft()[3] == "/" else 1
+from reporting.units import Meaning, meaning_of
 
 
 def same_dimension(first: str, second: str) -> bool | None:
     """Return whether two unit texts have one dimension; None if one of them is not understood."""
+    if first == second:
+        return True  # pint takes a third of a second to load
     one, two = meaning_of(first), meaning_of(second)
     return None if one is None or two is None else one.exponents == two.exponents
 

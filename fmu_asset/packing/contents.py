@@ -28,13 +28,12 @@ from typing import Any
 from uuid import UUID
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from fmu_asset.archive.declared import BASE_UNITS
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
-from fmu_asset.door.units import meaning_of
 from fmu_asset.errors import FmuBuildError, FmuError
 from fmu_asset.sentences import said
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
+from reporting.units import BASE_UNITS, meaning_of
 
 PYTHONFMU_VERSION = "0.7.0"
 """The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""

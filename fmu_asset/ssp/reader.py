@@ -15,7 +15,7 @@ from typing import Any
 
 from lxml import etree
 
-from fmu_asset.archive.declared import BASE_UNITS, UnitInfo
+from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.coupling.structure import (
     CONNECTOR_KINDS,
     Component,
@@ -29,6 +29,7 @@ from fmu_asset.door.units import IDENTITY, Conversion
 from fmu_asset.errors import SspError
 from fmu_asset.sentences import said
 from reporting.files import atomic_write_bytes
+from reporting.units import BASE_UNITS
 
 from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage
 

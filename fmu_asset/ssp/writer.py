@@ -6,7 +6,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fmu_asset.archive.declared import BASE_UNITS
 from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import rendered
@@ -14,6 +13,7 @@ from fmu_asset.errors import SspError
 from fmu_asset.packing.contents import archive_bytes, checked_target
 from fmu_asset.sentences import said
 from reporting.files import atomic_write_bytes
+from reporting.units import BASE_UNITS
 
 from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, parse_xml, validate
 

@@ -125,17 +125,6 @@ def test_jenkins_elements_hold_the_stated_force_when_all_slip():
         assert float(law.stiffness @ law.slip) == pytest.approx(slip, rel=2e-3)
 
 
-def test_bouc_wen_against_the_quadrature_of_its_loading_branch():
-    share, limit = 0.6, 0.004
-    force = 5.0
-    x = float(
-        oscillator().static(np.array([[force]]), [Law("x", BOUC_WEN, (share * STIFFNESS, limit, 1.0))])[0, 0]
-    )
-    # order 1: z = z_y (1 - exp(-x / z_y)) while loading
-    z = limit * (1.0 - np.exp(-x / limit))
-    assert (1.0 - share) * STIFFNESS * x + share * STIFFNESS * z == pytest.approx(force, rel=1e-4)
-
-
 @pytest.mark.parametrize(
     "law",
     [

@@ -19,12 +19,10 @@ from calibration.paper.load_test import (
     normal_reference_bandwidth,
     particle_filter,
 )
-from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
+from calibration.paper.procedure import fit_masses, read_published_results
 from calibration.static.errors_in_variables import assess_fit, exact_posterior, pair_log_likelihoods
 from calibration.static.experiments import published_measurements
-from calibration.static.posterior import GaussianPrior
-from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
-from fe.runtime.modal_system import rayleigh_damping_ratio
+from calibration.static.posterior import PUBLISHED_LINE, GaussianPrior, stiffness_curve_of, stiffness_line
 from tests.refusals import Inputs
 
 DATA = published_measurements()
@@ -168,19 +166,6 @@ def test_masses_of_a_closed_solution(factor):
     assert result.samples[0, 2] == pytest.approx(pitot, abs=1e-6)
     assert 2.0 * result.samples[0, 1] + result.samples[0, 2] == pytest.approx(0.472, abs=1e-15)
     assert result.frequency[0, 0] == pytest.approx(5.6492, rel=1e-6)
-
-
-@given(
-    first=st.floats(2.0, 10.0),
-    factor=st.floats(2.0, 9.0),
-    alpha=st.floats(0.01, 10.0),
-    beta=st.floats(1e-5, 1e-2),
-)
-def test_damping_coefficients_undo_the_damping_ratios(first, factor, alpha, beta):
-    frequency = first, first * factor
-    ratio = rayleigh_damping_ratio(alpha, beta, frequency)
-    found = damping_coefficients(frequency, (float(ratio[0]), float(ratio[1])))
-    assert found == pytest.approx((alpha, beta), rel=1e-6, abs=1e-9)
 
 
 def test_the_authors_table_gives_their_figures(reference):

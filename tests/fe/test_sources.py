@@ -38,9 +38,7 @@ OUTER = (
 
 
 @pytest.mark.parametrize("change", [{"added": 5.0}, {"step": 7.0}])
-def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, float]
-) -> None:
+def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(tmp_path, monkeypatch, change):
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
 
     def outer(**numbers: float) -> tuple[float, int]:
@@ -69,7 +67,7 @@ def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(
 PACKAGE = Path(fe.runtime.__file__).parent
 
 
-def test_runtime_files_import_only_numpy_the_standard_library_and_each_other() -> None:
+def test_runtime_files_import_only_numpy_the_standard_library_and_each_other():
     files = sorted(PACKAGE.rglob("*.py"))
     assert len(files) > 15
     for name in files:

@@ -68,7 +68,7 @@ def test_a_run_is_flown_and_stored_without_heavy_libraries():
         "import sys, twin_master.workflow, twin_master.assets.design_source\n"
         "import calibration.paper.load_test\n"
         "import calibration.static.errors_in_variables, calibration.static.experiments\n"
-        "import calibration.static.stiffness_curve\n"
+        "import calibration.static.posterior\n"
         "heavy = {'xarray', 'pandas', 'dask', 'distributed', 'zarr', 'matplotlib', 'bokeh', 'skfem', 'pymor',"
         " 'meshio', 'scipy.interpolate', 'scipy.optimize', 'scipy.sparse'}\n"
         "print(*sorted(heavy & set(sys.modules)))"

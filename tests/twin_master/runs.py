@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,16 @@ from typing import Any
 import pytest
 
 from scenarios import scenario_files
+from twin_master.assets.asset_source import Asset, AssetSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
+from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.mission.turns import History, Turn
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.scenario.schema import Scenario
+from uav_twin import load_scenario, reduced_model
 
 
 def edited(text: str, *changes: tuple[str, str]) -> str:
@@ -40,6 +46,22 @@ def table_of(name: str) -> dict[str, Any]:
     return tomllib.loads(text_of(name))
 
 
+def merged(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table with other values, also in its tables; "" for a key that goes."""
+    found = {key: value for key, value in table.items() if changes.get(key) != ""}
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(found.get(key), dict):
+            found[key] = merged(found[key], value)
+        elif value != "":
+            found[key] = value
+    return found
+
+
+def changed_scenario(name: str, changes: Mapping[str, Any]) -> LoadedScenario:
+    """Return a shipped scenario with other values in its tables."""
+    return loaded_from(merged(table_of(name), changes), name)
+
+
 def loaded_from(table: dict[str, Any], name: str) -> LoadedScenario:
     """Return a scenario that stands where a shipped one does."""
     return LoadedScenario(parse_scenario(table, name), scenario_files()[name], "0" * 64)
@@ -52,6 +74,25 @@ def of_library(
     scenario = load_scenario(name).scenario.model_copy(update=sections)
     source = StrainLibrarySource(scenario, load_strain_library(library))
     return prepare_knowledge(scenario, source, seed), source
+
+
+def of_wing(given: str | Scenario, seed: int = 3) -> tuple[Knowledge, ReducedModelSource]:
+    """Return what a twin of the shipped wing knows, and that wing."""
+    scenario = load_scenario(given).scenario if isinstance(given, str) else given
+    source = ReducedModelSource(scenario, reduced_model())
+    return prepare_knowledge(scenario, source, seed), source
+
+
+def flight_of(
+    knowledge: Knowledge,
+    source: AssetSource,
+    *sinks: Callable[[Turn], None],
+    seed: int = 3,
+    asset: Asset | None = None,
+) -> History:
+    """Return the mission of a seed, flown by an asset or by what its source opens."""
+    plant = knowledge.plant(knowledge.truth(seed), asset or source.open())
+    return fly(knowledge.scenario, knowledge.twin(), plant, *sinks)
 
 
 def figures_of(folder: Path) -> dict[str, Any]:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from tests.twin_master.runs import flight_of
 from twin_master.assets.resolution import asset_source
 from twin_master.environment import ScenarioEnvironment
 from twin_master.errors import MissionInputError
-from twin_master.mission.loop import fly
 
 
 @pytest.fixture(params=["level_turns", "growing_damage", "failing_gauges"])
@@ -31,8 +31,7 @@ def test_it_passes_the_checker_of_gymnasium(environment):
 def test_our_policy_flies_the_mission_of_the_loop(environment):
     """To the last bit, with the seed of the mission; rewards by enumeration."""
     scenario, knowledge = environment.scenario, environment.knowledge
-    plant = knowledge.plant(knowledge.truth(3), asset_source(scenario).open())
-    flight = fly(scenario, knowledge.twin(), plant)
+    flight = flight_of(knowledge, asset_source(scenario))
     for seed in (4, 3):  # an episode leaves nothing to the next one
         twin, (observation, info) = knowledge.twin(), environment.reset(seed=seed)
         observed, controls, rewards, truncated = [info["observed"]], [info["control"]], [], False

@@ -38,10 +38,10 @@ from twin_master.run_folder import (
     read_config,
     tidy,
 )
-from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import RunOutcome, finished_run, open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import fly as new_run
+from uav_twin import load_scenario
+from uav_twin import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
 ROOT = Path(__file__).parents[2]

@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from calibration.result.file import load_calibration, result_bytes, save_calibration
+from calibration.result.file import result_bytes, save_calibration
 from fmu_asset.door.binding import load_binding
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.contents import build_script_fmu
 from scenarios import asset_scripts, binding_files
 from tests.command_line import refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import edited, loaded_from, table_of
+from tests.twin_master.runs import changed_scenario, edited
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
-from twin_master.workflow import fly as new_run
+from uav_twin import FmiAsset, fly, load_calibration
 
 INPUTS = Inputs(__file__)
 
@@ -178,15 +177,8 @@ def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench, tmp_path):
     deviation = found.standard_deviation("viscosity_factor")
     assert abs(found.mean("viscosity_factor") - TRUTH) < 3.0 * deviation < 0.012
 
-    table = table_of("pump_wear")
-    table["mission"] |= {"steps": 3, "prediction_steps": 2}
-    table["state"][0] |= {"levels_percent": [0, 30], "prior": [1, 0]}
-    table["state"][1] |= {"levels_percent": [0, 60], "prior": [1, 0]}
-    table["calibration"] |= {"draws": 4}
-    table["asset"] = {"kind": "script", "script": "gear_pump", "binding": "gear_pump", "isolated": False}
-    table["truth"]["gains"] = []
-    scenario = loaded_from(table, "pump_wear")
-    folder = new_run(scenario, tmp_path / "run", Overrides(calibration=file), report=False).folder
+    scenario = changed_scenario("pump_wear", INPUTS.table("pump_mission.toml"))
+    folder = fly(scenario, tmp_path / "run", Overrides(calibration=file), report=False).folder
     with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
         tree.load()
     assert set(tree["calibration"]["draw_value"].values) <= set(found.draws_of("viscosity_factor"))

@@ -20,20 +20,17 @@ from calibration.dynamics.records import read_records
 from calibration.dynamics.trials import average, fit_trials
 from calibration.geometry import published_lengths, read_lengths
 from calibration.joint.wing_table import weighed
-from calibration.result.file import load_calibration
 from calibration.result.record import STATE, Calibration
 from calibration.static.experiments import read_measurements
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
 from calibration.wing.lab_data import read_weighed_mass, write_lab_folder
-from fe.reduction.model_cache import reduced_model
 from fe.runtime.state import DigitalState
-from fe.wing.design import SHIPPED_DESIGN, load_design
-from fe.wing.operators import assemble
-from fmu_asset.door.session import FmiAsset
+from fe.wing.design import SHIPPED_DESIGN
 from tests.command_line import call, command, refused, said
 from tests.kept import FE, ROOT, kept_folder
 from tests.twin_master.runs import check_same, cut_off_after, edited, figures_of, text_of, written
 from tests.wings import tip_stiffness
+from uav_twin import FmiAsset, assemble, load_calibration, load_design, reduced_model
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 

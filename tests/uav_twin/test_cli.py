@@ -11,17 +11,14 @@ import pytest
 from benchmarks import command_page
 from fe.verification import wing_checks
 from fe.verification.wing_checks import Check
-from fe.wing.design import load_design
-from fe.wing.operators import assemble
 from reporting import terminal
 from scenarios import scenario_files
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
 from twin_master.errors import MissionInputError, ScenarioError
-from twin_master.scenario.reading import load_scenario
 from twin_master.scenario_check import check_scenario
-from uav_twin import cli
+from uav_twin import assemble, cli, load_design, load_scenario
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import math
 import re
 import zipfile
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,25 +23,18 @@ from tests.twin_master.runs import text_of, written
 
 INPUTS = Inputs(__file__)
 HISTORIES = INPUTS.table("histories.toml")["refused"]
-ROOM = INPUTS.text("room.toml")
+ROOM = INPUTS.folder / "room.toml"
 
 
-@pytest.fixture
-def room(tmp_path: Path) -> Path:
-    path = tmp_path / "room.toml"
-    path.write_text(ROOM, encoding="utf-8")
-    return path
-
-
-def test_histories_in_outputs_out(foreign_fmu, room, tmp_path):
+def test_histories_in_outputs_out(foreign_fmu, tmp_path):
     fmu, given = foreign_fmu("room2"), tmp_path / "inputs.csv"
     power, outside = [0.0, 3.0, 1.5, 0.25], [5.0, -3.5, 0.1, 20.0]
     lines = [f"{120.0 + 60.0 * i},{p},{o}" for i, (p, o) in enumerate(zip(power, outside, strict=True))]
     given.write_text("time, power, load.outside\n" + "\n".join(lines) + "\n\n", encoding="utf-8")
-    with FmiAsset(fmu, room, isolated=False) as asset:
+    with FmiAsset(fmu, ROOM, isolated=False) as asset:
         seen = [asset.step({"power": p}, load={"outside": o}) for p, o in zip(power, outside, strict=True)]
     for out, more in ((tmp_path / "out.csv", ()), (tmp_path / "out.nc", ("--in-process",))):
-        words = ("fmu", "simulate", fmu, "--binding", room, "--inputs", given, "--out", out)
+        words = ("fmu", "simulate", fmu, "--binding", ROOM, "--inputs", given, "--out", out)
         assert "4 steps to t = 360 s" in said(*words, *more)
     with (tmp_path / "out.csv").open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
@@ -125,13 +117,7 @@ def test_histories_of_an_array_of_another_size(foreign_fmu, tmp_path):
 
 def test_structural_parameters_of_a_binding(foreign_fmu):
     """They hold after every start, in a state and for an asset beside it; some cannot be taken."""
-    header = {"name": "r", "step_size": 1.0, "structural_parameters": {"n": 3}}
-    content = {
-        "binding": header,
-        "control": {"u": {"variable": "u", "unit": "1"}},
-        "parameter": {"w": {"variable": "w", "unit": "1"}, "one": {"variable": "w[2]", "unit": "1"}},
-        "observation": {"y": {"variables": "y", "unit": "1"}},
-    }
+    content = INPUTS.table("structural.toml")
     with closing(FmiAsset(foreign_fmu("resize3"), parse_binding(content))) as asset:
         for _ in range(2):
             asset.reset({"w": [1.0, 1.0, 4.0]}, control={"u": [1.0, 2.0, 3.0]})
@@ -142,14 +128,14 @@ def test_structural_parameters_of_a_binding(foreign_fmu):
             asset.reset({"one": 5.0}, control={"u": [1.0, 2.0, 3.0]})
         with pytest.raises(FmuFileError, match=r"'u' of .* has 3 elements but 2 start values"):
             asset.reset({})
-    content["binding"] = {**header, "structural_parameters": {"rows": 3}}
+    content["binding"]["structural_parameters"] = {"rows": 3}
     with pytest.raises(
         BindingError,
         match=r"structural_parameters\.rows of the binding r names 'rows', which is not a variable",
     ):
         FmiAsset(foreign_fmu("resize3"), parse_binding(content))
     huge = foreign_fmu.changed("resize3", "many", ('max="8"', ""))
-    content["binding"] = {**header, "structural_parameters": {"n": 1e9}}
+    content["binding"]["structural_parameters"] = {"n": 1e9}
     with pytest.raises(FmuInputError, match="'y' is an array of 1000000000 elements; 10000000 are the most"):
         FmiAsset(huge, parse_binding(content))
     states = '<UInt64 name="n" valueReference="100" causality="structuralParameter" start="2"/>'
@@ -170,30 +156,26 @@ def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu):
 
 
 @pytest.mark.parametrize(("content", "sentence"), HISTORIES)
-def test_files_that_are_refused(room, tmp_path, content, sentence):
+def test_files_that_are_refused(tmp_path, content, sentence):
     given = tmp_path / "inputs.csv"
     given.write_text(content, encoding="utf-8")
     with pytest.raises(FmuInputError, match=sentence):
-        read_histories(given, load_binding(room))
+        read_histories(given, load_binding(ROOM))
 
 
-def test_columns_of_arrays_in_any_order_and_time_alone(room, tmp_path):
+def test_columns_of_arrays_in_any_order_and_time_alone(tmp_path):
     given = tmp_path / "inputs.csv"
     given.write_text("power[2],time,power[1]\n1,120,2\n3,180,4\n", encoding="utf-8-sig")
-    steps, roles = read_histories(given, load_binding(room))
+    steps, roles = read_histories(given, load_binding(ROOM))
     assert steps == 2
     assert roles["control"]["power"].tolist() == [[2.0, 1.0], [4.0, 3.0]]
     given.write_text("time\n120\n180.00001\n240\n", encoding="utf-8")
-    assert read_histories(given, load_binding(room)) == (3, {})
+    assert read_histories(given, load_binding(ROOM)) == (3, {})
 
 
 def test_rows_that_are_joined_by_lines(foreign_fmu, tmp_path):
     """x' = u - x from rest under u = t: x = t - 1 + exp(-t); the first row is where the asset starts."""
-    given, bound, out = tmp_path / "u.csv", tmp_path / "follow.toml", tmp_path / "x.csv"
-    bound.write_text(
-        '[binding]\nname = "follow"\nstep_size = 0.5\n[load.u]\nvariable = "u"\nunit = "1"\n'
-        '[observation.x]\nvariables = "x"\nunit = "1"\n'
-    )
+    given, bound, out = tmp_path / "u.csv", INPUTS.folder / "follow.toml", tmp_path / "x.csv"
     given.write_text("time,u\n0,0\n0.5,0.5\n1,1\n")
     wanted = (foreign_fmu("follow2"), "--binding", bound, "--inputs", given, "--out", out, "--in-process")
     assert "2 steps to t = 1 s" in said("fmu", "simulate", *wanted, "--interpolation", "linear")
@@ -276,7 +258,7 @@ def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
 
 GRID = (
     "--grid",
-    "wear=0,0.3",
+    "health.wear=0,0.3",
     "--grid",
     "clogging=0,0.6",
     "--grid",

@@ -10,25 +10,22 @@ import pytest
 import xarray as xr
 from fmpy.validation import validate_fmu
 
-from calibration.result.file import load_calibration
 from fe.full.factorisation import Factorisation
 from fe.reduction.reduced_basis import measured_errors
 from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_comparison import calculix_program
 from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.progress import SilentProgress
-from scenarios import structure_files
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import loaded_from, table_of
+from tests.twin_master.runs import changed_scenario, loaded_from
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.watch.opening import begun_watch
-from twin_master.workflow import fly as new_run
-from uav_twin import assemble_structure, reduced_structure
+from uav_twin import assemble_structure, fly, load_calibration, reduced_structure, structure_files
 
 INPUTS = Inputs(__file__)
 
@@ -201,7 +198,7 @@ def test_a_twin_finds_the_patch_that_calculix_weakened(matrices, tmp_path):
     """The strains flown are CalculiX' with that patch."""
     table = INPUTS.table("skin_mission.toml")
     scenario = LoadedScenario(parse_scenario(table, "mission"), matrices.with_name("mission.toml"), "0" * 64)
-    folder = new_run(scenario, tmp_path / "run", report=False).folder
+    folder = fly(scenario, tmp_path / "run", report=False).folder
     with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
         tree.load()
     truth = tree["truth"]
@@ -249,12 +246,8 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def mission(**calibration: object) -> LoadedScenario:
     """The shipped mission in six shifts, of an asset whose parameters are not named."""
-    table = table_of("bracket")
-    table["mission"] |= {"steps": 6, "prediction_steps": 2}
-    table["asset"] = {"kind": "structure", "structure": "bracket", "isolated": False}
-    table["truth"]["gains"] = []
-    table["calibration"] |= calibration
-    return loaded_from(table, "bracket")
+    changes = {"mission": {"steps": 6, "prediction_steps": 2}, "asset": {"isolated": False, "parameters": ""}}
+    return changed_scenario("bracket", changes | {"truth": {"gains": []}, "calibration": calibration})
 
 
 def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated):
@@ -268,9 +261,7 @@ def test_the_twin_flies_with_it(calibrated, tmp_path):
     """Its draws are those of the file; what flies stands at the means; the mass follows the modulus."""
     found = load_calibration(calibrated)
     said: list[str] = []
-    folder = new_run(
-        mission(), tmp_path / "run", Overrides(calibration=calibrated), progress=_Noted(said)
-    ).folder
+    folder = fly(mission(), tmp_path / "run", Overrides(calibration=calibrated), progress=_Noted(said)).folder
     wanted_words = f"Calibrated was the model {found.model}; flown is the FMU of the structure bracket, and"
     assert found.design_hash == packed_design_hash(calibrated.parents[1] / "bracket.fmu")
     believed = f"The twin believes the design that was calibrated, {found.design_hash[:12]}."
@@ -320,7 +311,7 @@ class _Noted(SilentProgress):
 
 def test_what_the_calibration_does_not_fit_is_refused(calibrated, tmp_path):
     with pytest.raises(Exception, match="has no samples of `pomp`; it has e, pump"):
-        new_run(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
+        fly(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
     source = structure_files()["bracket"]
     shutil.copy(source.with_suffix(".inp"), tmp_path)
     text, table = source.read_text(encoding="utf-8"), mission().scenario.to_dict()
@@ -336,7 +327,7 @@ def test_what_the_calibration_does_not_fit_is_refused(calibrated, tmp_path):
         own = {name: table[name] | {"structure": str(tmp_path / "other.toml")} for name in tables}
         other = loaded_from(table | own, "bracket")
         with pytest.raises(MissionInputError, match=words):
-            new_run(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
+            fly(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
         assert not (tmp_path / "run").exists()
     own = {"asset": table["asset"] | {"structure": str(tmp_path / "other.toml")}}  # the truth may be another
     other = loaded_from(table | own, "bracket")

@@ -209,15 +209,7 @@ class AssetSource:
         return {**own, **self._scenario.calibration.all_files()}
 
     def path(self, copy: str) -> Path:
-        """Return a file: its copy in the run folder, or where it is given before that.
-
-        Raises
-        ------
-        MissionInputError
-            It is made in the run folder, and there is none yet.
-        """
-        if self._folder is None and copy not in self.places:
-            raise MissionInputError("the asset was not prepared: call `prepare` first.")
+        """Return a file: its copy in the run folder, or where it is given before that."""
         return self.places[copy] if self._folder is None else self._folder / copy
 
     @property

@@ -23,7 +23,7 @@ from twin_master.assets.asset_source import (
     AssetSource,
     asked_table,
 )
-from twin_master.assets.fmu_source import FmuSection
+from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import (
     OWN_OF_WING,
     ParameterDraws,
@@ -240,7 +240,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
 
             options = tailoring(self.calibration)
         pack_wing(
-            self.wing_design, self.fmu_path(), kind=self.section.packed, patch=self.patch, activate=True,
+            self.wing_design, self.path(FMU_COPY), kind=self.section.packed, patch=self.patch, activate=True,
             replace=True, progress=progress, **options,
         )  # fmt: skip
 

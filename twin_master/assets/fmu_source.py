@@ -79,11 +79,6 @@ class FmuSection(AssetSection):
         """Load inputs, the same in every step, SI."""
         return self.load
 
-    @property
-    def binding_path(self) -> Path:
-        """The binding, shipped or not."""
-        return self.all_files()[BINDING_COPY]
-
     def faults(self) -> Iterator[Fault]:
         """Yield parameters that are seeds, too."""
         for name in self.seeds:
@@ -225,11 +220,7 @@ class FmuSource(AssetSource):
 
     def binding(self) -> Binding:
         """Return the binding: where it is given, or its copy once prepared."""
-        return load_binding(self.section.binding_path if self._folder is None else self.path(BINDING_COPY))
-
-    def fmu_path(self) -> Path:
-        """Return the FMU, once prepared."""
-        return self.path(FMU_COPY)
+        return load_binding(self.path(BINDING_COPY))
 
     def check(self) -> None:
         """Read what is given where it is, without copying or starting anything.
@@ -280,8 +271,8 @@ class FmuSource(AssetSource):
         return FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters()).binding
 
     def _make(self, progress: Progress) -> dict[str, str]:
-        packed = packed_design_hash(self.fmu_path())
-        return ({FLOWN_DESIGN_HASH: packed} if packed else {}) | {"fmu": hash_file(self.fmu_path())}
+        packed = packed_design_hash(self.path(FMU_COPY))
+        return ({FLOWN_DESIGN_HASH: packed} if packed else {}) | {"fmu": hash_file(self.path(FMU_COPY))}
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Ask the FMU for its observation (E, S, U, G) at every draw, state and control.
@@ -354,7 +345,7 @@ class FmuSource(AssetSource):
     def _session(self, binding: Binding, parameters: Mapping[str, float]) -> "Session":
         section = self.section
         return FmiAsset(
-            self.fmu_path(), binding, isolated=section.isolated, step_timeout=section.step_timeout,
+            self.path(FMU_COPY), binding, isolated=section.isolated, step_timeout=section.step_timeout,
             parameters=parameters,
         )  # fmt: skip
 

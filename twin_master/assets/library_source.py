@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from fmu_asset.door.binding import load_binding
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
@@ -23,7 +22,7 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import OBSERVATIONS_COPY, AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
-from twin_master.assets.fmu_source import FMU_COPY, FmuSection
+from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import InvalidModelError, InvalidObservationLibraryError, MissionInputError
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
@@ -241,12 +240,9 @@ class LibraryBelief(BeliefSection):
         MissionInputError
             What flies is no FMU.
         """
-        if not isinstance(scenario.asset, FmuSection):
+        if not isinstance(flown, FmuSource):
             raise MissionInputError(said("assets.not_sampled", kind=scenario.asset.kind))
-        model: AssetSource = flown
-        if self.design is not None:
-            model = DesignSource(scenario, section=DesignBelief(design=self.design))
-        return LibrarySource(scenario, self, model, scenario.asset.binding_path)
+        return LibrarySource(scenario, self, flown)
 
 
 class LibrarySource(AssetSource):
@@ -258,15 +254,16 @@ class LibrarySource(AssetSource):
         What is flown.
     section : LibraryBelief
         What is believed.
-    model : AssetSource
-        Gives the draws of the parameter and the field: what is flown, or the model of a design.
-    binding : Path
-        Binding of what is flown.
+    flown : FmuSource
+        Gives the draws of the parameter and the field where no design does.
     """
 
-    def __init__(self, scenario: Scenario, section: LibraryBelief, model: AssetSource, binding: Path) -> None:
+    def __init__(self, scenario: Scenario, section: LibraryBelief, flown: FmuSource) -> None:
         super().__init__(scenario, section)
-        self._model, self._binding = model, binding
+        self._flown = flown
+        self._model: AssetSource = flown
+        if section.design is not None:
+            self._model = DesignSource(scenario, section=DesignBelief(design=section.design))
         self._other_fmu: bool | None = False
 
     @property
@@ -286,7 +283,7 @@ class LibrarySource(AssetSource):
         """
         library = load_observation_library(self.path(OBSERVATIONS_COPY))
         scenario, section = self._scenario, self._scenario.observation
-        vector = load_binding(self._binding).observation.get(section.role)
+        vector = self._flown.binding().observation.get(section.role)
         units = zip(library.states.names, library.state_units, strict=True)
         of_states = {f"{factor.name}: {factor.unit}" for factor in scenario.state}
         for what, has, wanted in (
@@ -326,7 +323,7 @@ class LibrarySource(AssetSource):
     def _make(self, progress: Progress) -> dict[str, str]:
         """Prepare the design if one is named; what is flown is prepared before."""
         assert self._folder is not None
-        fmu, own = self._folder / FMU_COPY, isinstance(self._model, DesignSource)
+        fmu, own = self._folder / FMU_COPY, self._model is not self._flown
         hashes = self._model.prepare(self._folder, progress) if own else {}
         # Of several FMUs each has its own hash.
         self._other_fmu = self.library.fmu_hash != hash_file(fmu) if fmu.exists() else None

@@ -110,8 +110,12 @@ def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedMode
     from calibration.paper.load_test import particle_filter, push_forward
     from calibration.static.errors_in_variables import exact_posterior
     from calibration.static.experiments import published_measurements
-    from calibration.static.posterior import GaussianPrior, ScalarPosterior
-    from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of
+    from calibration.static.posterior import (
+        PUBLISHED_LINE,
+        GaussianPrior,
+        ScalarPosterior,
+        stiffness_curve_of,
+    )
     from reporting.record_json import plain
 
     sequence, pairs = seed_sequence(seed, "calibration"), published_measurements()

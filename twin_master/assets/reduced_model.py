@@ -51,8 +51,7 @@ class ReducedModelSource(AssetSource):
     @property
     def wing(self) -> "ReducedModel":
         """The reduced model, once prepared."""
-        if self.model is None:
-            raise MissionInputError("the model was not prepared: call `prepare` first.")
+        assert self.model is not None
         return self.model
 
     def _make(self, progress: Progress) -> dict[str, str]:

@@ -18,7 +18,7 @@ from twin_master.assets.asset_source import (
     AssetBelief,
     AssetSource,
 )
-from twin_master.assets.fmu_source import FmuSection, FmuSource
+from twin_master.assets.fmu_source import FMU_COPY, FmuSection, FmuSource
 from twin_master.assets.parameter import (
     SAME_NAMES,
     calibrated_means,
@@ -78,19 +78,6 @@ class StructureSection(StructureFiles, FmuSection):
     """What evaluates the FMU: Python, or C compiled here."""
 
     kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "structure": FLOWN_COPY}
-
-    @property
-    def binding_path(self) -> Path:
-        """The binding, where there is one.
-
-        Raises
-        ------
-        MissionInputError
-            There is none.
-        """
-        if not self.binding:
-            raise MissionInputError(said("assets.binding"))
-        return super().binding_path
 
     def source(self, scenario: Scenario) -> "StructureFmuSource":
         """Return the FMU of the structure."""
@@ -234,13 +221,12 @@ class NamedStructure(AssetSource):
 
     def _check_parameter(self, *, believed: bool) -> None:
         """Refuse a calibration that the structure cannot have; raises `MissionInputError`."""
-        calibration, design, known = self._scenario.calibration, self.design, self.parameter_names
+        calibration, known = self._scenario.calibration, self.parameter_names
         if refusal := self.advice.get(calibration.source):
             raise MissionInputError(refusal)
-        ranges = {part.name: part.range for part in (*design.parameter, *design.mass)}
         check_calibration(
-            calibration, known, self.where, ranges=ranges, design_hash=self.hash if believed else "",
-            advice=self.advice["calibration"],
+            calibration, known, self.where, ranges=self.design.ranges, advice=self.advice["calibration"],
+            design_hash=self.hash if believed else "",
         )  # fmt: skip
         rows = [("parameter", [calibration.parameter], known)]
         error = MissingObservationModelError if believed else MissionInputError
@@ -251,9 +237,7 @@ class NamedStructure(AssetSource):
 
         A name that the structure does not have is passed over.
         """
-        scenario, design = self._scenario, self.design
-        ranges = {part.name: part.range for part in (*design.parameter, *design.mass, *design.control)}
-        ranges |= {part.name: (0.0, part.largest_loss) for part in design.damage}
+        scenario, ranges = self._scenario, self.design.ranges
         given = [(f"parameter {name}", name, value) for name, value in parameters.items()]
         given += [(f"level of {f.name}", f.name, level) for f in scenario.state for level in f.levels]
         given += [
@@ -316,13 +300,13 @@ class StructureFmuSource(NamedStructure, FmuSource):
             atomic_write_text(self.path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
             self._pack(progress)
-        return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": hash_file(self.fmu_path())}
+        return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": hash_file(self.path(FMU_COPY))}
 
     def _pack(self, progress: Progress) -> None:
         from fmu_asset.packing.structure_fmu import build_fmu
 
         assert self.model is not None
-        build_fmu(self.model, self.fmu_path(), kind=self.section.packed, replace=True)
+        build_fmu(self.model, self.path(FMU_COPY), kind=self.section.packed, replace=True)
 
     def open(self) -> Asset:
         """Return the FMU at its start; where modes are observed, in motion with an identification behind."""

@@ -25,7 +25,7 @@ from fmu_asset.ssp.writer import write_ssp
 from reporting.progress import reporter
 from scenarios import binding_files
 from twin_master.assets.coupled_source import SeveralSource
-from twin_master.assets.fmu_source import FmuSource
+from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario
@@ -68,8 +68,8 @@ def export_scenario(
         if isinstance(source, SeveralSource):
             wiring = source.wiring()
         else:
-            binding = _with_own_names(binding, source.fmu_path(), source.parameters())
-            wiring = single_system(scenario.mission.name, source.fmu_path(), binding)
+            binding = _with_own_names(binding, source.path(FMU_COPY), source.parameters())
+            wiring = single_system(scenario.mission.name, source.path(FMU_COPY), binding)
         wiring, names = _with_values(wiring, binding, source.parameters(), scenario.asset.constant_load)
         stop = scenario.mission.steps * binding.step_size
         return write_ssp(wiring, out, parameter_names=names, stop_time=stop, replace=replace_file)

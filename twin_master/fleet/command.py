@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from reporting import terminal
-from reporting.words import counted
 from twin_master.viewer.command import shown
 
 if TYPE_CHECKING:
@@ -112,34 +111,30 @@ class _Console:
 
 
 def _heading(standing: Mapping[str, Any]) -> str:
+    from reporting.page import Words
     from twin_master.fleet.watching import counts_of
 
-    counts = counts_of(standing)
-    told = [counted(counts[f"{name}s"], name) for name in ("asset", "turn", "alarm")]
-    told += [f"{counted(counts['messages refused'], 'message')} refused"] * bool(counts["messages refused"])
-    told += [f"{counts['not watched']} not watched"] * bool(counts["not watched"])
-    return ", ".join(told)
+    return Words("twin_master.fleet").say("heading", counts=counts_of(standing))
 
 
 def _watched_table(standing: Mapping[str, Any]) -> "Table":
-    from rich import box
-    from rich.table import Table
-
+    from reporting.console_table import console_table
     from twin_master.mission.replay import health_in_words
 
     def badness(row: tuple[str, dict[str, Any]]) -> tuple[int, float]:
         return row[1]["alarms"], sum(known["mean"] for known in row[1]["last"]["health"].values())
 
     told = [(name, asset) for name, asset in standing["assets"].items() if asset["last"] is not None]
-    rows = sorted(told, key=badness, reverse=True)[:ROWS]
-    states = list(dict.fromkeys(name for _, asset in rows for name in asset["last"]["health"]))
-    table = Table("asset", "turn", "control", *states, "next", "alarms", box=box.SIMPLE_HEAD)
-    table.title = _heading(standing)
-    for name, asset in rows:
+    worst = sorted(told, key=badness, reverse=True)[:ROWS]
+    states, rows = list(dict.fromkeys(name for _, asset in worst for name in asset["last"]["health"])), []
+    for name, asset in worst:
         last, health = asset["last"], health_in_words(asset["last"])
-        turn, control, coming = (str(last[key]) for key in ("turn", "control", "next_control"))
         cells = [health.get(state, "") for state in states]
-        table.add_row(name, turn, control, *cells, coming, str(asset["alarms"] or ""))
+        alarms = str(asset["alarms"] or "")
+        rows.append((name, str(last["turn"]), last["control"], *cells, last["next_control"], alarms))
+    headings = "asset", "turn", "control", *states, "next", "alarms"
+    table = console_table(headings, rows, terminal.console().width)
+    table.title = _heading(standing)
     return table
 
 

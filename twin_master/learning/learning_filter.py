@@ -16,15 +16,64 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, gammaln, logsumexp, ndtr
 
 from reporting.arrays import Float, Index
-from twin_master.errors import ImpossibleObservation, InvalidModelError
-from twin_master.learning.posterior import INTERVAL, posterior_of_draws
+from twin_master.errors import ImpossibleObservation
 from twin_master.learning.regression import GaugeRegression
 from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
-from twin_master.sentences import said
+
+INTERVAL = (0.05, 0.95)
+_POINTS = 801
+_REACH = 60.0
+"""Draws whose evidence lies this many nats below the best tell the spline nothing that counts."""
+
+
+def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -> Learnt:
+    """Return the posterior of a parameter whose draws have weights.
+
+    The evidence of a draw is a smooth function of the parameter, and its logarithm nearly a parabola. When it
+    is narrower than the distance of the draws, their weights alone would give a point; so the log evidence is
+    interpolated between them by a cubic spline, and the prior by the straight lines of its distribution
+    function.
+
+    Parameters
+    ----------
+    values : (E,)
+        Draws.
+    prior, weight : (E,)
+        Their probabilities before and after the observations.
+    """
+    distinct, place = np.unique(np.asarray(values, dtype=np.float64), return_inverse=True)
+    before, after = (np.bincount(place, np.asarray(given, dtype=np.float64)) for given in (prior, weight))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        evidence = np.log(after) - np.log(before)
+    near = np.flatnonzero(evidence >= np.max(evidence[np.isfinite(evidence)]) - _REACH)
+    count = len(distinct)
+    if count < 4 or len(near) < 2:
+        mean, reached = float(after @ distinct), np.cumsum(after)
+        lower, upper = (float(distinct[np.searchsorted(reached, level * (1 - 1e-12))]) for level in INTERVAL)
+        return Learnt(mean, float(np.sqrt(after @ (distinct - mean) ** 2)), lower, upper)
+    first, end = max(int(near[0]) - 1, 0), min(int(near[-1]) + 2, count)
+    from scipy.interpolate import CubicSpline  # takes a while to load; only a twin that learns needs it
+
+    floor = np.min(evidence[near]) - _REACH
+    edges = np.concatenate([[distinct[0]], 0.5 * (distinct[1:] + distinct[:-1]), [distinct[-1]]])
+    edges[0] -= edges[1] - distinct[0]
+    edges[-1] += distinct[-1] - edges[-2]
+    grid = np.linspace(edges[first], edges[end], _POINTS)
+    middle = 0.5 * (grid[1:] + grid[:-1])
+    mass = np.diff(np.interp(grid, edges, np.concatenate([[0.0], np.cumsum(before)])))
+    # With fewer than four draws that count it is one polynomial.
+    log_evidence = CubicSpline(distinct[first:end], np.maximum(evidence[first:end], floor))(middle)
+    share = mass * np.exp(log_evidence - log_evidence.max())
+    share /= share.sum()
+    mean = float(share @ middle)
+    lower, upper = np.interp(INTERVAL, np.concatenate([[0.0], np.cumsum(share)]), grid)
+    deviation = float(np.sqrt(share @ (middle - mean) ** 2))
+    return Learnt(mean, deviation, float(lower), float(upper))
+
 
 _NEGLIGIBLE = 1e-9
 """Share of a belief below which a hypothesis tells nothing."""
@@ -125,10 +174,6 @@ class LearningFilter:
     name : str
         Name of the twin, for messages.
 
-    Raises
-    ------
-    InvalidModelError
-        The average over the draws stands inside the product over the sensors, or shapes do not fit.
     """
 
     def __init__(
@@ -139,8 +184,6 @@ class LearningFilter:
         transitions: Mapping[float, TransitionModel] | None = None,
         name: str = "twin",
     ) -> None:
-        if sensor_model.averages_inside:
-            raise InvalidModelError(said("learning.inside", what="learning"))
         moves = transitions or {1.0: model.transition}
         self.model, self.sensor_model, self._name = model, sensor_model, name
         self.priors, self._factors = priors, np.array([*moves])

@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+from twin_master.scenario.schema import Scenario
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,18 @@ class Words:
     units: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     command: str = "uav-twin discrepancy run --from-run DIR"
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> "Words":
+        """Return how sentences speak of the turns and sensors of a scenario."""
+        observation = scenario.observation
+        more: dict[str, Any] = {"names": observation.titles} | (
+            {} if scenario.searchable else {"command": ""}
+        )
+        if observation.role == "strain" and set(observation.sensor_units) == {"1"}:
+            return cls(scenario.mission.step_name, "gauge", 1e6, ("microstrain",) * observation.count, **more)
+        sensor = "gauge" if observation.role == "strain" else "sensor"
+        return cls(scenario.mission.step_name, sensor, 1.0, observation.sensor_units, **more)
 
     def value(self, sensor: int, *values: float) -> list[str]:
         """Return values of a sensor as they are printed."""

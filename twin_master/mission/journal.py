@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
 from reporting.files import synchronise, write_error, written
+from reporting.record_json import plain
 from twin_master.errors import NotResumableError
 from twin_master.mission.turns import Happened, Reading, Turn
 from twin_master.sentences import said
@@ -30,12 +30,6 @@ _PIECE = 1_000_000
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
 
 
-def plain(values: ArrayLike) -> list[float | None]:
-    """Return numbers for JSON: to the last bit, NaN as null."""
-    numbers: list[float] = np.asarray(values, dtype=np.float64).tolist()
-    return [None if math.isnan(number) else number for number in numbers]
-
-
 def array_of(values: Any) -> Float:
     """Return numbers of JSON as an array, null as NaN."""
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
@@ -43,7 +37,7 @@ def array_of(values: Any) -> Float:
 
 def turn_record(turn: Turn) -> dict[str, Any]:
     """Return what a line says of a turn: what came, and the belief for viewers, who need not filter again."""
-    happened, concluded = turn.reading.happened, turn.concluded
+    concluded = turn.concluded
     record: dict[str, Any] = {
         "turn": concluded.turn,
         "observed": plain(turn.reading.observed),
@@ -53,20 +47,14 @@ def turn_record(turn: Turn) -> dict[str, Any]:
         "filtered": concluded.filtered.tolist(),
         "log_evidence": concluded.log_evidence,
     }
-    if happened is not None:
-        told = dict(zip(happened.monitors, plain([*happened.monitors.values()]), strict=True))
-        record |= {
-            "state": plain(happened.state), "observation": plain(happened.observation), "monitors": told
-        }  # fmt: skip
+    if turn.reading.happened is not None:
+        record |= plain(turn.reading.happened._asdict())
     if concluded.learnt:
         record["learnt"] = {name: vars(learnt) for name, learnt in concluded.learnt.items()}
     if concluded.notices:
         record["notices"] = [notice.as_record() for notice in concluded.notices]
     if concluded.suspicion is not None:
-        record["suspicion"] = {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(concluded.suspicion).items()
-        }
+        record["suspicion"] = plain(vars(concluded.suspicion))
     return record
 
 

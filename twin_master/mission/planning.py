@@ -10,12 +10,17 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError
-from twin_master.network.belief_planning import BeliefPlan, DecisionProblem, plan_on_belief
+from twin_master.network.belief_planning import (
+    BeliefPlan,
+    Decide,
+    DecisionProblem,
+    plan_on_belief,
+    simulated_returns,
+)
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
 from twin_master.network.rewards import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel, observation_classes
-from twin_master.network.simulated_return import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 from twin_master.sentences import said

@@ -23,11 +23,12 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.setup import learning_filter, scenario_estimator
+from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.monitor import WatchfulEstimator
+from twin_master.learning.words import Words
 from twin_master.mission.planning import planned
 from twin_master.mission.truth import Plant, Truth
-from twin_master.network.estimator import Estimator
+from twin_master.network.estimator import Estimator, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy
@@ -79,8 +80,44 @@ class Knowledge:
 
     @cached_property
     def learning(self) -> LearningFilter | None:
-        """What learns, without notices; None where nothing is learnt."""
-        return learning_filter(self.scenario, self.model, self.sensor_model, self.draws.values)
+        """What learns, without notices; None where nothing is learnt.
+
+        Raises
+        ------
+        InvalidModelError
+            A transition factor makes a probability larger than one.
+        """
+        scenario, learning = self.scenario, self.scenario.learning
+        if learning is None:
+            return None
+        units = set(scenario.observation.sensor_units)
+        priors = LearntPriors(
+            parameter=scenario.calibration.parameter if learning.parameter else None,
+            draws=self.draws.values,
+            noise_degrees=learning.noise_degrees if learning.noise else 0.0,
+            gain=learning.gauge_gain,
+            offset=learning.gauge_offset,
+            sensor_unit=units.pop() if len(units) == 1 else "",
+        )
+        factors = learning.transition_factors
+        moves = {factor: build_graphical_model(scenario, factor).transition for factor in factors}
+        return LearningFilter(self.model, self.sensor_model, priors, moves, scenario.mission.name)
+
+    @cached_property
+    def estimator(self) -> Estimator:
+        """What holds the belief: the exact filter, or what learns and gives notice as the scenario says.
+
+        Raises
+        ------
+        InvalidModelError
+            There are too many states to watch, or as of `learning`.
+        """
+        notice = self.scenario.notice
+        inner = self.learning or ExactFilter(self.model, self.sensor_model, self.scenario.mission.name)
+        if notice is None:
+            return inner
+        words = Words.of(self.scenario)
+        return WatchfulEstimator(inner, self.sensor_model, self.draws.values, notice, words)
 
     @cached_property
     def expectation(self) -> LearntExpectation | None:
@@ -109,8 +146,6 @@ class Knowledge:
             What holds the belief in the place of the exact filter, or of what learns and gives notice where
             the scenario says so.
         """
-        if estimator is None:
-            estimator = scenario_estimator(self.scenario, self.model, self.sensor_model, self.draws.values)
         return Twin(
             self.scenario.mission.name,
             self.model,
@@ -120,7 +155,7 @@ class Knowledge:
             decide_on=self.scenario.planner.decide_on,
             lag=lag,
             first_control=self.scenario.mission.first_control,
-            estimator=estimator,
+            estimator=estimator or self.estimator,
             safest=self.safest,
             on_belief=self.plan.on_belief if policy is None else None,
         )

@@ -18,14 +18,7 @@ from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import (
-    DamageGrowth,
-    SensorStatus,
-    Truth,
-    checked_values,
-    decided_to_end,
-    inspected,
-)
+from twin_master.mission.truth import DamageGrowth, Truth, checked_values, decided_to_end
 from twin_master.mission.turns import History
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import filter_many
@@ -103,10 +96,7 @@ class _Stateless:
         numbers = {key: number for number, key in enumerate(distinct)}
         self._asset = np.array([numbers[id(asset)] for asset in assets])
         self._growth = DamageGrowth(knowledge.true_model)
-        self._noise = np.stack([truth.noise for truth in truths])
-        self._uniform = np.stack([truth.uniform for truth in truths])
-        self._reading_noise = np.stack([truth.reading_noise for truth in truths])
-        self._truth = truths[0]  # script, drift and losses are the scenario's, the same for all
+        self._truth = Truth.together(truths)
         self._before: tuple[Index | None, Index | None] = None, None
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
 
@@ -120,7 +110,7 @@ class _Stateless:
         place, state = self._grown(step, control)
         code = (self._asset * len(self._scenario.control) + control) * self._states.size + place
         _, first, inverse = np.unique(np.where(flying, code, -1), return_index=True, return_inverse=True)
-        distinct = np.full((len(first), self._noise.shape[2]), np.nan)
+        distinct = np.full((len(first), self._scenario.observation.count), np.nan)
         for row, twin in enumerate(first.tolist()):
             shown = self._shown(step, int(self._asset[twin]), int(control[twin]), state[twin])
             if isinstance(shown, str):
@@ -128,17 +118,15 @@ class _Stateless:
                     failure[other] = shown
             else:
                 distinct[row] = shown
-        observed = distinct[inverse] + self._noise[:, step] + self._truth.drift[step]
-        observed[:, self._truth.status[step] == SensorStatus.LOST] = np.nan
-        read = inspected(self._scenario.readings, state, control) + self._reading_noise[:, step]
-        return np.hstack((observed, read)), state
+        sensed, read = self._truth.sense(step, distinct[inverse]), self._truth.inspected(step, state, control)
+        return np.hstack((sensed, read)), state
 
     def _grown(self, step: int, control: Index) -> tuple[Index, Float]:
         """Return the true states: their numbers (B,), zeros where they are scripted, and levels (B, F)."""
         if self._scenario.truth.kind == "scripted":
             state = self._truth.state(step, None, None)
             return np.zeros_like(control), np.broadcast_to(state, (len(control), len(state)))
-        place = self._growth.following(*self._before, self._uniform[:, step])
+        place = self._growth.following(*self._before, self._truth.uniform[step])
         self._before = control, place
         return place, self._states.coordinates[place]
 

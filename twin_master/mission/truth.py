@@ -1,8 +1,8 @@
 """What really happens: damage, noise and faults, and the flown asset that is driven by them."""
 
 from collections.abc import Sequence
+from copy import copy
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,21 +77,16 @@ class Truth:
     def _apply_faults(self, scenario: Scenario) -> None:
         steps = np.arange(scenario.mission.steps)
         for fault in scenario.truth.sensor_faults:
-            if fault.sensors == "all":
-                sensors = np.arange(scenario.observation.count)
-            else:
-                sensors = np.asarray(fault.sensors) - 1
             last = fault.last_step if fault.last_step is not None else scenario.mission.steps
             active = (steps >= fault.first_step) & (steps <= last)
-            cells = np.ix_(active, sensors)
+            cells = np.ix_(active, np.array(fault.places(scenario.observation.count)))
             if fault.kind == "dropout":
                 self.status[cells] = SensorStatus.LOST
             else:
                 assert fault.rate is not None  # the schema asks for it
                 self.drift[cells] += (fault.rate * (steps[active] - fault.first_step + 1.0))[:, None]
-                self.status[cells] = np.maximum(
-                    self.status[cells], SensorStatus.DRIFTING * (self.status[cells] != SensorStatus.LOST)
-                )
+                lost = self.status[cells] == SensorStatus.LOST
+                self.status[cells] = np.where(lost, SensorStatus.LOST, SensorStatus.DRIFTING)
 
     def state(self, step: int, previous_state: Float | None, previous_control: int | None) -> Float:
         """Return the true state of a step: (F,), a value of each state factor in SI.
@@ -110,25 +105,25 @@ class Truth:
         place = self._growth.following(control, before, self.uniform[[step]])
         return np.asarray(self._states.coordinates[place][0])
 
+    @classmethod
+    def together(cls, truths: Sequence["Truth"]) -> "Truth":
+        """Return the truths of B missions of one scenario as one, which senses and inspects for all."""
+        joint = copy(truths[0])  # script, drift and losses are the scenario's, the same for all
+        for name in ("noise", "uniform", "reading_noise"):
+            setattr(joint, name, np.stack([getattr(truth, name) for truth in truths], axis=1))
+        return joint
+
     def sense(self, step: int, observation: Float) -> Float:
-        """Return what the sensors say about an observation (G,): noise and drift added, lost ones NaN."""
+        """Return what sensors say about an observation (..., G): noise and drift added, lost ones NaN."""
         sensed: Float = observation + self.noise[step] + self.drift[step]
-        sensed[self.status[step] == SensorStatus.LOST] = np.nan
+        sensed[..., self.status[step] == SensorStatus.LOST] = np.nan
         return sensed
 
-    def inspected(self, step: int, state: Float, control: int) -> Float:
-        """Return the readings of inspections in a step: (I,), SI, NaN where the control asks for none."""
-        read = inspected(self._readings, state[None], np.array([control]))[0]
-        return np.asarray(read + self.reading_noise[step])
-
-
-def inspected(readings: Sequence[Sequence[Any]], state: Float, control: Index) -> Float:
-    """Return what inspections would read without noise (B, I) of states (B, F) under controls (B,), SI.
-
-    It is NaN where the control asks for none.
-    """
-    read = [np.where(control == action, state[:, place], np.nan) for action, place, *_ in readings]
-    return np.array(read).reshape(-1, len(control)).T
+    def inspected(self, step: int, state: Float, control: Index | int) -> Float:
+        """Return the readings of inspections (..., I), SI, NaN where the control asks for none."""
+        read = [np.where(control == at, state[..., place], np.nan) for at, place, *_ in self._readings]
+        shape = len(read), *state.shape[:-1]
+        return np.asarray(np.moveaxis(np.reshape(read, shape), 0, -1) + self.reading_noise[step])
 
 
 class DamageGrowth:

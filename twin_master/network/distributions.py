@@ -75,8 +75,6 @@ def expect_shape(
     error : type
         What is raised.
     """
-    if shape == wanted:
-        return
     pairs = zip(wanted, shape, strict=False)
     if len(shape) != len(wanted) or any(isinstance(length, int) and length != has for length, has in pairs):
         told = ", ".join(map(str, wanted)) + "," * (len(wanted) == 1)
@@ -85,9 +83,6 @@ def expect_shape(
 
 def expect_controls(index: int | Index, count: int) -> None:
     """Refuse indices of controls, an array of any shape, that are none of `count`."""
-    if isinstance(index, int):
-        low = high = index
-    else:
-        low, high = index.min(initial=0), index.max(initial=0)
+    low, high = np.min(index, initial=0), np.max(index, initial=0)
     if low < 0 or high >= count:
         raise InvalidModelError(f"expected control indices between 0 and {count - 1}, got {low} to {high}")

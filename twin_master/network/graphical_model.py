@@ -260,12 +260,10 @@ def worsening_table(level_count: int, probability: float) -> Float:
     probability : float
         Probability to worsen by one level in one step, in [0, 1].
     """
-    if level_count < 1 or not 0.0 <= probability <= 1.0:
-        raise InvalidModelError(said("network.worsening", levels=level_count, probability=probability))
     table = np.diag(np.full(level_count, 1.0 - probability))
     table += np.diag(np.full(level_count - 1, probability), 1)
     table[-1, -1] = 1.0
-    return stochastic_matrix(table, name="worsening table")
+    return table
 
 
 def repaired_table(table: Float, success: float) -> Float:
@@ -286,7 +284,4 @@ def leaving_table(table: Float, factor: float) -> Float:
 
 def deterministic_policy(control_index: ArrayLike, control_count: int) -> Float:
     """Return the policy (S, U) that gives each state the control of its index (S,)."""
-    index = np.asarray(control_index)
-    if index.ndim != 1 or index.dtype.kind not in "iu" or np.any((index < 0) | (index >= control_count)):
-        raise InvalidModelError(said("network.control_of_state", last=control_count - 1, index=index))
-    return stochastic_matrix(np.eye(control_count)[index], name="policy[state]")
+    return np.asarray(np.eye(control_count)[np.asarray(control_index)])

@@ -211,15 +211,12 @@ def predict(
     InvalidModelError
         If shapes do not fit.
     """
-    size, controls = model.states.size, len(model.controls)
     belief = np.asarray(belief, dtype=np.float64)
     policy = np.asarray(policy, dtype=np.float64)
-    expect_shape("a belief", belief.shape, size)
-    expect_shape("a policy", policy.shape, size, controls)
-    expect_controls(control_index, controls)
+    expect_shape("a belief", belief.shape, model.states.size)
     if horizon < 0:
         raise InvalidModelError(f"expected a horizon of 0 or more steps, got {horizon}")
-    predicted, transition = np.empty((horizon, size)), model.transition
+    predicted, transition = np.empty((horizon, len(belief))), model.transition
     now: Float = belief
     closed_loop = None if transition.is_product else np.einsum("su,usn->sn", policy, transition.matrix)
     for h in range(horizon):

@@ -35,8 +35,8 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     """
     needed, there = sum(parts.values()), memory_left()
     if needed > there:
-        listed = ", ".join(f"{_gigabytes(size)} for {what}" for what, size in parts.items())
-        sizes = _gigabytes(needed), _gigabytes(there)
+        listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
+        sizes = [f"{size / 1e9:.3g} GB" for size in (needed, there)]
         raise InvalidModelError(said("network.memory", listed=listed, sizes=sizes, advice=advice))
 
 
@@ -66,10 +66,6 @@ def check_scenario_fits(scenario: Scenario) -> None:
         It does not.
     """
     check_fits(scenario_bytes(scenario), "take fewer levels, state factors, draws or steps")
-
-
-def _gigabytes(size: float) -> str:
-    return f"{size / 1e9:.3g} GB"
 
 
 def transition_bytes(states: int, controls: int) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError
-from twin_master.network.distributions import expect_shape, stochastic_matrix
+from twin_master.network.distributions import expect_shape
 from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.kernels import sweep
 from twin_master.network.transition import TransitionModel
@@ -240,7 +240,7 @@ def value_iteration(
 
 
 def given_policy(
-    transition: TransitionModel, reward: ArrayLike, discount: ArrayLike, policy: ArrayLike
+    transition: TransitionModel, reward: ArrayLike, discount: ArrayLike, policy: Float
 ) -> PlannedPolicy:
     """Return a policy that was made elsewhere, with its value, iterated to rounding.
 
@@ -251,7 +251,5 @@ def given_policy(
     policy : (S, U)
         p(U | D), row-stochastic; `control_index` is its mode, the first of equals.
     """
-    rows = stochastic_matrix(policy, name="policy[state]")
-    expect_shape("a policy", rows.shape, *transition.shape[1::-1], error=PlanningError)
-    value, action_value, sweeps, _ = _swept(transition, reward, discount, rows)
-    return PlannedPolicy(value, action_value, np.argmax(rows, axis=1).astype(np.int64), rows, sweeps)
+    value, action_value, sweeps, _ = _swept(transition, reward, discount, policy)
+    return PlannedPolicy(value, action_value, np.argmax(policy, axis=1).astype(np.int64), policy, sweeps)

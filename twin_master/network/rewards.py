@@ -11,10 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 from reporting.arrays import Float, Index
-from twin_master.errors import InvalidModelError
-from twin_master.network.distributions import expect_shape
 from twin_master.network.quantity import QuantityModel
-from twin_master.sentences import said
 
 
 def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
@@ -70,15 +67,6 @@ class RewardSettings:
     control_normaliser: tuple[float, ...] | None = None
     health_sensors: tuple[int, ...] | None = None
 
-    def __post_init__(self) -> None:
-        for name in ("limit", "error_scale", "control_normaliser", "control_reward"):
-            given = getattr(self, name)
-            value = np.asarray(1.0 if given is None else given)
-            signed = name == "control_reward"
-            if not np.all(np.isfinite(value) & (signed | (value > 0.0))):
-                must = "finite" if signed else "finite and positive"
-                raise InvalidModelError(f"reward setting {name!r} must be {must}, got {given}")
-
 
 @dataclass(frozen=True)
 class RewardExpectation:
@@ -105,23 +93,12 @@ class RewardModel:
     true_per_draw : (E, S, U, G), optional
         What is there at the sensors, SI, where that is not what they show: limits and health are of the
         structure, and a gauge that is known to show too little does not make it healthier.
-
-    Raises
-    ------
-    InvalidModelError
-        If the settings are for another number of controls, or what is there has another shape.
     """
 
     def __init__(
         self, quantity: QuantityModel, settings: RewardSettings, true_per_draw: Float | None = None
     ) -> None:
         normaliser = settings.control_normaliser or (1.0,) * len(settings.control_reward)
-        if not len(settings.control_reward) == len(normaliser) == quantity.control_count:
-            counts = quantity.control_count, len(settings.control_reward), len(normaliser)
-            raise InvalidModelError(said("network.rewards", counts=counts))
-        if true_per_draw is not None:
-            shape = quantity.value_per_draw.shape
-            expect_shape("what is there at the sensors", true_per_draw.shape, *shape)
         self.quantity = quantity
         self.settings = settings
         self.true_per_draw = true_per_draw
@@ -178,7 +155,6 @@ class RewardModel:
         variance[:, 1] = np.einsum("bu,bu->b", control, (self._control_reward - mean[:, 1, None]) ** 2)
         if observation is not None:
             observation = np.asarray(observation, dtype=np.float64)
-            expect_shape("observations", observation.shape, *lead, quantity.sensor_count)
             for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
                 if not np.isnan(seen).all():
                     state, chosen = np.nonzero(flat[row])

@@ -346,7 +346,7 @@ class Scenario(Section):
             told = {"key": f"{key}.standard_deviation", "given": given, "most": LARGEST_STRAIN_NOISE}
             yield absurd, said("scenario.strain_noise", **told)
         for fault in truth.sensor_faults:
-            last = 0 if fault.sensors == "all" else max(fault.sensors)
+            last = max(fault.places(count)) + 1
             yield last > count, said("scenario.faults", count=count, came=last)
 
     def _faults_of_modes(self) -> Iterator[Fault]:

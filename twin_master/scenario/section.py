@@ -7,6 +7,9 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from reporting import toml_file
 from reporting.toml_file import Fault as Fault
+from reporting.toml_file import NotNegative as NotNegative
+from reporting.toml_file import Number as Number
+from reporting.toml_file import Positive as Positive
 from reporting.toml_file import shown
 from twin_master.sentences import said
 
@@ -27,9 +30,6 @@ def _at_most(limit: int, why: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 PerSensor = Positive | tuple[Positive, ...]
 """One positive number for all sensors, or one for each."""
 Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]

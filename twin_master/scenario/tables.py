@@ -117,6 +117,10 @@ class SensorFault(Span):
         drifts = self.kind == "drift"
         yield drifts != (self.rate is not None), said("scenario.rate")
 
+    def places(self, count: int) -> list[int]:
+        """Return the places of its sensors among so many, from 0."""
+        return list(range(count)) if self.sensors == "all" else [sensor - 1 for sensor in self.sensors]
+
 
 class TruthSection(Section):
     """What really happens, unseen by the twin: damage, sensor noise and faults.

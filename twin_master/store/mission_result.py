@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from reporting.arrays import Float
+from reporting.record_json import plain
 from reporting.words import capital, parameter_title
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Truth
@@ -122,8 +123,7 @@ def _truth(scenario: Scenario, name: str) -> Float | None:
     healthy = np.zeros(observation.count)
     for fault in truth.sensor_faults:
         if fault.kind == "drift":
-            sensors = range(1, observation.count + 1) if fault.sensors == "all" else fault.sensors
-            healthy[[sensor - 1 for sensor in sensors]] = np.nan
+            healthy[fault.places(observation.count)] = np.nan
     return healthy
 
 
@@ -138,26 +138,17 @@ def printed_learnt(name: str, unit: str) -> tuple[float, str]:
 
 def learnt_record(quantities: Sequence[LearntQuantity]) -> dict[str, Any]:
     """Return what was learnt for the summary, a list where each sensor has its own; nothing without any."""
-    if not quantities:
-        return {}
-
-    def plain(values: Float) -> Any:
-        numbers = np.array(values, dtype=object)
-        numbers[~np.isfinite(values)] = None
-        return numbers.tolist()
-
-    return {
-        "learnt": {
-            quantity.name: {
-                "title": quantity.title,
-                "unit": quantity.unit,
-                "prior": {name: plain(quantity.prior[..., k]) for k, name in enumerate(MOMENTS)},
-                "posterior": {name: plain(quantity.course[-1, ..., k]) for k, name in enumerate(MOMENTS)},
-                "truth": None if quantity.truth is None else plain(quantity.truth),
-            }
-            for quantity in quantities
+    told = {
+        quantity.name: {
+            "title": quantity.title,
+            "unit": quantity.unit,
+            "prior": {name: quantity.prior[..., k] for k, name in enumerate(MOMENTS)},
+            "posterior": {name: quantity.course[-1, ..., k] for k, name in enumerate(MOMENTS)},
+            "truth": quantity.truth,
         }
+        for quantity in quantities
     }
+    return {"learnt": plain(told)} if told else {}
 
 
 SEVERAL_UNITS = "see sensor_unit"

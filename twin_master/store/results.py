@@ -202,14 +202,31 @@ def tables_of(groups: Mapping[str, Group], role: str) -> dict[str, str]:
     role
         What is observed.
     """
-    steps = {"step": [str(step) for step in groups["observed"]["step"].values]}
+    observed, filtered, policy = (groups[name] for name in ("observed", "filtered", "policy"))
+    controls, asked = policy["control"].values, filtered["decision_probability"].values
+    steps: Columns = {"step": [str(step) for step in observed["step"].values]}
+    known = {"true": groups["truth"]["state"]} if "truth" in groups else {}
+    for kind in ("filtered", "smoothed"):
+        known |= {f"{kind}_{name}": groups[kind][name] for name in ("mean", "standard_deviation")}
+    health, states = dict(steps), Columns()
+    for place, region in enumerate(filtered["region"].values):
+        factor, unit = printed_state(policy[region].attrs["units"], "percent")
+        states[f"{region}_{unit}"] = factor * policy[region].values
+        for name, variable in known.items():
+            health[f"{region}_{name}_{unit}"] = factor * variable.values[:, place]
     tables = {
-        "observed": steps | _observations(groups["observed"], role, role),
-        "estimated": steps | _observations(groups["filtered"], "quantity_mean", role),
+        "observed": steps | _observations(observed, role, role),
+        "estimated": steps | _observations(filtered, "quantity_mean", role),
         **({"true": steps | _observations(groups["truth"], role, role)} if "truth" in groups else {}),
-        "health": steps | _health(groups),
-        "decisions": steps | _decisions(groups),
-        "policy": _policy(groups),
+        "health": health,
+        "decisions": steps
+        | {"control": controls[observed["control_index"].values]}
+        | _each("{}_reward", filtered["reward"].values, filtered["reward_mean"].values)
+        | _each("decision_probability_{}", controls, asked)
+        | {"next_control": controls[asked.argmax(axis=1)]},
+        "policy": states
+        | {"control": controls[policy["control_index"].values]}
+        | _each("action_value_{}", controls, policy["action_value"].values),
     }
     return {
         name: table_text({title: _cells(values) for title, values in columns.items()})
@@ -229,39 +246,9 @@ def _observations(group: Group, variable: str, role: str) -> Columns:
     return columns
 
 
-def _health(groups: Mapping[str, Group]) -> Columns:
-    columns = {}
-    for place, region in enumerate(groups["filtered"]["region"].values):
-        factor, unit = printed_state(groups["policy"][region].attrs["units"], "percent")
-        if "truth" in groups:
-            columns[f"{region}_true_{unit}"] = factor * groups["truth"]["state"].values[:, place]
-        for kind in ("filtered", "smoothed"):
-            for name in ("mean", "standard_deviation"):
-                columns[f"{region}_{kind}_{name}_{unit}"] = factor * groups[kind][name].values[:, place]
-    return columns
-
-
-def _decisions(groups: Mapping[str, Group]) -> Columns:
-    controls, filtered = groups["policy"]["control"].values, groups["filtered"]
-    asked = filtered["decision_probability"].values
-    rewards = zip(filtered["reward"].values, filtered["reward_mean"].values.T, strict=True)
-    return {
-        "control": controls[groups["observed"]["control_index"].values],
-        **{f"{name}_reward": values for name, values in rewards},
-        **{f"decision_probability_{n}": values for n, values in zip(controls, asked.T, strict=True)},
-        "next_control": controls[asked.argmax(axis=1)],
-    }
-
-
-def _policy(groups: Mapping[str, Group]) -> Columns:
-    policy, columns = groups["policy"], {}
-    for region in groups["filtered"]["region"].values:
-        factor, unit = printed_state(policy[region].attrs["units"], "percent")
-        columns[f"{region}_{unit}"] = factor * policy[region].values
-    controls = policy["control"].values
-    columns["control"] = controls[policy["control_index"].values]
-    values = zip(controls, policy["action_value"].values.T, strict=True)
-    return columns | {f"action_value_{name}": action for name, action in values}
+def _each(title: str, names: Iterable[str], values: NDArray[Any]) -> Columns:
+    """Return a column for each of some names, of values (T, N)."""
+    return {title.format(name): column for name, column in zip(names, values.T, strict=True)}
 
 
 def _cells(values: Any) -> list[str]:

@@ -137,8 +137,10 @@ def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
-def summarise(result: MissionResult, reward_mean: Float, misfit: Float | None = None) -> tuple[Figure, ...]:
-    """Return the figures of a mission; all of them are the same for the same seed.
+def summarise(
+    result: MissionResult, reward_mean: Float, misfit: Float | None = None, before: Iterable[Told] = ()
+) -> Iterator[Figure]:
+    """Yield the figures of a mission; all of them are the same for the same seed.
 
     Parameters
     ----------
@@ -149,9 +151,11 @@ def summarise(result: MissionResult, reward_mean: Float, misfit: Float | None = 
     misfit
         Of the twin's model, (S, U, G), a share of what the asset shows, NaN where it shows nothing; where the
         asset is known to be another one.
+    before
+        What is told before them.
     """
     flight, step = result.flight, {"step": result.scenario.mission.step_name}
-    told = [*(_scored(result) if flight.simulated else _watched(result))]
+    told = [*before, *(_scored(result) if flight.simulated else _watched(result))]
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
         known = rewards[np.isfinite(rewards)]
         told.append(("reward", {"reward": name}, [float(known.mean()) if len(known) else None]))
@@ -174,12 +178,7 @@ def summarise(result: MissionResult, reward_mean: Float, misfit: Float | None = 
         last = flight.suspicion[-1]
         first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
         told.append(("notice", step, [first, last.none_of_these, last.gauge_off, last.decided_by]))
-    return tuple(_figures(result.scenario, told))
-
-
-def _figures(scenario: Scenario, told: Iterable[Told]) -> Iterator[Figure]:
-    """Yield the figures of groups beside what the scenario gives as their references."""
-    references = {entry.figure: (entry.value, entry.source) for entry in scenario.reference}
+    references = {entry.figure: (entry.value, entry.source) for entry in result.scenario.reference}
     for group, words, values in told:
         for (key, (title, unit)), value in zip(FIGURES[group].items(), values, strict=True):
             name = key.format(**words)

@@ -21,7 +21,7 @@ from twin_master.run_folder import FIELD_NAME, read_config, to_json
 from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult, learnt_record
 from twin_master.store.results import groups_of, tables_of
-from twin_master.store.summary import Figure, control_changes, noticed, summarise
+from twin_master.store.summary import Figure, Told, control_changes, noticed, summarise
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -80,7 +80,7 @@ def store_flight(
     origin: FlownAndBelieved,
     *,
     steps: int,
-    figures: Sequence[Figure] = (),
+    figures: Sequence[Told] = (),
     attributes: Mapping[str, Any] | None = None,
     misfit: Float | None = None,
     write_field: Callable[[Path], object] | None = None,
@@ -143,7 +143,7 @@ def store_flight(
         **noticed(result),
     }
     rewards = groups["filtered"]["reward_mean"].values
-    shown = [asdict(figure) for figure in (*figures, *summarise(result, rewards, misfit))]
+    shown = [asdict(figure) for figure in summarise(result, rewards, misfit, figures)]
     atomic_write_text(folder / SUMMARY_NAME, to_json({**heading, "figures": shown}))
 
 

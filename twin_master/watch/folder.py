@@ -33,7 +33,7 @@ from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.summary import Figure
+from twin_master.store.summary import Told
 from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
 from twin_master.watch.teaching import Outcome, Teaching, both_patches, judged, patched_model
@@ -330,18 +330,12 @@ class Watch:
                 told.setdefault(notice["sentence"], (max(record["turn"], 0), Notice(**found)))
         return [*told.values()]
 
-    def _figures(self, counts: Counts, turns: int) -> tuple[Figure, ...]:
-        step = self.scenario.mission.step_name
-        told = {
-            "turns": (f"{step}s watched", turns),
-            "missing": (f"{step}s predicted through, nothing was received", counts.missing),
-            "late": ("messages put in their place late", counts.late),
-            "duplicates": ("messages that said nothing new", counts.duplicates),
-            "rejected": (f"messages refused ({REJECTED_NAME})", counts.rejected),
-        }
+    def _figures(self, counts: Counts, turns: int) -> list[Told]:
+        """Return what the summary tells of a watch."""
+        step = {"step": self.scenario.mission.step_name, "file": REJECTED_NAME}
+        came = [turns, counts.missing, counts.late, counts.duplicates, counts.rejected]
+        told: list[Told] = [("watch", step, came)]
         for model in self.teaching.adopted:
-            first = model["from_turn"]
-            for when in ("before", "after"):
-                title = f"rms residual {when} the patch of {step} {first}"
-                told[f"gap_{when}_patch_{first}"] = title, model[when]["rms_residual"]
-        return tuple(Figure(key, title, value) for key, (title, value) in told.items())
+            gaps = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
+            told.append(("patch", step | {"first": model["from_turn"]}, gaps))
+        return told

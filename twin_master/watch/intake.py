@@ -19,7 +19,7 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, written
 from twin_master.errors import TwinMasterError
-from twin_master.learning.setup import words_of
+from twin_master.learning.words import Words
 from twin_master.mission.journal import turn_record
 from twin_master.mission.turns import Reading, Turn
 from twin_master.network.estimator import Notice
@@ -129,7 +129,7 @@ class Intake:
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: Path | None = None) -> None:
-        self._section, self._words = scenario.watch, words_of(scenario)
+        self._section, self._words = scenario.watch, Words.of(scenario)
         self._width = scenario.row_width
         self._feed = feed
         self._rejected, self._kept = rejected, 0

@@ -17,14 +17,13 @@ from calibration.dynamics.damped_cosine import RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError
-from calibration.joint.inference import infer
 from calibration.joint.measurement import PUBLISHED_MODES, _mean_of, measured_modes, modal_readings
-from calibration.joint.posterior import joint_posterior
+from calibration.joint.posterior import infer, joint_posterior
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, weighed, wing_priors
 from calibration.result.record import STATE, ParameterPrior, prior_samples
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import published_measurements
-from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
+from calibration.static.posterior import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from tests.refusals import Inputs
 

@@ -11,10 +11,12 @@ from scipy.stats import multivariate_normal, norm
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.static.errors_in_variables import exact_posterior, log_likelihood, pair_log_likelihoods
 from calibration.static.experiments import published_measurements
-from calibration.static.posterior import GaussianPrior, ScalarPosterior, child_seed
-from calibration.static.stiffness_curve import (
+from calibration.static.posterior import (
     PUBLISHED_LINE,
     TABLE_TOLERANCE,
+    GaussianPrior,
+    ScalarPosterior,
+    child_seed,
     stiffness_curve_of,
     stiffness_line,
 )

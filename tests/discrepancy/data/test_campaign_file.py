@@ -368,8 +368,8 @@ def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
 @pytest.mark.parametrize("what", ["force", "load_factor", "temperature", "health", "noise_factor"])
 def test_a_trial_under_something_else_is_no_repeat(what):
     trial = Trial.plain("a", TrialKind.STATIC, ("w",), np.zeros(3), force=np.arange(3.0))
-    assert repeated([trial, trial], "w") == [[trial, trial]]
-    assert not repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")
+    assert [group for group, *_ in repeated([trial, trial], "w")] == [[trial, trial]]
+    assert not [*repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")]
 
 
 # ---------------------------------------------------------------- what is wrong

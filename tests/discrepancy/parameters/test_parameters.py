@@ -10,7 +10,7 @@ from calibration.result.file import load_calibration, result_bytes, save_calibra
 from calibration.result.record import ParameterPrior
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import published_measurements
-from calibration.static.stiffness_curve import stiffness_curve_of
+from calibration.static.posterior import stiffness_curve_of
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.model_choice import ModelChoice, ModelKind, choose_model

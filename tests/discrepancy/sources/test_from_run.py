@@ -45,7 +45,7 @@ def campaign(run):
 
 @pytest.fixture(scope="module")
 def model(run):
-    return run_model(run)
+    return run_model(run)[0]
 
 
 def tree_of(folder):
@@ -116,7 +116,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path):
     )  # fmt: skip
     folder = tmp_path / "known"
     fly_mission(folder, 7, known, known, turns=4, draws=10)
-    tree, model = tree_of(folder), run_model(folder)
+    tree, model = tree_of(folder), run_model(folder)[0]
     campaign = run_campaign(folder, held_out_share=0.0)
     outputs, conditions = flown(model, tree)
     truth = np.asarray(tree["truth"]["strain"].values)  # of the FMU, which has the effects too
@@ -164,7 +164,7 @@ def test_a_mass_that_the_twin_does_not_know_is_found_in_the_run(tmp_path, mass):
     folder = tmp_path / "heavy"
     fly_mission(folder, 7, (PointMass(mass, 2.0),) if mass else (), turns=12)
     effects = chosen("point_mass", "inertia_relief")
-    found = investigate(run_campaign(folder), run_model(folder), effects, thorough=False)
+    found = investigate(run_campaign(folder), run_model(folder)[0], effects, thorough=False)
     if not mass:
         assert found.verdict.kind is VerdictKind.NOTHING_MISSING
         return

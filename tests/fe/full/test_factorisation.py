@@ -142,7 +142,7 @@ TERMS = _terms()
 WHOLE = affine_sum((1.0, 1.0, 1.0), TERMS)
 
 
-def test_sums_are_the_sums() -> None:
+def test_sums_are_the_sums():
     coefficients, vectors = np.array([(1.0, 0.0), (2.0, -1.0), (3.0, 0.5)]), np.eye(SIZE)[:, :2]
     wanted = [sum(c * term.toarray() for c, term in zip(own, TERMS, strict=True)) for own in coefficients.T]
     found = affine_product(TERMS, coefficients, vectors)
@@ -151,7 +151,7 @@ def test_sums_are_the_sums() -> None:
         np.testing.assert_allclose(affine_sum(coefficients[:, number], TERMS).toarray(), whole, atol=1e-13)
 
 
-def test_several_systems_are_solved_at_once_near_a_factorised_one_or_given_up(monkeypatch) -> None:
+def test_several_systems_are_solved_at_once_near_a_factorised_one_or_given_up(monkeypatch):
     factors, coefficients = (
         Factorisation(WHOLE),
         np.array([(1.0, 1.0, 0.3), (1.0, 1.0, 2.0), (1.0, 1.0, 1.0)]),
@@ -166,7 +166,7 @@ def test_several_systems_are_solved_at_once_near_a_factorised_one_or_given_up(mo
         solved_near(*given, tolerance=1e-12)
 
 
-def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_none() -> None:
+def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_none():
     stiffness, mass = DENSE @ DENSE.T + np.eye(30), np.diag(np.linspace(1.0, 2.0, 30))
     values, shapes = lowest_eigenpairs(sparse.csr_array(stiffness), sparse.csr_array(mass), 4)
     assert values == pytest.approx(eigh(stiffness, mass, eigvals_only=True)[:4], rel=1e-9)
@@ -177,7 +177,7 @@ def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_no
         lowest_eigenpairs(loose, sparse.eye_array(20).tocsr(), 3)
 
 
-def test_a_basis_holds_what_it_was_given_and_says_what_it_dropped() -> None:
+def test_a_basis_holds_what_it_was_given_and_says_what_it_dropped():
     """Blocks with copies, zeros and directions of all sizes: orthonormal, and the rest is below the bound."""
     rng = np.random.default_rng(5)
     basis, own = OrthonormalBasis(SIZE, drop=1e-8), rng.normal(size=(SIZE, 12))
@@ -199,7 +199,7 @@ def test_a_basis_holds_what_it_was_given_and_says_what_it_dropped() -> None:
     assert (nothing.vectors.shape, nothing.dropped_square) == ((SIZE, 0), 0.0)
 
 
-def test_a_basis_of_displacements_is_orthonormal_in_energy_with_its_terms_projected() -> None:
+def test_a_basis_of_displacements_is_orthonormal_in_energy_with_its_terms_projected():
     """Also with nearly dependent vectors; a load and its answer are whitened alike."""
     random, factors = np.random.default_rng(5), Factorisation(WHOLE)
     basis, first = ProjectedBasis(factors, TERMS, (WHOLE,), drop=1e-9), random.normal(size=(SIZE, 5))

@@ -31,7 +31,6 @@ from fe.reduction.settings import StructureSettings
 from fe.runtime import arrays as array_records
 from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign
 from tests.refusals import Inputs, refused
 
@@ -41,7 +40,7 @@ WHOLE = arrays_to_bytes({"a": np.arange(5)})
 
 
 @given(hnp.arrays(dtype=KINDS, shape=SHAPES))
-def test_archives_give_back_what_they_were_given(values: np.ndarray) -> None:
+def test_archives_give_back_what_they_were_given(values):
     content = arrays_to_bytes({"values": values, "text": np.array("µ"), "number": np.array(3.5)})
     with np.load(io.BytesIO(content), allow_pickle=False) as loaded:
         for arrays in (loaded, arrays_from_bytes(content, "It")):
@@ -50,7 +49,7 @@ def test_archives_give_back_what_they_were_given(values: np.ndarray) -> None:
             assert (str(arrays["text"]), arrays["number"].shape) == ("µ", ())
 
 
-def test_bytes_depend_on_the_arrays_only() -> None:
+def test_bytes_depend_on_the_arrays_only():
     values = np.arange(6.0).reshape(2, 3)
     first = arrays_to_bytes({"a": values, "b": values[0]})
     assert first == arrays_to_bytes({"b": values[0].copy(), "a": np.asfortranarray(values)})
@@ -67,7 +66,7 @@ def refuses(content: bytes, words: str = "not a sound archive of plain arrays") 
         arrays_from_bytes(content, "x.npz", ["a"])
 
 
-def test_every_truncation_flipped_byte_and_lock_is_noticed() -> None:
+def test_every_truncation_flipped_byte_and_lock_is_noticed():
     for length in range(0, len(WHOLE), 7):
         refuses(WHOLE[:length])
     for place in range(len(WHOLE)):
@@ -82,7 +81,7 @@ def test_every_truncation_flipped_byte_and_lock_is_noticed() -> None:
     refuses(bytes(locked), "password")
 
 
-def test_a_member_that_is_no_plain_array_is_one_sentence() -> None:
+def test_a_member_that_is_no_plain_array_is_one_sentence():
     for kind, shape in (
         ("'<f8'", "(1, "), ("'<f8'", "(-1,)"), ("'<f8'", "(4611686018427387904, 2)"),
         ("'<f8'", "(" + "9" * 5000 + ",)"), ("'|O'", "(1,)"), ("[" * 4000 + "]" * 4000, "(1,)"),
@@ -105,7 +104,7 @@ def kept(request: pytest.FixtureRequest) -> KeptArrays:
     return found
 
 
-def test_what_is_kept_comes_back_to_the_last_bit_or_is_refused(kept: KeptArrays, tmp_path) -> None:
+def test_what_is_kept_comes_back_to_the_last_bit_or_is_refused(kept, tmp_path):
     kind, path, content = type(kept), tmp_path / "kept.npz", kept.to_bytes()
     path.write_bytes(content)
     again = kind.load(path)
@@ -127,7 +126,7 @@ def test_what_is_kept_comes_back_to_the_last_bit_or_is_refused(kept: KeptArrays,
 @pytest.mark.parametrize(
     "value", [np.array(1.0), np.array("a"), np.zeros(5), np.zeros(0), np.zeros((0, 0, 0)), np.array(1j)]
 )
-def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray, monkeypatch) -> None:
+def test_arrays_of_a_wrong_kind_are_refused(kept, value, monkeypatch):
     arrays = arrays_from_bytes(kept.to_bytes(), "it")
     for item in fields(kept):
         if item.type is str or (arrays[item.name].shape == value.shape == () and value.dtype.kind == "f"):
@@ -149,9 +148,7 @@ SPOILT: dict[str, Callable[[Any], Any]] = {
 
 
 @pytest.mark.parametrize(("name", "how", "sentence"), Inputs(__file__).refused("values"))
-def test_values_that_cannot_be_are_refused(
-    coarse_fields: ReducedModel, coarse_patch_arrays, name: str, how: str, sentence: str
-) -> None:
+def test_values_that_cannot_be_are_refused(coarse_fields, coarse_patch_arrays, name, how, sentence):
     kept = coarse_fields if hasattr(coarse_fields, name) else coarse_patch_arrays
     with refused(ReducedModelFileError, sentence):
         replace(kept, **{name: SPOILT[how](getattr(kept, name))})
@@ -184,7 +181,7 @@ def builds(monkeypatch: pytest.MonkeyPatch, coarse_fields, coarse_patch_arrays) 
     return built
 
 
-def test_cache_lies_where_the_user_says(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_lies_where_the_user_says(own_cache, monkeypatch):
     assert cache_folder() == own_cache
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert cache_folder() == Path.home() / ".cache" / "uav-twin"
@@ -192,7 +189,7 @@ def test_cache_lies_where_the_user_says(own_cache: Path, monkeypatch: pytest.Mon
 
 def test_what_is_unchanged_is_built_once_and_what_is_changed_anew(
     builds, coarse_design, shipped_design, monkeypatch
-) -> None:
+):
     first, again, wing = (
         make(coarse_design.changed()) for make in (reduced_model, reduced_model, wing_fields)
     )
@@ -215,7 +212,7 @@ def test_what_is_unchanged_is_built_once_and_what_is_changed_anew(
     ("kind", "make"), [("wing", reduced_model), ("fields", wing_fields), ("patches", patch_arrays)]
 )
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "missing"])
-def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, kind, make, damage: str) -> None:
+def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, kind, make, damage):
     good, path = make(coarse_design).to_bytes(), entry(kind, coarse_design.hash, None)
     content = bytearray(path.read_bytes())
     if damage == "flipped":
@@ -229,15 +226,13 @@ def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, kind, make, 
     assert len(builds) == 1 + (kind != "wing")  # the model alone is among the fields
 
 
-def test_many_at_once_build_once_and_agree(builds: list[str], coarse_design: WingDesign) -> None:
+def test_many_at_once_build_once_and_agree(builds, coarse_design):
     with ThreadPoolExecutor(6) as threads:
         results = list(threads.map(lambda _: reduced_model(coarse_design).to_bytes(), range(6)))
     assert len(set(results)) == len(builds) == 1
 
 
-def test_failed_build_keeps_nothing_and_the_next_succeeds(
-    builds, coarse_design, own_cache, monkeypatch
-) -> None:
+def test_failed_build_keeps_nothing_and_the_next_succeeds(builds, coarse_design, own_cache, monkeypatch):
     def failing(*_: object) -> WingFields:
         raise KeyboardInterrupt
 
@@ -252,14 +247,14 @@ def test_failed_build_keeps_nothing_and_the_next_succeeds(
 
 def test_without_a_place_to_keep_it_the_model_is_still_given(
     builds, coarse_design, tmp_path, monkeypatch, caplog
-) -> None:
+):
     (tmp_path / "a file").write_text("not a folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a file"))
     assert reduced_model(coarse_design).design_hash == coarse_design.hash
     assert "could not be kept" in caplog.text
 
 
-def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
+def test_every_file_that_shapes_the_model_counts_for_the_key():
     code = "import sys, fe.reduction.patch_basis; print(*(n for n in sys.modules if n.startswith('fe.')))"
     words = [sys.executable, "-c", code]
     result = subprocess.run(words, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
@@ -269,9 +264,7 @@ def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_real_build_is_reproducible_in_any_number_of_threads(
-    coarse_design, coarse_fields, own_cache
-) -> None:
+def test_a_real_build_is_reproducible_in_any_number_of_threads(coarse_design, coarse_fields, own_cache):
     with threadpool_limits(2):
         wing = wing_fields(coarse_design)
     assert wing.to_bytes() == coarse_fields.to_bytes()
@@ -298,7 +291,7 @@ def theirs(path: Path, began: Any, finish: Any) -> None:
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_a_wait_is_said_and_ends_with_the_other(tmp_path: Path, caplog, killed: bool) -> None:
+def test_a_wait_is_said_and_ends_with_the_other(tmp_path, caplog, killed):
     """With what it made, or, where it was killed, with what is made here."""
     path, context = tmp_path / "cache" / "model.npz", multiprocessing.get_context("spawn")
     began, finish = context.Event(), context.Event()
@@ -311,7 +304,7 @@ def test_a_wait_is_said_and_ends_with_the_other(tmp_path: Path, caplog, killed: 
     other.join(60.0)
 
 
-def test_a_full_disk_stops_no_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_stops_no_build(tmp_path, monkeypatch):
     def full(handle: int, content: bytes, at: int) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -128,7 +128,7 @@ def warm(both: Compared, coefficient: float, e: float = STATE[0], loss: Any = ST
         *((warm, given) for given in ((2e-3,), (0.0, *SOUND), (0.0, 0.95, (0.6, 0.3)))),
     ],
 )
-def test_a_change_of_the_structure_is_that_of_the_full_model(both: Compared, change: Any, given: Any) -> None:
+def test_a_change_of_the_structure_is_that_of_the_full_model(both, change, given):
     """Under the lift of 2.5 g and under a force at the tip, and in the first three modes."""
     structure, operators, stiffness, masses = change(both, *given)
     stiffness = operators.stiffness(FACTOR, STATE[1]) if stiffness is None else stiffness
@@ -157,7 +157,7 @@ def finer(both: Compared) -> AffineOperators:
         (0.5, 0.6, 0.5),
     ],
 )
-def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, start, end, loss) -> None:
+def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, start, end, loss):
     lines = finer.wing_mesh.span_lines
     start, end = (float(lines[np.abs(lines - place).argmin()]) for place in (start, end))
     matrices = finer.stiffness(), both.softened(finer, start, end, loss)
@@ -179,7 +179,7 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, st
     assert found - 1.0 == pytest.approx(effect - 1.0, rel=0.05)
 
 
-def test_strips_make_the_skin_and_losses_that_overlap_multiply(both: Compared) -> None:
+def test_strips_make_the_skin_and_losses_that_overlap_multiply(both):
     everywhere = both.structure(LocalStiffnessLoss(0.25, 0.0, both.wing.span), state=SOUND).stiffness
     skin = np.tensordot((0.75, 0.75, 0.75, 1.0), both.arrays.stiffness, 1)
     assert np.abs(everywhere - skin).max() < 1e-6 * np.abs(skin).max()
@@ -252,7 +252,7 @@ def relieved(both: Compared, fraction: float) -> tuple[FloatArray, FloatArray]:
         (relieved, (0.2,)),
     ],
 )
-def test_a_change_of_the_loads_is_that_of_the_full_model(both: Compared, change: Any, given: Any) -> None:
+def test_a_change_of_the_loads_is_that_of_the_full_model(both, change, given):
     reduced, full = change(both, *given)
     u, solution = both.structure().static(reduced), both.factors.solve(full)
     both.alike(u, solution, both.operators)
@@ -264,7 +264,7 @@ def test_a_change_of_the_loads_is_that_of_the_full_model(both: Compared, change:
 
 
 @pytest.mark.parametrize("degrees", [-15.0, 8.0, 90.0])
-def test_a_turned_gauge_follows_from_the_three_components(both: Compared, degrees: float) -> None:
+def test_a_turned_gauge_follows_from_the_three_components(both, degrees):
     angle, full = np.deg2rad(degrees), both.factors.solve(both.operators.load_lift)
     wanted = gauge_output(both.mesh, angle) @ (both.operators.expansion @ full)
     along, across, shear = both.arrays.strain_rows @ both.structure().static(both.load(1.0))
@@ -273,7 +273,7 @@ def test_a_turned_gauge_follows_from_the_three_components(both: Compared, degree
     assert np.abs(c * c * along + s * s * across + s * c * shear - wanted).max() <= STRAIN * scale
 
 
-def test_outputs_and_places_by_name(both: Compared) -> None:
+def test_outputs_and_places_by_name(both):
     wing, elastic = both.wing, float(both.arrays.line_chord[0])
     u = both.structure().static(both.load(1.0))
     tip, there = wing.output_row("tip_displacement"), wing.output_row(f"displacement[{wing.span}, {elastic}]")
@@ -290,7 +290,7 @@ def test_outputs_and_places_by_name(both: Compared) -> None:
 
 
 @pytest.mark.parametrize(("kind", "values", "sentence"), Inputs(__file__).refused("wing"))
-def test_what_cannot_be_is_refused(both: Compared, kind: str, values: Any, sentence: str) -> None:
+def test_what_cannot_be_is_refused(both, kind, values, sentence):
     item = patch.PRIMITIVES[kind](*values)
     with refused(InvalidPatchError, sentence):
         _ = both.structure(item, temperature=10.0).answers
@@ -298,7 +298,7 @@ def test_what_cannot_be_is_refused(both: Compared, kind: str, values: Any, sente
         both.wing.force_row("nose")
 
 
-def test_shares_of_the_area_integrate_a_parabola_on_each_cell() -> None:
+def test_shares_of_the_area_integrate_a_parabola_on_each_cell():
     stations = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
     # mean of y^2 with chord 2 - y: (2/3 - 1/4) / 1.5
     mean = area_shares(stations, 2.0, 1.0) @ stations**2

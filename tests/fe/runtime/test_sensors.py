@@ -36,7 +36,7 @@ def shown(*primitives, record=RECORD, **more):
     return applied(ModelPatch(primitives), record, VALUES, RATES, **more)
 
 
-def test_nothing_without_sensors_touches_the_input() -> None:
+def test_nothing_without_sensors_touches_the_input():
     mass, clock = patch.PointMass(0.1, 0.2), Clock(0.1, 0.0)
     values, rates = shown(mass, clock)
     assert values is VALUES
@@ -44,7 +44,7 @@ def test_nothing_without_sensors_touches_the_input() -> None:
     assert sensors.clock_of(ModelPatch((Clock(0.1, 0.5), Clock(0.2, -0.1)))) == pytest.approx((0.3, 0.4))
 
 
-def test_order_of_sensors_matters() -> None:
+def test_order_of_sensors_matters():
     gain, drift = SensorGain("g0", 0.5), SensorDrift("g0", 2e-3, 100.0)
     added, (first, _), (last, rates) = 2e-3 * (100.0 + TIME) / 100.0, shown(gain, drift), shown(drift, gain)
     assert first[:, 1] == pytest.approx(1.5 * VALUES[:, 1] + added)
@@ -54,7 +54,7 @@ def test_order_of_sensors_matters() -> None:
 
 
 @pytest.mark.parametrize(("kind", "given", "trial", "changed"), CHANNELS_SEEN)
-def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, trial, changed) -> None:
+def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, trial, changed):
     item = patch.PRIMITIVES[kind](*given)
     values = shown(item, record=replace(RECORD, kind=trial))[0]
     assert np.flatnonzero(np.any(values != VALUES, axis=0)).tolist() == changed
@@ -62,7 +62,7 @@ def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, tri
         assert values[:, changed] == pytest.approx(VALUES[:, changed] + 1e-3)
 
 
-def test_drift_by_kind_of_trial_and_exponent() -> None:
+def test_drift_by_kind_of_trial_and_exponent():
     drifted = shown(SensorDrift("tip", 1.0, 50.0), record=replace(STATIC, time=100.0 * TIME))[0][:, 0]
     assert drifted == pytest.approx(VALUES[:, 0] + 2.0 * TIME)
     values, rates = shown(SensorDrift("tip", 1.0, 2.0, 0.5), record=replace(RECORD, start=0.0))
@@ -72,9 +72,7 @@ def test_drift_by_kind_of_trial_and_exponent() -> None:
 
 @given(st.floats(-1.5, 1.5), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 @settings(max_examples=60)
-def test_rotation_is_that_of_the_strain_tensor(
-    angle: float, along: float, across: float, gamma: float
-) -> None:
+def test_rotation_is_that_of_the_strain_tensor(angle, along, across, gamma):
     tensor = np.array([[along, gamma / 2.0], [gamma / 2.0, across]])
     direction = np.array([np.cos(angle), np.sin(angle)])
     record = SensorRecord((("g", "strain"),), "static", np.zeros(1), 0.0, np.zeros(1))
@@ -85,7 +83,7 @@ def test_rotation_is_that_of_the_strain_tensor(
     assert values[0, 0] == pytest.approx(2.0 * direction @ tensor @ direction, abs=1e-12)
 
 
-def test_rotation_needs_components_and_has_rates() -> None:
+def test_rotation_needs_components_and_has_rates():
     turn = SensorRotation("g0", 0.2)
     values, rates = shown(turn, transverse=-0.3 * VALUES, shear=0.1 * VALUES)
     factor = np.cos(0.2) ** 2 - 0.3 * np.sin(0.2) ** 2 + 0.1 * np.sin(0.2) * np.cos(0.2)
@@ -93,7 +91,7 @@ def test_rotation_needs_components_and_has_rates() -> None:
     assert rates[1:-1, 1] == pytest.approx(factor * RATES[1:-1, 1], abs=1e-6)
 
 
-def test_lines_run_with_the_trial() -> None:
+def test_lines_run_with_the_trial():
     wave = (0.3 + 0.4j) * np.exp(100j * np.pi * TIME)
     assert shown(patch.Line("tip", 50.0, 0.3, -0.4))[0][:, 0] - VALUES[:, 0] == pytest.approx(
         wave.real, abs=1e-12
@@ -107,7 +105,7 @@ def test_lines_run_with_the_trial() -> None:
 
 
 @pytest.mark.parametrize(("kind", "given", "sentence"), INPUTS.refused("sensors"))
-def test_what_cannot_be_is_refused_in_one_sentence(kind: str, given, sentence: str) -> None:
+def test_what_cannot_be_is_refused_in_one_sentence(kind, given, sentence):
     item = ModelPatch((patch.PRIMITIVES[kind](*given),))
     with refused(InvalidPatchError, sentence):
         check_channels(item, CHANNELS)
@@ -120,7 +118,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(kind: str, given, sentence: s
 
 @pytest.mark.parametrize("order", [1.0, 2.0, 3.0])
 @pytest.mark.parametrize("held", [None, 0.0])
-def test_high_pass_against_an_integrator(order: float, held: float | None) -> None:
+def test_high_pass_against_an_integrator(order, held):
     times, signal, tau = np.arange(60) * 0.02, np.random.default_rng(2).normal(size=60), 0.11
 
     def slope(t: float, low: np.ndarray) -> np.ndarray:
@@ -138,7 +136,7 @@ def test_high_pass_against_an_integrator(order: float, held: float | None) -> No
 
 @given(st.floats(0.0, 4.0), st.floats(1e-4, 50.0))
 @settings(max_examples=80, deadline=None)
-def test_step_response_of_any_order(order: float, ratio: float) -> None:
+def test_step_response_of_any_order(order, ratio):
     expected, shown = (
         hyp1f1(order, 1.0, -ratio * np.arange(80)),
         high_pass(np.ones(80), ratio, 1.0, order, 0.0),
@@ -149,7 +147,7 @@ def test_step_response_of_any_order(order: float, ratio: float) -> None:
     assert far == pytest.approx(before * (1417.0 / 1417.9) ** 0.01, rel=1e-8)  # there it falls by a power
 
 
-def test_limits_of_the_high_pass() -> None:
+def test_limits_of_the_high_pass():
     signal = np.random.default_rng(3).normal(size=(50, 2))
     assert high_pass(signal, 0.01, 0.3, 0.0, 0.0) == pytest.approx(signal, abs=1e-12)
     assert high_pass(signal, 1e-3, 1e9, 1.0, 0.0) == pytest.approx(signal, abs=1e-9)
@@ -163,7 +161,7 @@ def test_limits_of_the_high_pass() -> None:
 
 
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
-def test_rates_through_the_high_pass(order: float) -> None:
+def test_rates_through_the_high_pass(order):
     item = HighPass("*", 0.4, order)
     values, rates = shown(item)
     assert rates[1:-1] == pytest.approx((values[2:] - values[:-2]) / 0.02, abs=2e-3 if order != 1.5 else 2e-2)
@@ -173,7 +171,7 @@ def test_rates_through_the_high_pass(order: float) -> None:
     assert np.array_equal(settled, VALUES)
 
 
-def test_a_high_pass_follows_uneven_stamps() -> None:
+def test_a_high_pass_follows_uneven_stamps():
     time = 0.01 * (np.arange(400) + 0.6 * np.random.default_rng(1).uniform(-0.5, 0.5, 400))
     time = np.delete(time - time[0], slice(133, 140))  # and a gap
     wave = 2.0 * np.pi * 1.3
@@ -203,7 +201,7 @@ STREAMED = ModelPatch(
 
 
 @pytest.mark.parametrize("kind", ["ringdown", "flight"])
-def test_samples_are_the_rows_of_the_whole_record(kind: str) -> None:
+def test_samples_are_the_rows_of_the_whole_record(kind):
     generator, count, dynamic = np.random.default_rng(3), 60, kind == "ringdown"
     values, across, shear = (1e-4 * generator.normal(size=(count, 3)) for _ in range(3))
     time, temperature = 0.01 * np.arange(count) + 4.0 * (not dynamic), generator.normal(size=count)

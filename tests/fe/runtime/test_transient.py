@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from fe.runtime.arrays import PLACE
 from fe.runtime.errors import InvalidStateError, OutsideModelError
 from fe.runtime.patch import ModelPatch, PowerStiffness
-from fe.runtime.patched_wing import HOLDING, PatchedWing
+from fe.runtime.patched_wing import HOLDING
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator, TransientState
@@ -29,7 +29,7 @@ def integrator(model: ReducedModel) -> ModalIntegrator:
 
 
 @pytest.mark.parametrize("beta", [0.0, BETA, 0.05])  # with 0.05 s all but the first mode are overdamped
-def test_loads_that_are_held_are_integrated_exactly(model: ReducedModel, beta: float) -> None:
+def test_loads_that_are_held_are_integrated_exactly(model, beta):
     integrator = wing_integrator(model, **{**HEALTHY, "damping_beta": beta})
     assert (integrator.damping_ratio[1:] > 1).all() == (beta == 0.05)
     omega = 2.0 * np.pi * integrator.modes.frequency
@@ -48,7 +48,7 @@ def test_loads_that_are_held_are_integrated_exactly(model: ReducedModel, beta: f
 
 
 @pytest.mark.parametrize("kind", ["wing", "beam"])
-def test_rest_is_the_static_response_and_stays(kind: str, model, beam_reduction, integrator) -> None:
+def test_rest_is_the_static_response_and_stays(kind, model, beam_reduction, integrator):
     values, motion = {"load_factor": 3.0, "tip_force": 5.0}, integrator
     if kind == "beam":
         model, values = beam_reduction.model, {"z1": 0.3, "pump": 0.07, "load_factor": 3.0, "push": 50.0}
@@ -61,7 +61,7 @@ def test_rest_is_the_static_response_and_stays(kind: str, model, beam_reduction,
         state = motion.advance(state, 0.7, load)
 
 
-def test_the_load_point_rests_where_its_compliance_puts_it(integrator, model: ReducedModel) -> None:
+def test_the_load_point_rests_where_its_compliance_puts_it(integrator, model):
     rest = integrator.point_displacement(integrator.at_rest((0.0, 7.0)), TIP_FORCE)
     assert rest == pytest.approx(7.0 / model.tip_stiffness(1.0), rel=1e-10)
     # 5 cm inboard of the tip, it moves less than the tip and in time with it
@@ -69,7 +69,7 @@ def test_the_load_point_rests_where_its_compliance_puts_it(integrator, model: Re
     assert 0.9 * 0.03 < integrator.point_displacement(released, TIP_FORCE) < 0.03
 
 
-def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
+def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     """Once the high modes have died away, strain, position and acceleration agree."""
     model, values = beam_reduction.model, {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 0.0}
     vector, let_go = (model.vector({**values, "push": push}) for push in (100.0, 0.0))
@@ -93,7 +93,7 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
 
-def test_a_released_wing_for_patches_moves_as_all_its_unknowns(coarse_patched_wing: PatchedWing) -> None:
+def test_a_released_wing_for_patches_moves_as_all_its_unknowns(coarse_patched_wing):
     """What its modes leave out fades as the damping has it, for a law as well."""
     vector = np.array((1.0, 0.0, 0.0, 0.169, 0.134, 1.0, 0.0))
     weak = PowerStiffness("tip", 1e-6, 1.0, 0, 1.0)  # which only tells where the tip is
@@ -112,7 +112,7 @@ def test_a_released_wing_for_patches_moves_as_all_its_unknowns(coarse_patched_wi
     assert np.all(error < 5e-3 * np.abs(structure.outputs @ held))
 
 
-def test_damage_in_flight_keeps_motion_and_changes_strain(model: ReducedModel, integrator) -> None:
+def test_damage_in_flight_keeps_motion_and_changes_strain(model, integrator):
     damaged = wing_integrator(model, **{**HEALTHY, "stiffness_loss": (0.4, 0.2)})
     for duration in (0.003, 0.05, 0.11):
         before = integrator.advance(integrator.released(0.03, (3.0, 0.0), TIP_FORCE), duration, (3.0, 0.0))
@@ -132,7 +132,7 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(model: ReducedModel, i
     np.testing.assert_allclose(taken.displacement, kept, atol=1e-9 * np.abs(kept).max())
 
 
-def test_bad_input_is_refused(model: ReducedModel, integrator: ModalIntegrator) -> None:
+def test_bad_input_is_refused(model, integrator):
     for values in ([], [1.0, 2.0, 3.0], [0.0, 0.0, np.nan, 0.0]):
         with pytest.raises(InvalidStateError, match="transient state of 2 modes needs"):
             TransientState.from_list(values, 2)

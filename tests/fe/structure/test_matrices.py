@@ -1,7 +1,6 @@
 """Structures from matrices: shells and beams against CalculiX, formats, closed forms, and what is refused."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +42,7 @@ def tables(free: list[int], forces: list[tuple[int, Point]], gauge: tuple[int, i
     ("build", "kind"),
     [(decks.stiffened_skin, "S8R"), (decks.stiffened_skin, "S4"), (decks.frame, "B32"), (decks.frame, "B31")],
 )
-def test_shells_and_beams_are_calculixs_own(build: Callable[..., decks.Deck], kind: str, tmp_path) -> None:
+def test_shells_and_beams_are_calculixs_own(build, kind, tmp_path):
     """Displacements, an extension, six frequencies, also in a state of which no matrix was made."""
     deck = build(kind)
     places = [*PARTS[build]]
@@ -102,7 +101,7 @@ def chain(tmp_path: Path):
     return lambda changes=None: assemble_structure(write_chain(tmp_path, changes))
 
 
-def test_a_chain_answers_as_by_hand(chain) -> None:
+def test_a_chain_answers_as_by_hand(chain):
     """Forces over springs: extensions add up; e = 2 is nominal, z1 takes from the middle spring alone."""
     structure = chain()
     found = static_responses(structure)
@@ -127,7 +126,7 @@ FORMATS = {  # in `inputs/chain` one of each two entries that mirror each other 
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_every_format_is_the_same_structure(kind: str, chain, tmp_path: Path) -> None:
+def test_every_format_is_the_same_structure(kind, chain, tmp_path):
     """Those that name nodes need no file of unknowns, and a part may name fewer of them."""
     wanted, changes = chain(), {}
     shutil.copytree(INPUTS.folder / "chain", tmp_path, dirs_exist_ok=True)
@@ -143,7 +142,7 @@ def test_every_format_is_the_same_structure(kind: str, chain, tmp_path: Path) ->
             assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
 
 
-def test_other_ways_to_say_the_same(chain, tmp_path: Path) -> None:
+def test_other_ways_to_say_the_same(chain, tmp_path):
     """A whole as a sum, a part as a difference, vectors in the order of the rows or by node and component."""
     wanted = chain()
     for name, matrix in (("rest", STIFFNESS - MIDDLE), ("soft", STIFFNESS - 0.75 * MIDDLE)):
@@ -170,7 +169,7 @@ def test_other_ways_to_say_the_same(chain, tmp_path: Path) -> None:
     np.testing.assert_allclose(found.mass().toarray(), wanted.mass().toarray(), rtol=1e-12, atol=1e-15)
 
 
-def test_a_support_holds_what_the_matrices_leave_free(chain) -> None:
+def test_a_support_holds_what_the_matrices_leave_free(chain):
     """A free chain is told which motion is free; held at its first node it is a spring and a mass."""
     free: dict[str, FloatArray | str] = {"k.mtx": STIFFNESS - np.diag([200.0, 0.0, 0.0])}
     words = r"leaves free, or nearly: 1; in one node \d, component 1 moves most\. Hold"
@@ -189,17 +188,17 @@ CHANGED = [({old: new}, sentence) for old, new, sentence in INPUTS.refused("chai
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [*CHANGED, *INPUTS.refused("chains")])
-def test_what_is_no_structure_is_refused_in_a_sentence(changes, sentence: str, chain) -> None:
+def test_what_is_no_structure_is_refused_in_a_sentence(changes, sentence, chain):
     with refused(FiniteElementError, sentence):
         chain(changes)
 
 
-def test_a_mesh_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
+def test_a_mesh_is_asked_for_where_one_is_needed(tmp_path):
     with refused(FiniteElementError, "is a structure from matrices: without a mesh"):
         load_and_assemble(write_chain(tmp_path))
 
 
-def test_the_hash_is_of_the_content_of_every_file(chain, tmp_path: Path) -> None:
+def test_the_hash_is_of_the_content_of_every_file(chain, tmp_path):
     first = chain().design_hash
     assert chain().design_hash == first
     assert set(load_structure(tmp_path / "chain.toml").files) == set(FILES)

@@ -64,7 +64,7 @@ def refuses(path: Path, sentence: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("file_format", ["vtu", "gmsh", "gmsh22", "abaqus", "nastran", "med"])
-def test_formats_agree(kind: str, file_format: str, box, tmp_path: Path) -> None:
+def test_formats_agree(kind, file_format, box, tmp_path):
     """MED counts the nodes of a cell as seen in a mirror; its families are of several groups."""
     points, cells = box(kind, (2, 1, 1))
     ending = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp", "nastran": "bdf"}.get(file_format, file_format)
@@ -90,7 +90,7 @@ def test_formats_agree(kind: str, file_format: str, box, tmp_path: Path) -> None
         np.testing.assert_allclose(found.nodes, 1e-3 * points[cells], atol=1e-12)
 
 
-def test_physical_groups_of_gmsh_are_sets(box, tmp_path: Path) -> None:
+def test_physical_groups_of_gmsh_are_sets(box, tmp_path):
     """An element of two groups, which version 2 writes again for each, counts once."""
     points, cells = box("tetra10", (2, 1, 1))
     faces = [[cell[n] for n in face] for cell in cells.tolist() for face in KINDS["tetra10"].face_nodes]
@@ -115,7 +115,7 @@ def test_physical_groups_of_gmsh_are_sets(box, tmp_path: Path) -> None:
     refuses(tmp_path / "m.vtu", r"m\.vtu: 2 elements, such as 13, have the nodes of another")
 
 
-def test_arrays_of_a_vtu_that_are_sets(box, tmp_path: Path) -> None:
+def test_arrays_of_a_vtu_that_are_sets(box, tmp_path):
     """As meshio writes sets, and as a mask of zeros and ones; the values keep their names."""
     points, cells = box("hexahedron", (2, 1, 1))
     root = np.flatnonzero(points[:, 0] == 0.0)
@@ -138,7 +138,7 @@ def test_arrays_of_a_vtu_that_are_sets(box, tmp_path: Path) -> None:
     assert sets["part"].tolist() == sets["set"].tolist() == [1, 2, 3]
 
 
-def test_other_files_that_cannot_be_read_are_refused(box, tmp_path: Path, capsys) -> None:
+def test_other_files_that_cannot_be_read_are_refused(box, tmp_path, capsys):
     refuses(tmp_path / "none.msh", "is not there")
     refuses(tmp_path, "is a folder; `mesh` must name it as seen")
     for name, content, words in INPUTS.refused("files"):
@@ -162,7 +162,7 @@ def test_other_files_that_cannot_be_read_are_refused(box, tmp_path: Path, capsys
 # ---------------------------------------------------------------- decks
 
 
-def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
+def test_a_deck_is_read_with_its_sets(tmp_path):
     mesh = written(tmp_path / "m.inp", CUBES, "*SURFACE, NAME=sides", "10, S3", "10, S5")
     assert mesh.cell_numbers.tolist() == [10, 20]
     assert mesh.cells_of("BODY", "here").tolist() == [0, 1]
@@ -182,16 +182,14 @@ def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
     ("name", "old", "new", "sentence"),
     [(name, *row) for name in ("cubes.inp", "tetrahedron.bdf") for row in INPUTS.refused(name.split(".")[0])],
 )
-def test_a_fault_of_a_deck_is_said_with_its_line(
-    name: str, old: str, new: str, sentence: str, tmp_path: Path
-) -> None:
+def test_a_fault_of_a_deck_is_said_with_its_line(name, old, new, sentence, tmp_path):
     path = tmp_path / f"m.{name[-3:]}"
     path.write_text(INPUTS.text(name, (old, new)))
     refuses(path, sentence)
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_a_word_is_read_or_harmless_or_refused_or_told(dialect: str, tmp_path: Path) -> None:
+def test_a_word_is_read_or_harmless_or_refused_or_told(dialect, tmp_path):
     """What must not be lost is refused with what it does and what to do; what is unknown is told."""
     words, (name, lines) = words_of(dialect), DIALECTS[dialect]
     assert not words.harmless & words.refused.keys()
@@ -205,7 +203,7 @@ def test_a_word_is_read_or_harmless_or_refused_or_told(dialect: str, tmp_path: P
             written(tmp_path / name, *lines, f"{words.mark}{word.lower()}, 1", "1, 2, 3")
 
 
-def test_decks_that_include_others(tmp_path: Path) -> None:
+def test_decks_that_include_others(tmp_path):
     for name, include, count in (("m.inp", "*INCLUDE, INPUT=", 5), ("m.bdf", "BEGIN BULK\ninclude ", 4)):
         lines = SOLID if name == "m.inp" else TETRAHEDRON
         (tmp_path / f"part{name}").write_text("\n".join(lines[:count]))
@@ -217,7 +215,7 @@ def test_decks_that_include_others(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["R", "C", "S"])
 @pytest.mark.parametrize("form", [1, 2])
-def test_grid_points_of_any_coordinate_system(kind: str, form: int, box, tmp_path: Path) -> None:
+def test_grid_points_of_any_coordinate_system(kind, form, box, tmp_path):
     """The system stands on another one that is shifted and turned; its grid points come before it."""
     points, cells = box("hexahedron20", (2, 1, 1))
     axes = TURN.as_matrix().T
@@ -244,7 +242,7 @@ def test_grid_points_of_any_coordinate_system(kind: str, form: int, box, tmp_pat
     assert mesh.remarks == ()
 
 
-def test_real_numbers_and_lines_of_nastran(tmp_path: Path) -> None:
+def test_real_numbers_and_lines_of_nastran(tmp_path):
     """Exponents without E, fields of 8 and 16, lines that go on by a comma, a marker or a blank.
 
     Bulk data may stand alone, as Gmsh writes it; the property of an element is its set.
@@ -260,7 +258,7 @@ def test_real_numbers_and_lines_of_nastran(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["R", "C"])
-def test_nodes_of_abaqus_in_a_system_of_their_own(kind: str, box, tmp_path: Path) -> None:
+def test_nodes_of_abaqus_in_a_system_of_their_own(kind, box, tmp_path):
     points, cells = box("tetra10", (1, 1, 1))
     axes = TURN.as_matrix().T
     system = np.concatenate((ORIGIN, ORIGIN + 2.0 * axes[0], ORIGIN + axes[1] + axes[0])).tolist()
@@ -310,7 +308,7 @@ HOSTILE = {f"many {mark}": mark * LONG for mark in 'a1,"['} | {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_a_long_text_is_read_or_refused(what: str, tmp_path: Path) -> None:
+def test_a_long_text_is_read_or_refused(what, tmp_path):
     """None of these takes a time that grows with the square of its length."""
     errors = TableErrors(DesignFileError, InvalidDesignError)
     for parse, last in ((parse_toml, DesignFileError), (parse_json, DesignFileError), (parse_table, errors)):
@@ -333,12 +331,12 @@ MUCH = {
 
 
 @pytest.mark.parametrize("what", MUCH)
-def test_short_lines_that_ask_for_much_are_read_or_refused(what: str, tmp_path: Path) -> None:
+def test_short_lines_that_ask_for_much_are_read_or_refused(what, tmp_path):
     (tmp_path / "m.inp").write_text(INPUTS.text("tetrahedron.inp") + "\n".join(MUCH[what]))
     check(partial(read_mesh, tmp_path / "m.inp", 1.0, "m"), MeshError)
 
 
-def test_a_chain_of_coordinate_systems_ends(tmp_path: Path) -> None:
+def test_a_chain_of_coordinate_systems_ends(tmp_path):
     rows = [f"CORD2R,{n},{n + 1},0.,0.,0.,0.,0.,1.\n,1.,0.,0." for n in range(1, 3000)]
     (tmp_path / "m.bdf").write_text("\n".join([*rows, "GRID,1,1,0.,0.,0."]))
     refuses(tmp_path / "m.bdf", "rests on itself, or on too many others")

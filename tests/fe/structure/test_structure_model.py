@@ -54,7 +54,7 @@ def distorted(
 
 
 @pytest.mark.parametrize("name", SKFEM)
-def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box) -> None:
+def test_element_arrays_are_those_of_scikit_fems_forms(name, box):
     (points, cells), kind = box(name, (1, 1, 1)), KINDS[name]
     points = points + 0.1 * points[:, [1, 2, 0]]  # sheared: straight, and no two edges alike
     corners = len(kind.corners)
@@ -81,7 +81,7 @@ def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box) -> None:
     assert scalar == pytest.approx(theirs @ mass @ theirs, rel=1e-12)
 
 
-def test_patch_test_and_gauges(distorted: StructureMesh) -> None:
+def test_patch_test_and_gauges(distorted):
     gradient = 1e-3 * np.array([[1.0, 2.0, -0.5], [0.3, -1.5, 0.8], [0.6, -0.2, 0.9]])
     exact = distorted.points @ gradient.T
     elasticity = np.linalg.inv(assembly.isotropic_compliance(7e10, 0.3))
@@ -105,7 +105,7 @@ def test_patch_test_and_gauges(distorted: StructureMesh) -> None:
         assert strain == pytest.approx(along @ gradient @ along, rel=1e-10)
 
 
-def test_faces_enclose_the_volume(distorted: StructureMesh) -> None:
+def test_faces_enclose_the_volume(distorted):
     normal = face_areas(distorted, distorted.boundary)[0]
     np.testing.assert_allclose(normal.sum(axis=0), 0.0, atol=1e-13)
     # Gauss: the integral of x . n over the surface is three volumes.
@@ -113,7 +113,7 @@ def test_faces_enclose_the_volume(distorted: StructureMesh) -> None:
     assert face_areas(distorted, distorted.boundary)[1].sum() == pytest.approx(2 * (2.0 + 0.5 + 1.0))
 
 
-def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted: StructureMesh, box) -> None:
+def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted, box):
     points, cells = box(distorted.kind.file_type, (1, 1, 1))
     mass = assembly.CellMesh(distorted.kind, points, cells).mass(np.arange(len(cells)), 1.0)
     power = np.array(PRODUCTS[distorted.kind.file_type])
@@ -121,7 +121,7 @@ def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted: Stru
     assert field @ (mass @ field) == pytest.approx((1.0 / (2.0 * power + 1.0)).prod())
 
 
-def test_a_point_inside_is_found_and_one_outside_on_the_surface(distorted: StructureMesh) -> None:
+def test_a_point_inside_is_found_and_one_outside_on_the_surface(distorted):
     size, random = np.array([1.0, 2.0, 0.5]), np.random.default_rng(1)
     for number, point in enumerate(random.random((12, 3)) * size):
         cell, local = attach(distorted, point, "here")
@@ -208,7 +208,7 @@ def ring_of(made: Callable[..., Structure], kind: str, count: int) -> Structure:
         ("wedge15", 3.5, 1e-4),
     ],
 )
-def test_a_thick_ring_under_pressure_converges_to_lame(kind: str, order: float, error: float, made) -> None:
+def test_a_thick_ring_under_pressure_converges_to_lame(kind, order, error, made):
     # Lame: u(a) = (1 + nu) p a ((1 - 2 nu) a^2 + b^2) / (E (b^2 - a^2)) in plane strain.
     wanted = 1.3 * 1e6 * (0.4 * INNER**2 + OUTER**2) / (1e9 * (OUTER**2 - INNER**2))
     mass = 1000.0 * 0.1 * 0.25 * np.pi * (OUTER**2 - INNER**2)
@@ -228,7 +228,7 @@ def test_a_thick_ring_under_pressure_converges_to_lame(kind: str, order: float, 
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_the_field_of_every_kind_is_written(kind: str, made, tmp_path: Path) -> None:
+def test_the_field_of_every_kind_is_written(kind, made, tmp_path):
     structure = ring_of(made, kind, 2)
     write_structure_vtu(tmp_path / "field.vtu", structure)
     found = read_mesh(tmp_path / "field.vtu", 1.0, "m")
@@ -236,7 +236,7 @@ def test_the_field_of_every_kind_is_written(kind: str, made, tmp_path: Path) -> 
     np.testing.assert_array_equal(found.cells, structure.mesh.cells)
 
 
-def test_a_cantilever_has_the_figures_of_a_beam(made) -> None:
+def test_a_cantilever_has_the_figures_of_a_beam(made):
     structure, length, second = made("cantilever"), 1.0, 0.06 * 0.01**3 / 12.0
     stiffness, area_mass = 7e10 * second, 2700.0 * 0.06 * 0.01
     found = static_responses(structure)
@@ -262,7 +262,7 @@ def test_a_cantilever_has_the_figures_of_a_beam(made) -> None:
     assert abs(structure.acceleration_output - structure.displacement_output).max() == 0.0
 
 
-def test_terms_make_what_a_changed_file_makes(made) -> None:
+def test_terms_make_what_a_changed_file_makes(made):
     structure = made("cantilever")
     assert [(term.parameter, term.region) for term in structure.stiffness_terms] == [("e", "z1"), ("e", None)]
     outer = '[[set]]\nname = "outer"\nof = "cells"\nbox = [[250, 0, 0], [1000, 60, 10]]\n[[material]]\n'
@@ -288,7 +288,7 @@ def test_terms_make_what_a_changed_file_makes(made) -> None:
             ask(wrong)
 
 
-def test_a_rigid_root_on_springs_shifts_and_turns(made) -> None:
+def test_a_rigid_root_on_springs_shifts_and_turns(made):
     """The whole is statically determinate: what the springs add to the bending is F / k and F L^2 / k_r."""
     held = static_responses(made("cantilever"))
     structure = made(
@@ -304,7 +304,7 @@ def test_a_rigid_root_on_springs_shifts_and_turns(made) -> None:
     np.testing.assert_allclose(fixed["weight"].displacement, held["weight"].displacement, rtol=1e-9)
 
 
-def test_a_gauge_reads_the_mean_over_its_area(made) -> None:
+def test_a_gauge_reads_the_mean_over_its_area(made):
     """Of u = x y^2, which the 20-node cell holds exactly: the mean of y^2 over ten strips of the width."""
     structure = made("strip")
     field = np.zeros_like(structure.mesh.points)
@@ -315,13 +315,13 @@ def test_a_gauge_reads_the_mean_over_its_area(made) -> None:
         made("strip", ("width = 0.6", "width = 1.2"))
 
 
-def test_an_orthotropic_material_follows_its_axes(made) -> None:
+def test_an_orthotropic_material_follows_its_axes(made):
     # Axis 1 along z, axis 2 along x, axis 3 along y.
     wanted = 1e6 * np.array([1.0, -0.3, -0.25]) / 1.3e11
     np.testing.assert_allclose(static_responses(made("ply"))["p"].strain, wanted, rtol=1e-9)
 
 
-def test_an_orthotropic_material_is_softer_between_its_axes() -> None:
+def test_an_orthotropic_material_is_softer_between_its_axes():
     # Jones (1999), eq. 2.97: 1 / E_x = c^4 / E_1 + (1 / G_12 - 2 nu_12 / E_1) s^2 c^2 + s^4 / E_2.
     c, s = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
     ply = Material(
@@ -332,7 +332,7 @@ def test_an_orthotropic_material_is_softer_between_its_axes() -> None:
     assert np.linalg.inv(ply.elasticity)[0, 0] == pytest.approx(wanted, rel=1e-12)
 
 
-def test_memory_is_estimated(made) -> None:
+def test_memory_is_estimated(made):
     assert 0.3 * 2**30 < memory_estimate(made("cantilever").mesh) < 0.5 * 2**30
 
 
@@ -341,7 +341,7 @@ def test_memory_is_estimated(made) -> None:
     ("kind", "changes"),
     [*((kind, ()) for kind in ("tetra", "hexahedron", *CURVED)), ("hexahedron", ON_SPRINGS)],
 )
-def test_both_codes_agree(kind: str, changes: tuple[tuple[str, str], ...], made, tmp_path: Path) -> None:
+def test_both_codes_agree(kind, changes, made, tmp_path):
     """The last one stands on a rigid flange, which the push and two gauges near it load, on springs."""
     parts = (4, 2, 1 if kind in CURVED else 2)
     deck = structure_deck(made("body", *changes, kind=kind, parts=parts, mass_as_stiffness=True))
@@ -355,7 +355,7 @@ def test_both_codes_agree(kind: str, changes: tuple[tuple[str, str], ...], made,
     assert found.modal < 1e-6
 
 
-def test_wedges_cannot_be_compared(made) -> None:
+def test_wedges_cannot_be_compared(made):
     with pytest.raises(errors.CalculixError, match=r"integrates 6-node wedges \(C3D6\) in another way"):
         structure_deck(made("body", kind="wedge"))
 
@@ -363,7 +363,7 @@ def test_wedges_cannot_be_compared(made) -> None:
 # ---------------------------------------------------------------- its file
 
 
-def test_the_file_without_a_fault_is_taken(made) -> None:
+def test_the_file_without_a_fault_is_taken(made):
     structure = made("plate")
     assert set(static_responses(structure)) == {"weight", "push"}
     assert structure.unknowns == 24
@@ -376,12 +376,12 @@ def test_the_file_without_a_fault_is_taken(made) -> None:
     ("name", "old", "new", "sentence"),
     [(name, *row) for name in ("plate", "cantilever") for row in INPUTS.refused(name)],
 )
-def test_a_fault_is_one_sentence(name: str, old: str, new: str, sentence: str, made) -> None:
+def test_a_fault_is_one_sentence(name, old, new, sentence, made):
     with refused(errors.FiniteElementError, sentence):
         made(name, (old, new))
 
 
-def test_parts_that_turn_on_a_hinge_cannot_be_solved(box, write) -> None:
+def test_parts_that_turn_on_a_hinge_cannot_be_solved(box, write):
     """Two cubes share one edge only: no check of sets sees it, the factorisation does."""
     points, (cube,) = box("hexahedron", (1, 1, 1))
     places = np.concatenate((points[cube], points[cube] + (1.0, 1.0, 0.0)))
@@ -391,7 +391,7 @@ def test_parts_that_turn_on_a_hinge_cannot_be_solved(box, write) -> None:
         static_responses(load_and_assemble(file))
 
 
-def test_a_rosette_is_gauges_at_one_point(made) -> None:
+def test_a_rosette_is_gauges_at_one_point(made):
     """Its strains are those of one plane strain state; beside gauges of their own they come last."""
     structure = made("plate")
     assert structure.gauges == ("a", "r_a", "r_b", "r_c", "r_d")

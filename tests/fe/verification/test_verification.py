@@ -1,7 +1,6 @@
 """Balances of the wing, and the wing against CalculiX on a coarse mesh; its input and parsers without it."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,9 +61,7 @@ PLACES = {"nodal displacements": 1e-5, "displacement outputs": 1e-5, "strains at
     ],
     ids=["healthy", "damaged", "with a rod and no wall at its nose", "other masses"],
 )
-def test_statics_and_frequencies_agree(
-    state, changes, count: int, coarse_design, coarse_operators, tmp_path
-) -> None:
+def test_statics_and_frequencies_agree(state, changes, count, coarse_design, coarse_operators, tmp_path):
     wing = assemble(coarse_design.changed(**changes)) if changes else coarse_operators
     found = comparison.agreement(wing_deck(wing, state), tmp_path, count)
     assert list(found.loads) == ["tip force", "lift"]
@@ -76,12 +73,12 @@ def test_statics_and_frequencies_agree(
 
 
 @needs_calculix
-def test_an_input_that_calculix_refuses_is_one_sentence(tmp_path: Path) -> None:
+def test_an_input_that_calculix_refuses_is_one_sentence(tmp_path):
     with pytest.raises(CalculixError, match=r"did not finish .*bad\.inp.*bad\.log"):
         comparison.run_calculix("*NONSENSE\n*STEP\n*STATIC\n*END STEP\n", tmp_path, "bad")
 
 
-def test_calculix_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_calculix_that_is_not_there_is_one_sentence(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CalculixError, match="apt-get install calculix-ccx"):
         comparison.run_calculix("", tmp_path, "job")
@@ -90,7 +87,7 @@ def test_calculix_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPa
 TABLES, EIGENVALUES = (Inputs(__file__).text(f"{name}.dat") for name in ("tables", "eigenvalues"))
 
 
-def test_printed_tables_are_read_or_refused() -> None:
+def test_printed_tables_are_read_or_refused():
     tables = {name: [rows.tolist() for rows in own] for name, own in comparison.read_tables(TABLES).items()}
     assert tables == {"NALL": [[[1, 0.1, -2, 0], [2, 0.3, 4, 5]]], "E0": [[[1, 1, 2.5]]]}
     assert comparison.read_frequencies(EIGENVALUES).tolist() == [5.632151, 15.09876]

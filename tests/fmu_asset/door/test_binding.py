@@ -19,9 +19,10 @@ from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import Conversion, Meaning, contradictions, conversion, meaning_of, same_dimension
+from fmu_asset.door.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
+from reporting.units import Meaning, meaning_of
 from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed, tables
 
@@ -121,10 +122,10 @@ def test_any_text_is_understood_or_not(text) -> None:
 
 
 def test_dimensions_are_compared_and_contradictions_told() -> None:
-    pairs = ("kN", "lbf"), ("N", "m"), ("bushel", "m")
+    pairs = ("kN", "lbf"), ("N", "m"), ("blorp", "m")
     assert [same_dimension(*pair) for pair in pairs] == [True, False, None]
     sound = UnitInfo("kN", si(kg=1, m=1, s=-2), 1e3, 0.0, ())
-    unusual, open_one = UnitInfo("bushel", si(m=3), 0.035, 0.0, ()), UnitInfo("K", None, 1, 0, ())
+    unusual, open_one = UnitInfo("blorp", si(m=3), 0.035, 0.0, ()), UnitInfo("K", None, 1, 0, ())
     # Radians come and go in FMUs, and nobody means anything by it.
     turning = UnitInfo("rad/s", si(s=-1), 1.0, 0.0, ())
     assert contradictions([sound, unusual, open_one, turning]) == []

@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import CalibrationRecordError
-from calibration.result.file import (
-    description,
-    load_calibration,
-    plain_record,
-    result_bytes,
-    run_record,
-    save_calibration,
-)
+from calibration.result.file import description, plain_record, result_bytes, run_record, save_calibration
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
 from tests.refusals import Inputs
@@ -29,9 +22,9 @@ from twin_master.assets.resolution import (
 )
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.run_folder import to_json
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Calibration
-from twin_master.workflow import fly as new_run
+from uav_twin import fly, load_calibration, load_scenario
 
 MakeCalibration = Callable[..., Calibrated]
 TEXT = text_of("level_turns")
@@ -177,5 +170,5 @@ def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, 
 def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario, means, words):
     given = Overrides(calibration=of_campaign(tmp_path / "calibration.nc", **means))
     with pytest.raises(MissionInputError, match=words):
-        new_run(load_scenario(scenario), tmp_path / "run", given, report=False)
+        fly(load_scenario(scenario), tmp_path / "run", given, report=False)
     assert not (tmp_path / "run").exists()

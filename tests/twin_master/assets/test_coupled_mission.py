@@ -16,14 +16,13 @@ from tests.twin_master.runs import check_same, cut_off_after, journal, table_of,
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
-from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
 from twin_master.mission.truth import Plant, Truth
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import fly as new_run
+from uav_twin import fly_fleet, load_scenario, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
 INPUTS = Inputs(__file__)
@@ -97,7 +96,7 @@ def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder, tmp_path):
         new_run(loaded, tmp_path / "run")
     assert len(journal(tmp_path / "run")) == 16
     with pytest.raises(FmuError, match=r"not finite.*outlet"):
-        resume_run(tmp_path / "run")
+        resume(tmp_path / "run")
 
 
 def test_a_system_of_one_fmu_flies_as_the_fmu_alone(folder, direct, tmp_path):
@@ -114,14 +113,14 @@ def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(folder, direct, tmp_p
     loaded = load_scenario(folder / f"{name}.toml")
     with cut_off_after(11):
         new_run(loaded, tmp_path / "part")
-    resume_run(tmp_path / "part")
+    resume(tmp_path / "part")
     check_same(tmp_path / "part", direct[name], "run.nc", "config.json", "summary.json", "journal.jsonl")
     ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
     flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
     assert rows(flown) == rows(direct[name])
     assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
     ssp.unlink()
-    assert rows(resume_run(flown).folder) == rows(direct[name])
+    assert rows(resume(flown).folder) == rows(direct[name])
 
 
 ANY = TwinMasterError, FmuError
@@ -197,23 +196,9 @@ def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
 @pytest.mark.xdist_group("wing")
 def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
-    script = (
-        (10, 19, "z1", 0.02), (20, 20, "z1", 0.2), (30, 30, "z1", 0.2),
-        (5, 14, "z2", 0.02), (5, 5, "z2", 0.2), (25, 25, "z2", 0.2),
-    )  # fmt: skip
-    entries = ", ".join(
-        f'"script[{i}].first" = {first}.0, "script[{i}].last" = {last}.0, "script[{i}].{region}" = {gain}'
-        for i, (first, last, region, gain) in enumerate(script, start=1)
-    )
-    faults = (
-        '"dropout_start[1]" = 28.0, "dropout_end[1]" = 1000.0, "dropout_start[{17..20}]" = 12.0, '
-        '"dropout_end[{17..20}]" = 19.0, "blackout.start" = 36.0, "blackout.end" = 38.0, '
-        '"drift_rate[12]" = 6e-6, "drift_start[12]" = 8.0'
-    )
-    damage = ('"probability.z1" = 0.10, "probability.z2" = 0.10', entries)
-    gauges = ('noise = 150e-6, "dropout_start[6]" = 20.0, "dropout_end[6]" = 30.0', faults)
     quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
-    split = plant_of(shipped("three_fmus", tmp_path, damage, gauges), tmp_path / "split")
+    lived = INPUTS.table("lived_by_fmus.toml")["changes"]
+    split = plant_of(shipped("three_fmus", tmp_path, *lived), tmp_path / "split")
     single = plant_of(shipped("failing_gauges", tmp_path, quiet), tmp_path / "single")
     controls = np.random.default_rng(3).integers(2, size=50).tolist()
     for step, control in enumerate(controls):

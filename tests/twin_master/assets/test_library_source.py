@@ -1,5 +1,6 @@
 """A twin that believes an observation library, and the pump's mission against its equations."""
 
+import copy
 import itertools
 import json
 import math
@@ -17,54 +18,34 @@ from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
 from scenarios import asset_scripts
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, table_of
+from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, merged, table_of
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
 from twin_master.library.grid import grid_of_scenario
 from twin_master.library.sampling import sample_library
-from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace, deterministic_policy
-from twin_master.network.inference import filter_sequence, predict, smooth
+from twin_master.network.graphical_model import Factor, StateSpace, deterministic_policy
+from twin_master.network.inference import predict, smooth
 from twin_master.network.transition import TransitionModel
-from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.scenario.reading import LoadedScenario
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import GraphicalModel, filter_sequence, fly, load_scenario, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
 INPUTS = Inputs(__file__)
 
 
-def pump_table() -> dict[str, Any]:
-    """Return the shipped mission cut down: five shifts, 3 x 2 levels, four draws, and sensors that fail."""
-    table = table_of("pump_wear")
-    table["mission"] |= {"steps": 5, "prediction_steps": 3}
-    table["state"][0] |= {"levels_percent": [0, 30, 60], "prior": [1, 0, 0]}
-    table["state"][1] |= {"levels_percent": [0, 60], "prior": [1, 0]}
-    table["calibration"] |= {"draws": 4}
-    table["asset"] |= {"isolated": False}
-    table["observation"] |= {"between_levels": False}  # what is enumerated below
-    table["truth"]["gains"] = [
-        {"state": "wear", "first_step": 1, "gain_percent": 20},
-        {"state": "clogging", "first_step": 3, "gain_percent": 50},
-    ]
-    table["truth"]["sensor_faults"] = [
-        {"kind": "dropout", "sensors": [1], "first_step": 1, "last_step": 1},
-        {"kind": "dropout", "sensors": "all", "first_step": 2, "last_step": 2},
-    ]
-    return table
+PUMP = merged(table_of("pump_wear"), INPUTS.table("small_pump.toml"))
 
 
 def small_pump(**asset: Any) -> LoadedScenario:
     """Return the small mission, with changes of its asset."""
-    table = pump_table()
-    table["asset"] |= asset
-    return loaded_from(table, "pump_wear")
+    return loaded_from(merged(PUMP, {"asset": asset}), "pump_wear")
 
 
 def changed(key: str, entry: object) -> LoadedScenario:
     """Return the small mission with another entry at a key such as `state.0.unit`."""
-    table = pump_table()
+    table = copy.deepcopy(PUMP)
     *path, last = key.split(".")
     node: Any = table
     for part in path:
@@ -100,7 +81,7 @@ def test_a_table_over_another_parameter_grid_is_interpolated(library):
 
 def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
     path = Path(shutil.copy(made, tmp_path / "pump.nc"))
-    whole = new_run(small_pump(), tmp_path / "whole", Overrides(library=path))
+    whole = fly(small_pump(), tmp_path / "whole", Overrides(library=path))
     assert not whole.origin.differ
     assert whole.origin.model == "observation library of it"
     config = json.loads((tmp_path / "whole" / "config.json").read_text())
@@ -109,15 +90,15 @@ def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
     assert set(config["inputs"]) == {"binding", "fmu", "observation_library"}
     part = tmp_path / "part"
     with cut_off_after(3):
-        new_run(small_pump(), part, Overrides(library=path))
+        fly(small_pump(), part, Overrides(library=path))
     path.unlink()
-    resume_run(part)
+    resume(part)
     check_same(part, whole.folder, "run.nc", "summary.json", "csv/health.csv")
     stored = part / "asset" / "observation_library.nc"
     stored.write_bytes(stored.read_bytes()[:-200])
     (part / "run.nc").unlink()  # of a finished run nothing is read again
     with pytest.raises(TwinMasterError, match=r"not a whole NetCDF"):
-        resume_run(part)
+        resume(part)
 
 
 def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
@@ -125,7 +106,7 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
     text = asset_scripts()["gear_pump"].read_text(encoding="utf-8")
     script.write_text(text.replace("COOLING = 250.0", "COOLING = 200.0"))
     fmu = build_script_fmu(script, tmp_path / "other.fmu").path
-    outcome = new_run(small_pump(), tmp_path / "run", Overrides(library=made, fmu=fmu))
+    outcome = fly(small_pump(), tmp_path / "run", Overrides(library=made, fmu=fmu))
     assert outcome.origin.differ
     assert outcome.origin.model == "observation library of another FMU"
     assert figures_of(outcome.folder)["model_misfit_largest"] > 1.0  # percent: it is hotter with less cooling
@@ -135,15 +116,15 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
 @pytest.mark.parametrize(("key", "entry", "words"), INPUTS.refused("library"))
 def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
     with pytest.raises(InvalidObservationLibraryError, match=words):
-        new_run(changed(key, entry), tmp_path / "run", Overrides(library=made))
+        fly(changed(key, entry), tmp_path / "run", Overrides(library=made))
 
 
 def test_names_and_order_of_controls_and_states_do_not_matter(made, tmp_path):
-    table, figures = pump_table(), []
+    table, figures = copy.deepcopy(PUMP), []
     table["state"].reverse()
     table["control"].reverse()
     for name, loaded in (("a", small_pump()), ("b", loaded_from(table, "pump_wear"))):
-        figures.append(figures_of(new_run(loaded, tmp_path / name, Overrides(library=made)).folder))
+        figures.append(figures_of(fly(loaded, tmp_path / name, Overrides(library=made)).folder))
     assert figures[0]["log_evidence"] == pytest.approx(figures[1]["log_evidence"], rel=1e-12)
     assert figures[0]["filtered_rms_error_wear"] == pytest.approx(figures[1]["filtered_rms_error_wear"])
 
@@ -231,7 +212,7 @@ def move(control: str, before: int, after: int) -> float:
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("pump")
     overrides = Overrides(library=sampled(folder) if request.param == "library" else None)
-    return open_run(new_run(small_pump(), folder / "run", overrides, report=False).folder)
+    return open_run(fly(small_pump(), folder / "run", overrides, report=False).folder)
 
 
 @pytest.fixture(scope="module")

@@ -31,10 +31,9 @@ from twin_master.errors import MissingObservationModelError, ScenarioError, Twin
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
+from uav_twin import GaussianSensorModel, load_scenario
 
 ROOT = Path(__file__).parents[3]
 TEXT = text_of("model_mismatch")

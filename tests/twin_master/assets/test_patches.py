@@ -24,10 +24,9 @@ from twin_master.assets.reduced_model import check_model_patch
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, ScenarioError
-from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import fly as new_run
+from uav_twin import load_scenario, resume
 
 TEXT = text_of("level_turns", ("steps = 50", "steps = 7"), ("draws = 100", "draws = 6"))
 DRIFT: tuple[Primitive, ...] = (SensorDrift("g5", 3e-5, 1.0), SensorGain("strain[9]", 0.1))
@@ -135,7 +134,7 @@ def test_a_mission_with_a_hidden_drift(mission, tmp_path):
     assert config["scenario"]["asset"]["patch"] == "asset/patch.json"
     assert "patch" in config["inputs"]
     before = (folder / "run.nc").read_bytes()
-    resume_run(folder)
+    resume(folder)
     assert (folder / "run.nc").read_bytes() == before
 
 

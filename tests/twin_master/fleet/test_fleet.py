@@ -12,20 +12,19 @@ import pytest
 from calibration.errors import PosteriorError
 from tests.command_line import refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, edited, text_of, written
+from tests.twin_master.runs import check_same, edited, flight_of, text_of, written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderExistsError
 from twin_master.fleet import flight
-from twin_master.fleet.flight import fly_fleet, group_folder
+from twin_master.fleet.flight import group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Estimated, group_figures
-from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.shard import Engine, unflown
 from twin_master.mission.journal import JournalFile
-from twin_master.mission.loop import fly
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
+from uav_twin import fly as new_run
+from uav_twin import fly_fleet, open_fleet
 
 
 def growing(library_file: Path, count: int = 10, shard: int = 4) -> Fleet:
@@ -41,7 +40,7 @@ def whole(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
     given = Overrides(strain_library=library_file)
     outcome = fly_fleet(ensemble("level_turns", range(2020, 2023), given), tmp_path / "many")
-    group = fleet_groups(outcome.folder)["level_turns"]
+    group = open_fleet(outcome.folder)["level_turns"]
     tree = open_run(new_run("level_turns", tmp_path / "one", given, report=False).folder)
     row = group["seed"].values.tolist().index(int(tree.attrs["seed"]))
     for ours, (part, name) in {
@@ -57,7 +56,7 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
 def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
     cut = fly_fleet(growing(library_file, shard=3), tmp_path / "cut", Engine(2))
     assert cut.shards_flown == 4
-    first, second = (fleet_groups(folder)["growing_damage"] for folder in (whole, cut.folder))
+    first, second = (open_fleet(folder)["growing_damage"] for folder in (whole, cut.folder))
     assert set(first.data_vars) == set(second.data_vars)
     for name in first.data_vars:
         np.testing.assert_array_equal(first[name].values, second[name].values)
@@ -77,7 +76,7 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
         patch.setattr(JournalFile, "append", dying)
         with pytest.raises(KeyboardInterrupt):
             fly_fleet(fleet, cut)
-    assert fleet_groups(cut)["growing_damage"]["status"].values.tolist() == [1] * 8 + [0] * 2
+    assert open_fleet(cut)["growing_damage"]["status"].values.tolist() == [1] * 8 + [0] * 2
     with (cut / "journal.jsonl").open("a") as file:
         file.write(64 * "0" + ' {"shard": 2, "fail')  # a line that the kill cut off
     outcome = fly_fleet(fleet, cut)
@@ -106,9 +105,9 @@ def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").touch()
     with pytest.raises(RunFolderExistsError, match="there is no folder"):
-        fleet_groups(tmp_path / "nowhere")
+        open_fleet(tmp_path / "nowhere")
     with pytest.raises(RunFolderExistsError, match="not the folder of a fleet"):
-        fleet_groups(tmp_path / "other")
+        open_fleet(tmp_path / "other")
     with pytest.raises(RunFolderExistsError, match="not touched"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(other, folder, replace_old=True).twins == 3
@@ -198,12 +197,9 @@ def test_figures_are_those_of_the_flights(library_file, tmp_path):
     fleet = growing(library_file, count=4)
     folder, (group,) = fly_fleet(fleet, tmp_path / "fleet").folder, fleet.groups
     knowledge = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
-    asset = group.scenarios[0].asset.source(group.scenarios[0]).open()
-    flights = [
-        fly(knowledge.scenario, knowledge.twin(), knowledge.plant(knowledge.truth(seed), asset))
-        for seed in range(4)
-    ]
-    figures = group_figures(fleet_groups(folder)["growing_damage"])
+    source = group.scenarios[0].asset.source(group.scenarios[0])
+    flights = [flight_of(knowledge, source, seed=seed) for seed in range(4)]
+    figures = group_figures(open_fleet(folder)["growing_damage"])
     error = [knowledge.model.states.mean(f.filtered) - f.state for f in flights]
     for name, expected in (
         ("log evidence of a step", np.mean([f.log_evidence.mean() for f in flights])),

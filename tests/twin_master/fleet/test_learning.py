@@ -9,20 +9,24 @@ from tests.twin_master.network.decision_oracles import enumerate_trajectories
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
-from twin_master.fleet.flight import fly_fleet, group_folder
+from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import learn_fleet
-from twin_master.fleet.lessons import learn_from_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
 from twin_master.fleet.reading import attention
-from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.mission.preparation import kept_knowledge
-from twin_master.network.inference import filter_sequence
-from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
+from uav_twin import (
+    GaussianSensorModel,
+    filter_sequence,
+    fly_fleet,
+    learn_from_fleet,
+    load_scenario,
+    open_fleet,
+)
 
 
 def tiny(
@@ -273,7 +277,7 @@ def test_true_rates_may_differ_from_those_believed(tmp_path):
 def test_the_report_names_who_needs_attention(grown):
     fleet, folder = grown
     text = write_fleet_report(folder).read_text()
-    (group,) = fleet_groups(folder).values()
+    (group,) = open_fleet(folder).values()
     delay = group["delay"].values[~np.isnan(group["delay"].values)]
     control = group["control_index"].values
     last = [mean[flown >= 0][-1].sum() for mean, flown in zip(group["mean"].values, control, strict=True)]

@@ -21,22 +21,19 @@ from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
-from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learn import learn_fleet
-from twin_master.fleet.lessons import learn_from_fleet
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import attention, group_figures, leaving
-from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import fleet_page, write_fleet_report
 from twin_master.fleet.shard import Engine
 from twin_master.fleet.view import WORST, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import kept_knowledge
-from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begun_watch
+from uav_twin import fly_fleet, learn_from_fleet, load_scenario, open_fleet
 
 TURNS = 6
 Decision = Mapping[str, Any]
@@ -365,7 +362,7 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     short.write_text("".join(short.read_text().splitlines(keepends=True)[:4]))
     planned = load_fleet(fleet_of(tmp_path, "logs/*.csv", f"steps = {TURNS}"))
     outcome = fly_fleet(planned, tmp_path / "flown", Engine(0))
-    group = fleet_groups(outcome.folder)["north"]
+    group = open_fleet(outcome.folder)["north"]
     for row, turns in enumerate((3, TURNS, TURNS)):
         last = {record["turn"]: record for record in journal(tmp_path / "alone" / f"wing-{row}")}
         assert group["control_index"].values[row].tolist() == [1] * turns + [-1] * (TURNS - turns)
@@ -390,12 +387,12 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
 
 def test_recordings_teach_what_the_flights_taught(fleet_file, tmp_path):
     fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(4)), tmp_path / "flown", Engine(0))
-    group = fleet_groups(tmp_path / "flown")["growing_damage"]
+    group = open_fleet(tmp_path / "flown")["growing_damage"]
     for row in range(4):
         observed = group["observed"].values[row].astype(np.float64)
         write_csv(log_of(tmp_path, row), observed, group["control_index"].values[row])
     fly_fleet(load_fleet(fleet_file), tmp_path / "recorded", Engine(0))
-    again = fleet_groups(tmp_path / "recorded")["north"]
+    again = open_fleet(tmp_path / "recorded")["north"]
     assert np.array_equal(again["observed"].values, group["observed"].values)
     np.testing.assert_allclose(again["mean"].values, group["mean"].values, atol=1e-4)
     flown, recorded = (learn_fleet(tmp_path / name)["groups"] for name in ("flown", "recorded"))
@@ -412,7 +409,7 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     fleet_of(tmp_path, "logs/*.csv", f"steps = {TURNS}")
     fleet = watched(fleet_file, tmp_path / "out")
     fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
-    group, alarmed = fleet_groups(tmp_path / "flown")["north"], 0
+    group, alarmed = open_fleet(tmp_path / "flown")["north"], 0
     assets = [fleet.assets[f"north/wing-{row}"] for row in range(3)]
     for row, asset in enumerate(assets):
         told = [n for n in asset.watch.told(0) if n[1].kind != "gauge_back"]
@@ -441,7 +438,7 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
 def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
     flown = ensemble(str(tmp_path / "wing.toml"), range(60))
     fly_fleet(flown, tmp_path / "flown", Engine(0))
-    group = fleet_groups(tmp_path / "flown")["growing_damage"]
+    group = open_fleet(tmp_path / "flown")["growing_damage"]
     kept = tmp_path / "flown" / "groups" / "growing_damage"
     knowledge = kept_knowledge(kept, flown.groups[0].scenarios[0])
     belief, control = group["belief"].values.astype(float), group["control_index"].values[:, -1]

@@ -8,14 +8,17 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import foldnorm, multivariate_normal, multivariate_t, norm
 
-from twin_master.errors import InvalidModelError
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import LearningFilter, LearntPriors, quantiles_of
-from twin_master.learning.posterior import posterior_of_draws
-from twin_master.network.estimator import Carried, Estimate, Learnt
-from twin_master.network.graphical_model import GraphicalModel, worsening_table
+from twin_master.learning.learning_filter import (
+    LearningFilter,
+    LearntPriors,
+    posterior_of_draws,
+    quantiles_of,
+)
+from twin_master.network.estimator import Learnt
+from twin_master.network.graphical_model import worsening_table
 from twin_master.network.rewards import RewardModel, RewardSettings
-from twin_master.network.sensor_model import GaussianSensorModel
+from uav_twin import Carried, Estimate, GaussianSensorModel, GraphicalModel
 
 Float = NDArray[np.float64]
 
@@ -192,11 +195,6 @@ def test_a_belief_that_underflows_comes_back():
     log_belief = [estimate.carried.arrays["log_belief"][:, 0] for estimate in estimates]
     np.testing.assert_allclose(log_belief[0][1], -1800.0, rtol=1e-12)
     np.testing.assert_allclose(log_belief[2][0], -1800.0, rtol=1e-12)
-
-
-def test_an_average_inside_the_product_is_refused():
-    with pytest.raises(InvalidModelError, match="learning needs"):
-        LearningFilter(model(), sensors(average="inside"), LearntPriors("e", [1, 2, 3]))
 
 
 SETTINGS = RewardSettings(2.0, (-0.1, 0.1), 0.8, (2.0, 3.0))

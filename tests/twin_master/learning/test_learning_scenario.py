@@ -13,15 +13,12 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, figures_of, journal, text_of, written
 from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.preparation import prepare_twin
-from twin_master.network.estimator import ExactFilter
-from twin_master.network.twin import build_graphical_model
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.store.writing import open_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import ExactFilter, load_scenario, prepare_twin, resume
 
 TEXT, INPUTS = text_of("level_turns_learning"), Inputs(__file__)
 
@@ -30,14 +27,6 @@ def test_without_the_table_the_filter_is_the_exact_one():
     loaded = load_scenario("level_turns")
     assert loaded.scenario.to_dict()["learning"] is None
     assert isinstance(prepare_twin("paper_level_turns").twin().estimator, ExactFilter)
-
-
-def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave():
-    scenario = load_scenario("level_turns").scenario
-    once, thrice = (build_graphical_model(scenario, factor).transition.matrix for factor in (1.0, 3.0))
-    assert thrice[1, 0, 1] == pytest.approx(0.3 * 0.7)
-    assert once[1, 0, 1] == pytest.approx(0.1 * 0.9)
-    assert thrice.sum(axis=-1) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("learning"))
@@ -154,5 +143,5 @@ def test_a_run_that_was_cut_off_ends_the_same(folder):
     (cut / JOURNAL_NAME).write_text("".join(lines[:6]))
     for name in ("run.nc", "summary.json"):
         (cut / name).unlink()
-    resume_run(cut, report=False)
+    resume(cut, report=False)
     check_same(cut, folder, "run.nc", "summary.json")

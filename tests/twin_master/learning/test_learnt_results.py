@@ -14,15 +14,14 @@ from scipy.stats import invgamma
 from reporting.page import ReportFigure
 from tests.command_line import said
 from tests.twin_master.runs import journal, text_of, written
-from twin_master.mission.preparation import prepare_twin
 from twin_master.mission.replay import gap_of
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.learnt import learnt_figure, sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
-from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
+from uav_twin import load_scenario, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9

@@ -14,18 +14,25 @@ from scipy.stats import t as student
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import switching
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.learning.switching import at_first, one_turn_later
 from twin_master.learning.words import Words
 from twin_master.mission.journal import line_of, turn_record
-from twin_master.mission.preparation import Knowledge, prepare_twin
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import Reading, Turn
-from twin_master.network.estimator import Carried, Estimate, ExactFilter
-from twin_master.network.graphical_model import GraphicalModel, worsening_table
-from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.network.twin import Twin, TwinTurn
-from twin_master.scenario.reading import load_scenario
+from twin_master.network.graphical_model import worsening_table
+from twin_master.network.twin import TwinTurn
 from twin_master.scenario.tables import Noticing
+from uav_twin import (
+    Carried,
+    Estimate,
+    ExactFilter,
+    GaussianSensorModel,
+    GraphicalModel,
+    Twin,
+    WatchfulEstimator,
+    load_scenario,
+    prepare_twin,
+)
 
 Float = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from fmu_asset.packing.contents import build_script_fmu
 from tests.refusals import Inputs
 from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
-from twin_master.library.grid import SamplingGrid, grid_of_fmu, parse_grid
+from twin_master.library.grid import SamplingGrid, grid_of_fmu
 from twin_master.library.sampling import blocks_folder, sample_library
 
 FINE, LAG, COUNT, DIE, SLEEP, REFUSE, SLOW = (float(mode) for mode in range(7))
@@ -179,18 +179,9 @@ def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(files, 
 
 def test_what_does_not_fit_is_named_before_anything_is_started(files, tmp_path):
     out = tmp_path / "lever.nc"
-    for changes, words in (
-        (
-            {"states": {"tear": (0.0,)}},
-            "the state tear, which the binding wayward does not know; it knows wear",
-        ),
-        ({"controls": {"a": {"pull": 1.0}}}, "control input pull"),
-        ({"parameter": "gains"}, "the parameter gains"),
-        ({"states": {}}, "needs at least one state"),
-        ({"states": {"wear": (0.2, 0.1)}}, "must increase"),
-    ):
+    for changes, words in Inputs(__file__).refused("grids"):
         with pytest.raises(InvalidObservationLibraryError, match=words):
-            sample_library(grid(files, **changes), out, workers=1)  # type: ignore[arg-type]
+            sample_library(grid(files, **changes), out, workers=1)
     with pytest.raises(InvalidObservationLibraryError, match="suffix"):
         sample_library(grid(files), tmp_path / "lever.csv", workers=1)
     with pytest.raises(InvalidObservationLibraryError, match="at least 1"):
@@ -199,15 +190,6 @@ def test_what_does_not_fit_is_named_before_anything_is_started(files, tmp_path):
     with pytest.raises(InvalidObservationLibraryError, match="exists"):
         sample_library(grid(files), out, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["lever.nc"]
-
-
-def test_grids_are_read(files):
-    from fmu_asset.door.binding import load_binding
-
-    found = parse_grid(["health.wear=0:1:5", "push=1,2", "gain=3"], load_binding(files[1]))
-    assert found["health"] == {"wear": (0.0, 0.25, 0.5, 0.75, 1.0)}
-    assert found["control"] == {"push": (1.0, 2.0)}
-    assert found["parameter"] == {"gain": (3.0,)}
 
 
 @given(st.integers(1, 40), st.lists(st.integers(1, 12), min_size=1, max_size=3), st.integers(1, 6))

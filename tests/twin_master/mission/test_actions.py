@@ -12,17 +12,14 @@ import pytest
 from scipy.stats import norm
 
 import uav_twin
-from fe.reduction.model_cache import reduced_model
-from fe.wing.design import load_design
 from tests.command_line import said
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
-from tests.twin_master.runs import edited, text_of, written
+from tests.twin_master.runs import edited, flight_of, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     decision_problem,
@@ -37,16 +34,16 @@ from twin_master.mission.preparation import (
     keep_knowledge,
     kept_knowledge,
     knowledge_of,
-    prepare_knowledge,
 )
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
-from twin_master.network.estimator import Carried, Estimator, ExactFilter
+from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.store.writing import open_run
+from uav_twin import Carried, ExactFilter, WatchfulEstimator, reduced_model
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3
@@ -70,7 +67,7 @@ def knowledge(policy: str = "mode") -> Knowledge:
 
 
 def known_of(written: Scenario) -> Knowledge:
-    return prepare_knowledge(written, ReducedModelSource(written, reduced_model(load_design())), 3)
+    return of_wing(written)[0]
 
 
 def following(known: Knowledge, policy: BeliefPolicy, written: Scenario | None = None) -> Knowledge:
@@ -84,7 +81,7 @@ def side_by_side(known: Knowledge, seeds: int) -> Flights:
 
 
 def asset_of(known: Knowledge) -> Any:
-    return ReducedModelSource(known.scenario, reduced_model(load_design())).open()
+    return ReducedModelSource(known.scenario, reduced_model()).open()
 
 
 def test_an_action_is_a_control_with_a_price_that_reads_back():
@@ -167,7 +164,7 @@ def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp
 def test_missions_side_by_side_are_those_alone_with_readings_and_repairs():
     known = knowledge("qmdp")
     together = side_by_side(known, 3)
-    alone = fly(known.scenario, known.twin(), known.plant(known.truth(1), asset_of(known)))
+    alone = flight_of(*of_wing(known.scenario), seed=1)
     assert np.array_equal(together.control_index[1], alone.control_index)
     assert np.array_equal(together.filtered[1], alone.filtered)
     for states, controls in zip(together.state, together.control_index, strict=True):

@@ -11,16 +11,11 @@ import xarray as xr
 from fmu_asset.errors import FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, written
-from twin_master.environment import ScenarioEnvironment
-from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
-from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.store import ENDED
-from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
-from twin_master.workflow import fly as new_run
-from twin_master.workflow import resume as resume_run
+from uav_twin import ScenarioEnvironment, fly, fly_fleet, load_scenario, open_fleet, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
 
@@ -50,14 +45,14 @@ def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypa
     fmu, flag = foreign_fmu("hostile2", what, "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
     loaded = scenario(tmp_path, fmu, binding=f"{BINDING}limits = {{ step_time = 1.0, memory = 400.0 }}\n")
-    whole = new_run(loaded, tmp_path / "whole").folder
+    whole = fly(loaded, tmp_path / "whole").folder
     flag.touch()
     with pytest.raises(kind, match=sentence):
-        new_run(loaded, tmp_path / "part")
+        fly(loaded, tmp_path / "part")
     with pytest.raises(kind, match=sentence):
-        resume_run(tmp_path / "part")
+        resume(tmp_path / "part")
     flag.unlink()
-    resume_run(tmp_path / "part")
+    resume(tmp_path / "part")
     check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "csv/observed.csv")
 
 
@@ -68,10 +63,10 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
     fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
     loaded = scenario(tmp_path, fmu)
-    whole = new_run(loaded, tmp_path / "whole")
+    whole = fly(loaded, tmp_path / "whole")
     assert whole.notices == ()
     flag.touch()
-    part = new_run(loaded, tmp_path / "part")
+    part = fly(loaded, tmp_path / "part")
     (said,) = part.notices
     assert said.startswith("The asset ended the mission after 20 of 30 turns: ")
     assert "The FMU asked to end the simulation in the step from t = 20 s" in said
@@ -80,11 +75,11 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
             if name in long:
                 np.testing.assert_array_equal(short[name].values, long[name].values[:20])
         assert short["truth/sensor_status"].shape == (20, 1)
-    assert resume_run(part.folder).notices == part.notices
+    assert resume(part.folder).notices == part.notices
     fleet = fly_fleet(ensemble(str(tmp_path / "scenario.toml"), range(4, 5)), tmp_path / "fleet")
     assert fleet.failures == {}
     assert [*fleet.ended.values()] == [said.replace(f"{part.folder}/", "")]
-    (group,) = fleet_groups(fleet.folder).values()
+    (group,) = open_fleet(fleet.folder).values()
     assert group["status"].values.tolist() == [ENDED]
     assert (group["control_index"].values >= 0).sum() == 20
     assert np.isfinite(group["belief"].values).all()
@@ -113,12 +108,12 @@ def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
         )
         for count in (2, 3)
     )
-    truth = open_run(new_run(two, tmp_path / "run").folder)["truth"]
+    truth = open_run(fly(two, tmp_path / "run").folder)["truth"]
     assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
     assert truth["y[1]"].attrs["units"] == "mm"
     assert truth["y"].attrs["units"] == "m"
     assert truth["y"].shape == (3, 2)
     np.testing.assert_allclose(truth["y"].values[:, 1], 1e-3 * truth["y[2]"].values, rtol=1e-6)
     with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
-        new_run(three, tmp_path / "other")
+        fly(three, tmp_path / "other")
     assert not (tmp_path / "other").exists()

@@ -1,13 +1,13 @@
 """The mission loop and its truth: timing, history, growth, faults, resuming at every turn, what stops it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.seeds import fly_seeds
-from tests.twin_master.runs import journal, of_library, table_of
+from tests.twin_master.runs import flight_of, journal, of_library, table_of
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError
@@ -31,14 +31,6 @@ ARRAYS = (
 @pytest.fixture(scope="module")
 def paper(library_file: Path) -> Known:
     return of_library("paper_level_turns", library_file, 1)
-
-
-def flown(
-    known: Known, seed: int = 3, asset: StatelessAsset | None = None, *sinks: Callable[[Turn], None]
-) -> History:
-    knowledge, source = known
-    plant = knowledge.plant(knowledge.truth(seed), asset or source.open())
-    return fly(knowledge.scenario, knowledge.twin(), plant, *sinks)
 
 
 @pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges"])
@@ -75,7 +67,7 @@ def test_timing_of_a_turn(paper):
         asked.append((control["load_factor"], health["z1"], health["z2"]))
         return inner.step(control, health)
 
-    flight = flown(paper, 1, StatelessAsset(observe))
+    flight = flight_of(*paper, seed=1, asset=StatelessAsset(observe))
     assert asked[0] == (3.0, 0.0, 0.0)
     assert asked[5][1:] == (0.0, 0.22)
     assert asked[30][1:] == (0.6, 0.6)
@@ -102,9 +94,9 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
         return AssetReading(np.zeros(3))
 
     with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
-        flown(paper, 1, StatelessAsset(broken), kept.append)
+        flight_of(*paper, kept.append, asset=StatelessAsset(broken))
     with pytest.raises(AssetOutputError, match="expects 24 values"):
-        flown(paper, 1, StatelessAsset(short))
+        flight_of(*paper, asset=StatelessAsset(short))
 
 
 def test_study_on_the_published_library(published_library):

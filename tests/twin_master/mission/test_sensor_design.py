@@ -11,23 +11,19 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from fe.reduction.model_cache import reduced_model
 from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
-from fe.wing.design import load_design
 from scenarios import structure_files
 from tests.command_line import refused, said
-from twin_master.assets.reduced_model import ReducedModelSource
+from tests.twin_master.runs import of_wing
 from twin_master.errors import MissionInputError
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations
-from twin_master.scenario.reading import load_scenario
 
 
 @cache
 def knowledge() -> Knowledge:
-    scenario = load_scenario("level_turns").scenario
-    return prepare_knowledge(scenario, ReducedModelSource(scenario, reduced_model(load_design())), 3)
+    return of_wing("level_turns")[0]
 
 
 def test_the_information_of_a_sensor_is_that_of_an_integral():

@@ -17,9 +17,8 @@ from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.truth import DamageGrowth
-from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.transition import TransitionModel
-from twin_master.scenario.reading import load_scenario
+from uav_twin import GraphicalModel, load_scenario
 
 ARRAYS = ("observed", "control_index", "state", "filtered", "log_evidence")
 

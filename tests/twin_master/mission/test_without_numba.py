@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from reporting import progress
-from tests.twin_master.runs import of_library
-from twin_master.mission.loop import fly
+from tests.twin_master.runs import flight_of, of_library
 
 ROOT = Path(__file__).parents[3]
 WITHOUT = "import runpy, sys; sys.modules['numba'] = None; runpy.run_path(sys.argv[1], run_name='__main__')"
@@ -16,8 +15,7 @@ WITHOUT = "import runpy, sys; sys.modules['numba'] = None; runpy.run_path(sys.ar
 
 def arrays(library: Path) -> dict[str, np.ndarray]:
     """Fly with notices, and return what was believed and decided."""
-    knowledge, source = of_library("level_turns", library, 3)
-    history = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(knowledge.truth(3), source.open()))
+    history = flight_of(*of_library("level_turns", library))
     names = ("observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted")
     return {name: getattr(history, name) for name in names}
 

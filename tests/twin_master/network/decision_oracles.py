@@ -74,46 +74,36 @@ def enumerate_prediction(model, belief, control, policy, horizon):
 
 def precise_forward_backward(model, control, log_likelihood, digits=40):
     """Filtered, smoothed, log filtered and log evidence with `digits` digits and an unbounded exponent."""
+
+    def decimals(values, of=lambda x: Decimal(float(x))):
+        return np.vectorize(of, otypes=[object])(values)
+
     with localcontext() as context:
         context.prec, context.Emax, context.Emin = digits, 10**17, -(10**17)
-        steps, size = log_likelihood.shape
-        matrix = [
-            [[(i, Decimal(float(m[i, j]))) for i in range(size) if m[i, j] > 0] for j in range(size)]
-            for m in model.transition.matrix
-        ]
-        following = [
-            [[(j, Decimal(float(m[i, j]))) for j in range(size) if m[i, j] > 0] for i in range(size)]
-            for m in model.transition.matrix
-        ]
-        zero = Decimal(0)
-        likelihood = [
-            [Decimal(float(x)).exp() if np.isfinite(x) else zero for x in row] for row in log_likelihood
-        ]
-        belief = [Decimal(float(p)) for p in model.prior]
-        filtered, log_evidence = [], []
-        for t in range(steps):
-            if t:
-                table = matrix[control[t - 1]]
-                belief = [sum((belief[i] * p for i, p in table[j]), zero) for j in range(size)]
-            belief = [b * x for b, x in zip(belief, likelihood[t], strict=True)]
-            total = sum(belief, zero)
-            belief = [b / total for b in belief]
+        matrix, belief = decimals(model.transition.matrix), decimals(model.prior)
+        likelihood = decimals(
+            log_likelihood, lambda x: Decimal(float(x)).exp() if np.isfinite(x) else Decimal(0)
+        )
+        filtered, evidence = [], []
+        for t, row in enumerate(likelihood):
+            belief = (belief @ matrix[control[t - 1]] if t else belief) * row
+            evidence.append(belief.sum())
+            belief = belief / evidence[-1]
             filtered.append(belief)
-            log_evidence.append(float(total.ln()))
-        message = [Decimal(1)] * size
-        smoothed = [filtered[-1]]
-        for t in range(steps - 2, -1, -1):
-            weighted = [m * x for m, x in zip(message, likelihood[t + 1], strict=True)]
-            table = following[control[t]]
-            message = [sum((weighted[j] * p for j, p in table[i]), zero) for i in range(size)]
-            total = sum(message, zero)
-            message = [m / total for m in message]
-            joint = [f * m for f, m in zip(filtered[t], message, strict=True)]
-            total = sum(joint, zero)
-            smoothed.append([x / total for x in joint])
+        message, smoothed = decimals(np.ones(len(belief))), [filtered[-1]]
+        for t in range(len(filtered) - 2, -1, -1):
+            message = matrix[control[t]] @ (message * likelihood[t + 1])
+            message = message / message.sum()
+            joint = filtered[t] * message
+            smoothed.insert(0, joint / joint.sum())
         log_filtered = [[float(x.ln()) if x else -np.inf for x in row] for row in filtered]
-        as_float = [[[float(x) for x in row] for row in rows] for rows in (filtered, smoothed[::-1])]
-    return np.array(as_float[0]), np.array(as_float[1]), np.array(log_filtered), np.array(log_evidence)
+        log_evidence = [float(x.ln()) for x in evidence]
+    return (
+        np.array(filtered, float),
+        np.array(smoothed, float),
+        np.array(log_filtered),
+        np.array(log_evidence),
+    )
 
 
 def eliminate_variables(model, control, log_likelihood, policy, horizon):

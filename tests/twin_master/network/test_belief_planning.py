@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.study_planning import PROBLEMS, tiger
-from twin_master.errors import PlanningError
-from twin_master.network.belief_planning import DecisionProblem, plan_on_belief
+from twin_master.network.belief_planning import DecisionProblem, plan_on_belief, simulated_returns
 from twin_master.network.planner import value_iteration
-from twin_master.network.simulated_return import simulated_returns
 from twin_master.network.transition import TransitionModel
 
 
@@ -144,11 +142,3 @@ def test_a_product_of_tables_is_planned_as_the_table_of_all_states():
     first, second = plan_on_belief(problem, gap=1e-3), plan_on_belief(whole, gap=1e-3)
     assert first.lower == pytest.approx(second.lower, rel=1e-9)
     assert first.upper == pytest.approx(second.upper, rel=1e-9)
-
-
-def test_a_problem_whose_tables_do_not_fit_is_refused():
-    problem = tiger(0.9)
-    with pytest.raises(PlanningError, match="sum to one"):
-        replace(problem, likelihood=(problem.likelihood[0] * 0.5, *problem.likelihood[1:]))
-    with pytest.raises(PlanningError, match="expected likelihoods of controls of shape"):
-        replace(problem, likelihood=problem.likelihood[:2])

@@ -11,21 +11,10 @@ from tests.twin_master.network.decision_oracles import (
     random_model,
 )
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.network.graphical_model import (
-    Factor,
-    GraphicalModel,
-    StateSpace,
-    deterministic_policy,
-    worsening_table,
-)
-from twin_master.network.inference import (
-    filter_many,
-    filter_sequence,
-    predict,
-    smooth,
-    smooth_many,
-)
+from twin_master.network.graphical_model import Factor, StateSpace, deterministic_policy, worsening_table
+from twin_master.network.inference import filter_many, predict, smooth, smooth_many
 from twin_master.network.transition import TransitionModel
+from uav_twin import GraphicalModel, filter_sequence
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 EXACT = {"rtol": 1e-10, "atol": 1e-12}

@@ -1,7 +1,6 @@
 """The twin: the model that a scenario describes, and what it concludes from turn to turn."""
 
 import pickle
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -11,14 +10,15 @@ import pytest
 from scipy.stats import binom
 
 from fe.runtime.arrays import arrays_to_bytes
-from scenarios import scenario_files
+from tests.twin_master.runs import table_of
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
-from twin_master.network.inference import filter_sequence, smooth
-from twin_master.network.twin import Twin, TwinTurn, build_graphical_model
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.network.estimator import Learnt
+from twin_master.network.inference import smooth
+from twin_master.network.twin import TwinTurn, build_graphical_model
+from twin_master.scenario.reading import parse_scenario
+from uav_twin import Carried, Estimate, ExactFilter, Twin, filter_sequence, load_scenario
 
 
 @pytest.fixture
@@ -27,39 +27,28 @@ def knowledge(library_file: Path) -> Knowledge:
     return prepare_knowledge(scenario, StrainLibrarySource(scenario, load_strain_library(library_file)), 0)
 
 
-def test_the_model_of_the_paper():
-    model = build_graphical_model(load_scenario("level_turns").scenario)
-    assert model.states.names == ("z1", "z2")
-    assert model.prior[0] == 1.0
-    matrix = model.transition.matrix
-    start, index = model.states.index((0.2, 0.4)), model.states.index
+def test_the_transitions_of_a_scenario():
+    """Those of the paper, multiplied by a factor, of each state its own, and as tables."""
+    table = table_of("level_turns")
+    scenario = parse_scenario(table, "x")
+    model = build_graphical_model(scenario)
+    at, matrix = model.states.index, model.transition.matrix
+    assert (model.states.names, model.prior[0]) == (("z1", "z2"), 1.0)
     for control, p in enumerate((0.05, 0.10)):
-        row = matrix[control, start]
-        assert row[start] == pytest.approx((1 - p) ** 2)
-        assert row[index((0.4, 0.4))] == pytest.approx(p * (1 - p))
-        assert row[index((0.4, 0.6))] == pytest.approx(p * p)
-        assert matrix[control, index((0.8, 0.8)), index((0.8, 0.8))] == 1.0
-
-
-def test_probabilities_may_differ_between_states_and_tables_may_be_given():
-    table = tomllib.loads(scenario_files()["level_turns"].read_text(encoding="utf-8"))
+        row = matrix[control, at((0.2, 0.4))]
+        assert row[at((0.2, 0.4))] == pytest.approx((1 - p) ** 2)
+        assert row[at((0.4, 0.4))] == pytest.approx(p * (1 - p))
+        assert row[at((0.4, 0.6))] == pytest.approx(p * p)
+        assert matrix[control, at((0.8, 0.8)), at((0.8, 0.8))] == 1.0
+    assert build_graphical_model(scenario, 3.0).transition.matrix[1, 0, 1] == pytest.approx(0.3 * 0.7)
     table["transition"]["probability"]["3g"] = {"z1": 0.3, "z2": 0.0}
-    model = build_graphical_model(parse_scenario(table, "x"))
-    at = model.states.index
-    assert model.transition.matrix[1, at((0.0, 0.0)), at((0.2, 0.0))] == pytest.approx(0.3)
-    assert model.transition.matrix[1, at((0.0, 0.0)), at((0.0, 0.2))] == 0.0
-    tables = {
-        control: {
-            name: [
-                [1.0 - p if i == j else p if j == (i + 1) % 5 else 0.0 for j in range(5)] for i in range(5)
-            ]
-            for name, p in (("z1", 0.25), ("z2", 0.5))
-        }
-        for control in ("2g", "3g")
-    }
+    matrix = build_graphical_model(parse_scenario(table, "x")).transition.matrix
+    assert matrix[1, 0, [at((0.2, 0.0)), at((0.0, 0.2))]] == pytest.approx([0.3, 0.0])
+    z1, z2 = ((p * np.roll(np.eye(5), 1, axis=1) + (1 - p) * np.eye(5)).tolist() for p in (0.25, 0.5))
+    tables = {control: {"z1": z1, "z2": z2} for control in ("2g", "3g")}
     table["transition"] = {"kind": "independent_tables", "tables": tables}
-    model = build_graphical_model(parse_scenario(table, "x"))
-    assert model.transition.matrix[0, at((0.8, 0.0)), at((0.0, 0.2))] == pytest.approx(0.125)
+    matrix = build_graphical_model(parse_scenario(table, "x")).transition.matrix
+    assert matrix[0, at((0.8, 0.0)), at((0.0, 0.2))] == pytest.approx(0.125)
 
 
 def test_turn_by_turn_equals_the_whole_sequence(knowledge):

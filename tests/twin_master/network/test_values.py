@@ -171,19 +171,12 @@ REFUSED = [
     (lambda: QUANTITY.moments(JOINT[:, :, 0]), "known_control"),
     *((lambda bad=bad: QUANTITY.quantiles(JOINT, bad), "increasing quantile levels")
       for bad in ([0.9, 0.1], [0.0], [1.1], 0.5, [np.nan])),
-    *((lambda bad=bad: RewardSettings(**({"limit": 1.0, "control_reward": (0.0,), "error_scale": 1.0} | bad)),
-       "must be finite and positive") for bad in ({"limit": 0.0}, {"limit": np.nan}, {"error_scale": -1.0})),
-    (lambda: RewardSettings(1.0, (0.0, 1.0), 1.0, (1.0, 0.0)), "'control_normaliser' must be finite and pos"),
-    (lambda: RewardSettings(1.0, (0.0, np.inf), 1.0), "'control_reward' must be finite"),
-    (lambda: RewardModel(QUANTITY, RewardSettings(1.0, (0.0, 1.0, 2.0), 1.0)), "each of 2 controls, got 3"),
     (lambda: REWARDS.expectation(JOINT[1, 0]), "joint belief"),
-    (lambda: REWARDS.expectation(JOINT[1], np.zeros(4)), "expected observations of shape"),
     (lambda: value_iteration(MOVES, REWARD.T, 0.6), "rewards of shape"),
     *((lambda bad=bad: value_iteration(MOVES, REWARD, bad), r"discount factor in \[0, 1\)")
       for bad in (1.0, -0.1, np.nan)),
     (lambda: value_iteration(MOVES, REWARD, 0.9, max_iterations=3), "after 3 sweeps"),
     (lambda: value_iteration(TABLE * 0.95, REWARD, 0.6), "does not sum to one"),
-    (lambda: given_policy(MOVES, REWARD, 0.6, np.ones((7, 1))), "expected a policy of shape"),
     (lambda: value_iteration(MOVES, np.full((7, 3), np.nan), 0.6), r"\(0, 0\) is nan"),
 ]  # fmt: skip
 

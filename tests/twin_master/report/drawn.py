@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from tests.conftest import synthetic_library
 from twin_master.assets.resolution import Overrides
 from twin_master.report.reading import Run, read_run
-from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.workflow import fly
+from uav_twin import fly, load_scenario
 
 
 def flown(place: Path, **mission: int) -> Run:

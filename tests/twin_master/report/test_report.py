@@ -28,8 +28,8 @@ from twin_master.report.reading import Run
 from twin_master.run_folder import to_json
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import LearntQuantity
-from twin_master.store.summary import Fallback, of_fallback
 
+INPUTS = Inputs(__file__)
 DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
 
 
@@ -75,9 +75,7 @@ OTHERWISE: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("gentle", "otherwise", "said"), Inputs(__file__).table("first_sentences.toml")["rows"]
-)
+@pytest.mark.parametrize(("gentle", "otherwise", "said"), INPUTS.table("first_sentences.toml")["rows"])
 def test_the_first_sentence_follows_the_record(run, gentle, otherwise, said):
     turns = (turn for begin, end in gentle for turn in range(begin, end))
     assert first_sentence(run, *turns, **OTHERWISE[otherwise]) == said
@@ -188,18 +186,6 @@ def test_the_present_is_chosen_before_the_first_change_of_control(run):
     assert now(np.where(turns < 6, 1, 0)) == 3
 
 
-def test_a_fallback_that_came_before_the_damage_has_no_delay():
-    scenario = load_scenario("level_turns").scenario
-
-    def values(*steps: int | None) -> list[object]:
-        fallback = Fallback("z1", 0.6, *steps)
-        return list(of_fallback(fallback, scenario)[2])
-
-    assert values(30, 30, 12) == [60.0, 30, None, None, 12]
-    assert values(30, 31, None) == [60.0, 30, 31, 1, None]
-    assert values(30, 30, None) == [60.0, 30, 30, 0, None]
-
-
 @pytest.mark.usefixtures("no_drawing")
 def test_what_nobody_knows_is_left_out(run, tmp_path):
     text = text_of(replace(altered(run, truth=None), summary={}), tmp_path / "run")
@@ -260,21 +246,13 @@ def test_a_calibration_file_shows_its_wing(run, make_calibration):
 
 # ------------------------------------------------------------------------------- what is refused
 
-BROKEN = {
-    "no run": ("run.nc", None, r"holds no run\.nc"),
-    "empty": ("run.nc", b"", "damaged"),
-    "text": ("run.nc", b"not a run", r"damaged.* resume the run or fly it again\.$"),
-    "half a configuration": ("config.json", b'{"half": ', r"config\.json"),
-    "a list": ("config.json", b"[1]", r"config\.json"),
-    "no configuration": ("config.json", None, r"config\.json.*fly it again"),
-}
 
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_a_damaged_run_gives_one_sentence(run, tmp_path, name):
+@pytest.mark.parametrize(("file", "content", "sentence"), INPUTS.table("damaged.toml")["rows"])
+def test_a_damaged_run_gives_one_sentence(run, tmp_path, file, content, sentence):
     place = stored(run, tmp_path / "run")
-    file, content, sentence = BROKEN[name]
-    (place / file).unlink() if content is None else (place / file).write_bytes(content)
+    (place / file).unlink()
+    if content:
+        (place / file).write_text(content, encoding="utf-8")
     with pytest.raises(RunFolderError, match=sentence) as caught:
         report.write_report(place)
     assert "\n" not in str(caught.value)

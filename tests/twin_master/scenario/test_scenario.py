@@ -118,12 +118,7 @@ def test_no_table_whatsoever_raises_anything_but_a_sentence(table):
 
 # ---------------------------- the kinds, a kind of one's own, and files of format 1
 
-WING = {"young_modulus_factor": 1.0073}
-OLD = {
-    "level_turns": {"kind": "fmu", "design": "uav_wing", "binding": "uav_wing", "parameters": WING},
-    "model_mismatch": {"kind": "strain_library", "design": "uav_wing", "observation_model": "design"},
-    "pump_wear": {"script": "gear_pump", "binding": "gear_pump", "parameters": {"viscosity_factor": 1.02}},
-}
+FORMAT_1 = Inputs(__file__).table("format_1.toml")
 
 
 def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:
@@ -132,9 +127,9 @@ def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:
     return parse_scenario(table, "old.toml")
 
 
-@pytest.mark.parametrize("name", sorted(OLD))
+@pytest.mark.parametrize("name", FORMAT_1["same"])
 def test_a_file_of_format_1_means_what_it_meant(name):
-    assert of_format_1(name, OLD[name]) == parse_scenario(table_of(name), name)
+    assert of_format_1(name, FORMAT_1["same"][name]) == parse_scenario(table_of(name), name)
 
 
 def test_all_of_several_fmus_is_read_from_format_1():
@@ -143,32 +138,16 @@ def test_all_of_several_fmus_is_read_from_format_1():
     assert of_format_1("three_fmus", old) == parse_scenario(table_of("three_fmus"), "three_fmus")
 
 
-@pytest.mark.parametrize(
-    ("asset", "flown", "believed"),
-    [
-        ({"file": "a.fmu", "binding": "b.toml"}, "fmu", "asset"),
-        ({"file": "a.fmu", "binding": "b.toml", "design": "uav_wing"}, "fmu", "design"),
-        ({"design": "calibration", "binding": "uav_wing", "patch": "p"}, "calibration", "calibration"),
-        ({"design": "w.toml", "binding": "uav_wing", "observation_model": "asset"}, "design", "asset"),
-        ({"kind": "coupled", "file": "a.ssp", "binding": "b.toml"}, "ssp", "asset"),
-        ({"script": "gear_pump", "binding": "b", "observation_model": "library", "library": "l.nc"},
-         "script", "library"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("asset", "flown", "believed"), FORMAT_1["kinds"]["rows"])
 def test_every_combination_of_format_1_has_its_kinds(asset, flown, believed):
     scenario = of_format_1("level_turns", asset)
     assert (scenario.asset.kind, scenario.belief.kind) == (flown, believed)
 
 
-def test_what_is_wrong_with_format_1_stays_wrong():
-    for asset, words in (
-        ({"kind": "glider"}, "`kind` must be one of"),
-        ({"design": "uav_wing"}, "asset.binding"),
-        ({"kind": "strain_library", "observation_model": "design"}, "belief.design"),
-        ("wing", "asset"),
-    ):
-        with pytest.raises(ScenarioError, match=words):
-            of_format_1("level_turns", asset)  # type: ignore[arg-type]
+@pytest.mark.parametrize(("asset", "words"), FORMAT_1["wrong"]["rows"])
+def test_what_is_wrong_with_format_1_stays_wrong(asset, words):
+    with pytest.raises(ScenarioError, match=words):
+        of_format_1("level_turns", asset)
 
 
 class Bellows(AssetSection):

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from reporting.errors import FileNotWrittenError
-from tests.twin_master.runs import of_library
+from tests.twin_master.runs import flight_of, of_library
 from twin_master.errors import RunFolderError
-from twin_master.mission.loop import fly
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Reference
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of, tables_of
-from twin_master.store.summary import control_changes, filtered_rms_error, find_fallback, summarise
+from twin_master.store.summary import filtered_rms_error, find_fallback, of_fallback, summarise
 from twin_master.store.writing import open_run, write_run
 
 
@@ -27,9 +26,7 @@ def result(library_file: Path) -> MissionResult:
 
 def flown(name: str, library_file: Path) -> MissionResult:
     knowledge, source = of_library(name, library_file)
-    truth = knowledge.truth(3)
-    flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
-    return MissionResult(knowledge.scenario, knowledge, flight, truth)
+    return MissionResult(knowledge.scenario, knowledge, flight_of(knowledge, source), knowledge.truth(3))
 
 
 def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_path):
@@ -100,7 +97,8 @@ def test_damaged_and_unwritable(result, tmp_path):
         write_run(tmp_path / "file", groups_of(result), {})
 
 
-MODEL = build_graphical_model(load_scenario("level_turns").scenario)
+SCENARIO = load_scenario("level_turns").scenario
+MODEL = build_graphical_model(SCENARIO)
 Z1 = MODEL.states.coordinates[:, 0]
 POLICY = np.where(Z1 > 0.59, 0, 1)
 TRUTH = np.zeros((50, 2))
@@ -129,13 +127,8 @@ def test_fallback(gentle, truth, delay, early):
     assert (found.switch_state, found.switch_level) == ("z1", 0.6)
     assert found.called_for_step == (30 if truth.any() else None)
     assert (found.delay, found.early_step) == (delay, early)
-
-
-def test_a_policy_of_several_states_or_none_has_no_switch():
-    both = np.where(MODEL.states.coordinates.sum(axis=1) > 0.59, 0, 1)
-    for policy in (both, np.ones(25, dtype=np.int64)):
-        found = find_fallback(MODEL.states, policy, 1, controls(31), TRUTH)
-        assert (found.switch_state, found.delay) == (None, None)
+    told = list(of_fallback(found, SCENARIO)[2])  # one that came before the damage has no delay
+    assert told[3:] == [None if early == 29 else delay, early]
 
 
 def test_rms_error_of_a_certain_belief():
@@ -161,18 +154,7 @@ def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(each
     )
     scenario = each.scenario.model_copy(update={"reference": references})
     complete = replace(each, scenario=scenario, flight=replace(each.flight, turns=turns))
-    figures = summarise(complete, np.zeros((50, 3)))
+    figures = [*summarise(complete, np.zeros((50, 3)))]
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
-
-
-def test_a_change_of_control_is_said_in_words():
-    names = ("2g", "3g", "rest")
-    assert control_changes(names, np.array([1, 1, 1]), "turn") == "flew 3g at every turn"
-    assert control_changes(names, np.array([1, 1, 0, 0]), "turn") == "left 3g for 2g at turn 2"
-    several = control_changes(names, np.array([1, 0, 1, 2, 0, 1]), "shift")
-    assert several == (
-        "left 3g for 2g at shift 1, left 2g for 3g at shift 2, left 3g for rest at shift 3, "
-        "and 2 more changes"
-    )

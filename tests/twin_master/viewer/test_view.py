@@ -20,9 +20,10 @@ import numpy as np
 import pytest
 
 from benchmarks.browser import CHROMIUM, open_browser
-from fe.wing.design import SHIPPED_DESIGN, load_design
+from fe.wing.design import SHIPPED_DESIGN
 from reporting.figures import new_figure, to_svg
 from reporting.files import atomic_write_bytes
+from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
@@ -30,30 +31,18 @@ from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.report.structure import design_of, planform_of
-from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Belief, Flight
 from twin_master.viewer.messages import LATEST, Request, Teller
-from twin_master.workflow import fly as new_run
+from uav_twin import fly, load_design, load_scenario
 
 TURNS = 50
-TOLD = {
-    "notices": [
-        {"kind": "alarm", "sentence": "Look at <b>gauge 3</b>.", "sensors": [3], "value": 120.0},
-        {"kind": "alarm", "sentence": "Turn 49: gauge 4 is off.", "sensors": [4], "value": 110.0},
-    ],
-    "learnt": {
-        name: {"mean": 0.95123, "standard_deviation": 0.006, "lower": 0.94, "upper": 0.96, "unit": "1"}
-        for name in ("a[10]", "a[9]", "e")
-    },
-}
-"""What an estimator that learns would have added to a turn."""
 
 
 @pytest.fixture(scope="module")
 def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("view") / "run"
-    new_run(load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False)
+    fly(load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False)
     # The gauges of the library are those of the shipped wing: with its design the page shows them from above.
     shutil.copy(SHIPPED_DESIGN, folder / DESIGN_COPY)
     return folder
@@ -332,7 +321,7 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         assert first.value("element('force').hidden")  # nothing was known at turn 10
         # A viewer that was away gets what it missed; one that looks back stays there, and knows of the rest.
         tabs[2].value("socket.onclose = null; socket.close()")
-        add(begun, *lines[31:-1], line_of(json.loads(lines[-1][65:]) | TOLD))
+        add(begun, *lines[31:-1], line_of(json.loads(lines[-1][65:]) | Inputs(__file__).table("told.toml")))
         tabs[1].wait("window.painted.at(-1)[0] === 49")
         first.wait("state.count === 50")
         assert first.value("state.shown") == 10

@@ -17,12 +17,11 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import of_library
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge
-from twin_master.network.twin import Twin
-from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import WatchSection
 from twin_master.watch import feeds
 from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
+from uav_twin import Twin, load_scenario
 
 TURNS = 60
 NAMES = [f"strain_{number}" for number in range(1, 25)]

@@ -15,12 +15,14 @@ import pytest
 from discrepancy.report.figures import ReportInput
 from discrepancy.verdict_folder import write_verdict_folder
 from tests.discrepancy.rigs import ORIGIN, drag_found
-from tests.twin_master.runs import check_same, journal
+from tests.twin_master.runs import check_same, figures_of, journal
 from tests.twin_master.watch.watches import beliefs_of, decided, of_gauge, patch_of, ran, viewed, watchful
+from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
+from twin_master.store.writing import open_run
 from twin_master.viewer.messages import Request, Teller
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
@@ -93,15 +95,21 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     check_same(stopped.folder, watch.folder, JOURNAL_NAME)
 
 
-def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(noticing, recorded, tmp_path):
+def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(noticing, recorded, tmp_path):
     found, folder = drag_found(), tmp_path / "verdict"
     alone = replace(found, before=None, proof=None)  # of its figures the missing force
     write_verdict_folder(folder, ReportInput(alone, ORIGIN))
     of_gauge(folder / "patch.json", -0.3)  # an effect that a table of a wing's strains takes at once
     ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
     assert viewed(noticing).pictures == []  # turns are no motion
+    with pytest.raises(MissionInputError, match="--from-turn names one of the 20 turns"):
+        noticing.run(CsvFeed(recorded, noticing.scenario), str, patched=(folder / "patch.json", 21))
     given = (folder / "patch.json", 15)
-    noticing.run(CsvFeed(recorded, noticing.scenario), str, turns=25, patched=given)
+    counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, turns=25, patched=given)
+    noticing.store(counts, report=False)
+    run = open_run(noticing.folder)
+    assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
+    assert {"gap_after_patch_15", "gap_before_patch_15"} <= {*figures_of(noticing.folder)}
     shutil.rmtree(folder)
     flight = viewed(noticing)
     (picture,) = flight.pictures

@@ -24,10 +24,8 @@ from tests.command_line import command, refused, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
 from tests.twin_master.watch.watches import (
     begun,
-    beliefs_of,
     decided,
     killed_at,
-    of_gauge,
     ran,
     viewed,
     wait_until,
@@ -365,25 +363,6 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     told = [json.loads(line) for line in again.stdout.splitlines()]
     assert [(decision["turn"], decision["told_again"]) for decision in told] == [(59, True)]
     assert "60 messages." in again.stderr
-
-
-@pytest.mark.long
-def test_a_patch_is_believed_from_a_stated_turn_on(watch, mission, tmp_path):
-    observed = mission.observed.copy()
-    observed[20:, 4] *= 0.88
-    feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, mission.control_index), watch.scenario)
-    given = of_gauge(tmp_path / "patch.json", -0.12)
-    ran(watch, feed, 40)
-    with pytest.raises(MissionInputError, match="--from-turn names one of the 40 turns"):
-        watch.run(feed, str, patched=(given, 41))
-    watch.run(feed, str, turns=45, patched=(given, 20))
-    watch.store(ran(watch, feed), report=False)
-    run = uav_twin.open_run(watch.folder)
-    assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 20)
-    beliefs = beliefs_of(watch, observed, mission.control_index, 20)
-    np.testing.assert_array_equal(run["filtered"]["probability"].values, beliefs)
-    figures = figures_of(watch.folder)
-    assert figures["gap_after_patch_20"] < 0.97 * figures["gap_before_patch_20"]
 
 
 def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole):

@@ -1,0 +1,115 @@
+"""What the text of a unit means in SI, as pint knows it."""
+
+import re
+import unicodedata
+from decimal import Decimal
+from fractions import Fraction
+from functools import cache, lru_cache
+from math import pi
+from pathlib import Path
+from tokenize import TokenError
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from pint import UnitRegistry
+
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+"""In the order of `Meaning.exponents`."""
+_ROOTS = ("gram", "meter", "second", "ampere", "kelvin", "mole", "candela", "radian")
+"""The same in pint, which counts in grams."""
+_ALIASES = {
+    "kp": "kgf", "rev": "turn", "U": "turn", "%": "percent", "‰": "permille", "°": "degree", "°C": "degC",
+    "-": "1",
+}  # fmt: skip
+"""Names of units that pint does not know, or reads as something else."""
+_LONGEST = 40
+"""Letters of a unit: pint takes long over more."""
+_PART = re.compile(r"(\(*)([^\W\d_]+|[%‰°]|1)(?:\^?([+-]?\d))?(\)*)")
+"""One factor of a unit: a name and its power, and parentheses that begin before and end after it."""
+_WORDS = {
+    "chain", "chains", "dB", "decade", "hand", "hands", "link", "links", "octave", "point", "points", "rod",
+    "rods",
+}  # fmt: skip
+"""What pint takes for lengths and ratios, and measuring programmes do not."""
+
+
+class Meaning(NamedTuple):
+    """SI value = `factor` * value + `offset`, in the SI unit with these exponents (of `BASE_UNITS`)."""
+
+    exponents: tuple[int, ...]
+    factor: float
+    offset: float = 0.0
+
+
+@cache
+def _known_units() -> "UnitRegistry[Any]":
+    """Return the units of pint in fractions of integers; pi is that of floats, and so are its multiples."""
+    import pint
+
+    known: UnitRegistry[Any] = pint.UnitRegistry(None, non_int_type=Fraction, on_redefinition="ignore")
+    known.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
+    known.define(f"pi = {Decimal(pi)} = π")
+    known.define("@alias ohm = Ohm")
+    return known
+
+
+def _expression(unit: str, *, gravity: bool) -> str:
+    """Return a unit as pint reads it; raises ValueError if it is not made of names and powers."""
+    text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST]).replace("**", "^")
+    parts = re.split(r"\s*([*/.·⋅]|\s)\s*", _ALIASES.get(text, text))
+    for at in range(0, len(parts), 2):
+        found = _PART.fullmatch(parts[at])
+        if found is None or found[2] in _WORDS or len(unit) > _LONGEST:
+            raise ValueError(f"{unit!r} is no unit")
+        name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", _ALIASES.get(found[2], found[2]))
+        name = re.sub(r"^([mμ]?)g$", r"\1g_0", name) if gravity else name
+        parts[at] = found[1] + (name if found[3] is None else f"({name})**{found[3]}") + found[4]
+        if at:
+            parts[at - 1] = "/" if parts[at - 1] == "/" else "*"
+    return "".join(parts)
+
+
+@cache
+def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...], Fraction, Fraction]:
+    """Return what a unit means: its exponents, and factor and offset as fractions, see `Meaning`.
+
+    Names with SI prefixes are joined by `.`, `*`, `/` or a blank; a power follows its name (`m2`, `m^2`,
+    `s-1`, `m**2`); a `/` divides by the next name or parenthesis only, as in Modelica. An angle is no number
+    here, and a hertz no rad/s.
+
+    Parameters
+    ----------
+    unit : str
+        Such as `kN`, `kg/m3`, `W/(m2.K)`, `1/s`, `degC`, `N mm`.
+    gravity : bool
+        Whether g is an acceleration, not a mass.
+
+    Raises
+    ------
+    ValueError
+        If pint does not know it.
+    """
+    from pint.errors import PintError
+
+    known = _known_units()
+    try:
+        parsed = known.parse_units(_expression(unit, gravity=gravity))
+        factor, roots = known.get_root_units(parsed)
+        offset = known.Quantity(Fraction(0), parsed).to_root_units().magnitude
+    except (PintError, TokenError, AttributeError, TypeError, ArithmeticError) as cause:
+        raise ValueError(f"{unit!r} is no unit") from cause
+    powers: dict[str, Any] = dict(roots._units)
+    exponents = tuple(int(powers.pop(root, 0)) for root in _ROOTS)
+    if powers:
+        raise ValueError(f"{unit!r} is no unit of SI")
+    return exponents, Fraction(str(factor)) / 1000 ** exponents[0], Fraction(offset)
+
+
+@lru_cache(maxsize=1024)
+def meaning_of(unit: str) -> Meaning | None:
+    """Return what a unit means, or None if it is not understood; see `exact_meaning`."""
+    try:
+        exponents, factor, offset = exact_meaning(unit)
+        return Meaning(exponents, float(factor), float(offset))
+    except (ValueError, OverflowError):
+        return None
