@@ -103,9 +103,14 @@ class Candidate:
         return any(term.free_shape for term in self.terms)
 
     @property
+    def parameters(self) -> list[EffectParameter | ShapeParameter]:
+        """Fitted parameters, in order."""
+        return [item for term in self.terms for item in term.parameters]
+
+    @property
     def size(self) -> int:
         """Number of fitted parameters."""
-        return sum(len(term.parameters) for term in self.terms)
+        return len(self.parameters)
 
     @property
     def acts_on(self) -> frozenset[TrialKind]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
+from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 
 from .candidate import Candidate, Linearisation, Point, Remainder, State
@@ -268,10 +269,11 @@ def _finished(problem: Problem, candidate: Candidate, state: State, converged: b
 
 def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
     """Return the point a share of a step ahead."""
-    parameters = [item for term in candidate.terms for item in term.parameters]
     effect = [
         item.prior.stepped(u, du) if item.magnitude else u + du
-        for item, u, du in zip(parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True)
+        for item, u, du in zip(
+            candidate.parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True
+        )
     ]
     return _bounded(
         replace(
@@ -312,3 +314,39 @@ def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateF
     parts[number] = replace(term, free_shape=True), np.append(values, canonical)
     terms, begin = zip(*parts, strict=True)
     return attempt(problem, Candidate(terms), replace(named.point, effect=np.concatenate(begin)))
+
+
+def is_box(candidate: Candidate) -> bool:
+    """Whether an effect has more than one parameter that is no mere size, as a place and a length.
+
+    Its edges pass sensors and lines of the mesh, and optima on either side may fit within the noise.
+    """
+    return any(sum(not item.magnitude for item in term.parameters) > 1 for term in candidate.terms)
+
+
+def around(problem: Problem, found: CandidateFit) -> CandidateFit:
+    """Return the best fit of the same candidate beside an optimum, or the fit itself.
+
+    Hysteresis of several elements has many local optima along the direction that the data tell least of, and
+    a place has them at each sensor that it passes.
+    """
+    options, size = {"iterations": SEARCH.neighbour_iterations}, found.candidate.size
+    free = [number for number, item in enumerate(found.candidate.parameters) if not item.magnitude]
+    for _ in range(SEARCH.rounds):
+        moves = [step * axis for axis in np.eye(size)[free] for step in SEARCH.place_steps]
+        if size > 1:
+            _, directions = np.linalg.eigh(found.effect_covariance)
+            moves += [step * directions[:, -1] for step in SEARCH.ridge_steps]
+        better = found
+        for move in moves:
+            start = replace(found.point, effect=found.effect + move)
+            again = attempt(problem, found.candidate, start, give_up=better.objective, **options)
+            if again is None or again.log_evidence <= better.log_evidence + SEARCH.neighbour_gain:
+                continue
+            if not again.converged:  # along a bent valley one far better may have run out of steps
+                again = attempt(problem, again.candidate, again.point, **options) or again
+            better = again
+        if better is found:
+            break
+        found = better
+    return found

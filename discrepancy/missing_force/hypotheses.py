@@ -66,7 +66,7 @@ def both_signs(term: Term) -> bool:
 
 def stepped(candidate: Candidate, effect: FloatArray, step: FloatArray) -> FloatArray:
     """Return the unknowns of a candidate (E,) after a step, taken along the values' tangents."""
-    priors = [item.prior for term in candidate.terms for item in term.parameters]
+    priors = [item.prior for item in candidate.parameters]
     moved = [prior.stepped(float(u), float(s)) for prior, u, s in zip(priors, effect, step, strict=True)]
     return np.clip(moved, -LARGEST, LARGEST)
 

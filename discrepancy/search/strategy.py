@@ -16,7 +16,7 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.fits.candidate import Candidate, Key, Point, Term
-from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape, objective
+from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box, objective
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen
@@ -299,10 +299,14 @@ class Search:
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, one law of free shape, more effects. The best candidate is computed finely before what
-        rests on its evidence.
+        One effect, the best of them beside their optimum too, one law of free shape, more effects. The best
+        candidate is computed finely before what rests on its evidence.
         """
-        self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
+        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
+        for rank, item in enumerate(ranked[: SEARCH.ridges]):
+            misses = absolute_gate(self.problem, item).passed is False
+            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
+                self.keep(around(self.problem, item), exact=True)
         self.settle()
         self.families()
         self.settle()
