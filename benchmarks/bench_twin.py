@@ -27,7 +27,7 @@ from twin_master.network.inference import (
     smooth_many,
 )
 from twin_master.network.planner import value_iteration
-from twin_master.network.rewards import RewardModel, RewardSettings
+from twin_master.network.rewards import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
 
@@ -50,7 +50,7 @@ def mission_model() -> tuple[GraphicalModel, GaussianSensorModel, RewardModel]:
     shape = 1e-3 * (1.0 - 0.7 * span)
     strain = shape * load / draws * (1.0 + 0.7 * z1 * np.exp(-3 * span)) * (1.0 + 0.5 * z2 * span)
     sensors = GaussianSensorModel(strain, 125e-6)
-    return model, sensors, RewardModel(sensors, RewardSettings(2500e-6, (-0.1, 0.1), 125e-6, (2.0, 3.0)))
+    return model, sensors, RewardModel(sensors, 2500e-6, (-0.1, 0.1), 125e-6, (2.0, 3.0))
 
 
 def eliminate_variables(
@@ -207,7 +207,7 @@ def run() -> list[Measurement]:
     whole = median_seconds(whole_history, repeats=25, inner=20)
 
     def side_by_side() -> None:
-        found, _ = filter_many(model, many_controls, many, model.log_prior)
+        found, _ = filter_many(model.transition, many_controls, many, model.log_prior)
         smooth_many(model.transition, many_controls, found.filtered, found.log_filtered)
 
     batch = median_seconds(side_by_side, repeats=9)

@@ -55,8 +55,8 @@ from twin_master.mission.journal import JournalFile, reading_of, records_backwar
 from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario, parse_scenario
-from twin_master.scenario_check import check_scenario
 from twin_master.store.writing import finished_run, open_run
+from twin_master.workflow import check_scenario
 
 CPU_SECONDS = 20
 MEMORY = 4 * 1024**3

@@ -208,10 +208,8 @@ def measure_ring_down(
     Raises
     ------
     ExperimentDataError
-        If there is no trial, noise or step is negative or not finite, or the records would be too short.
+        If the step is not positive, or the records would be too short or too long.
     """
-    if trials < 1 or not (math.isfinite(noise) and noise >= 0.0):
-        raise ExperimentDataError(said("virtual.trials", trials=trials, noise=noise))
     if MOST_SAMPLES < trials * duration * sampling_rate < math.inf:
         asked = trials, duration, sampling_rate, MOST_SAMPLES
         raise ExperimentDataError(said("virtual.samples", asked=asked))

@@ -23,7 +23,7 @@ from discrepancy.campaign.records import Campaign
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.document import Origin, plain
-from discrepancy.errors import FitError, ModelError
+from discrepancy.errors import ModelError
 from discrepancy.judgement.separability import usable
 from discrepancy.models.interface import Model
 from discrepancy.sources.simulated_campaigns import Hidden, Simulator
@@ -194,10 +194,8 @@ def self_calibrate(
     Raises
     ------
     DiscrepancyError
-        If nothing can be tested here, or `count` is not positive.
+        If nothing can be tested here.
     """
-    if count < 1:
-        raise FitError(f"Self-calibration needs at least one simulated campaign, but {count} were asked for.")
     campaign, _ = checked(campaign, model)
     simulator = Simulator(campaign, model)
     testable = usable(effects, simulator.setting)

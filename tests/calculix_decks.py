@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fe.verification.calculix_comparison import calculix_program, read_frequencies, read_tables, run_calculix
+from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -132,31 +133,5 @@ def write_structure(folder: Path, build: Callable[..., Deck], tables: str) -> Pa
     for name, factors in (("whole", {}), ("skin_half", {"skin": 0.5}), ("patch_half", {"patch": 0.5})):
         store(build(**factors), folder, name)
     file = folder / "structure.toml"
-    file.write_text(STRUCTURE + tables, encoding="utf-8")
+    file.write_text(Inputs(__file__).text("stored.toml") + tables, encoding="utf-8")
     return file
-
-
-STRUCTURE = """name = "stored"
-length_unit = "mm"
-stiffness_matrix = "whole.sti"
-mass_matrix = "whole.mas"
-unknowns = "whole.dof"
-[[parameter]]
-name = "e"
-[[control]]
-name = "push"
-unit = "N"
-minimum = -1000
-maximum = 1000
-[[damage]]
-name = "z1"
-[[part]]
-changed = "skin_half.sti"
-times = 0.5
-scaled_by = "e"
-[[part]]
-changed = "patch_half.sti"
-times = 0.5
-scaled_by = "e"
-damage = "z1"
-"""

@@ -19,8 +19,9 @@ from calibration.result.record import Calibration
 from discrepancy.sources.examples import write_example
 from fmu_asset.packing.structure_fmu import build_fmu
 from tests import command_line
+from tests.refusals import Inputs
 
-ROOT = Path(__file__).parents[1]
+ROOT, INPUTS = Path(__file__).parents[1], Inputs(__file__)
 REFERENCE = ROOT.parent / "shared" / "reference"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 BLOCK = re.compile(r"^```(?:\{code-cell\} )?(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -132,33 +133,7 @@ def converted_wing(folder: Path) -> None:
 def fmu_rig(folder: Path) -> None:
     """The wing's FMU as the model of a rig."""
     wing_fmu(folder)
-    (folder / "rig.toml").write_text(RIG, encoding="utf-8")
-
-
-RIG = """
-format = 1
-kind = "fmu"
-name = "Wing as a rig"
-fmu = "wing.fmu"
-
-[inputs]
-force = { tip = "tip_force" }
-
-[[output]]
-name = "tip"
-variable = "load_point_displacement"
-
-[[parameter]]
-name = "young_modulus_factor"
-variable = "young_modulus_factor"
-mean = 1.0
-deviation = 0.02
-low = 0.9
-high = 1.1
-
-[scales]
-length = 1.8
-"""
+    shutil.copy(INPUTS.folder / "rig.toml", folder)
 
 
 def bracket(folder: Path) -> None:
@@ -202,32 +177,7 @@ READER_HAS: dict[str, tuple[Prepare, ...]] = {
 }
 """What is in the reader's folder before the first block."""
 
-MADE_ONCE = {
-    "README.md": ("mission", "runs/demo"),
-    "docs/calibrate_a_wing.md": ("calibrated_wing", "calibrations/wing_7"),
-    "docs/discrepancy_missions.md": ("short_mission", "runs/mission"),
-    "docs/report.md": ("mission", "runs/level_turns"),
-    "docs/run_folder.md": ("mission", "runs/level_turns"),
-}
-"""Folders that fixtures make, and where the page has them."""
-
-MINUTES = {
-    "docs/calibration.md",
-    "docs/discrepancy_missions.md",
-    "docs/paper.md",
-    "docs/python.md",
-    "docs/real_wing.md",
-    "docs/tutorials/a_fleet_that_learns.md",
-    "docs/tutorials/calibrate_a_wing.md",
-    "docs/tutorials/fly_the_mission.md",
-    "docs/tutorials/name_an_effect.md",
-    "docs/tutorials/watch_and_teach.md",
-    "docs/verdict.md",
-}
-"""Pages whose blocks take ten seconds of processor time or more, and show what others show."""
-
-MODULES = {"docs/use_the_wing_in.md": "libcosimpy"}
-"""What the page tells the reader to install; without it the blocks before are run."""
+TABLES = INPUTS.table("pages.toml")
 
 
 @pytest.fixture(scope="module")
@@ -261,13 +211,16 @@ def calibrated_wing(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(page, marks=pytest.mark.long if page in MINUTES else ()) for page in sorted(WITH_PYTHON)],
+    [
+        pytest.param(page, marks=pytest.mark.long if page in TABLES["minutes"] else ())
+        for page in sorted(WITH_PYTHON)
+    ],
 )
 def test_the_blocks_of_a_page_run_as_printed(name, tmp_path, monkeypatch, request):
     for prepare in READER_HAS.get(name, ()):
         prepare(tmp_path)
-    if name in MADE_ONCE:
-        fixture, place = MADE_ONCE[name]
+    if name in TABLES["made"]:
+        fixture, place = TABLES["made"][name]
         shutil.copytree(request.getfixturevalue(fixture), tmp_path / place)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "__main__"}
@@ -276,6 +229,7 @@ def test_the_blocks_of_a_page_run_as_printed(name, tmp_path, monkeypatch, reques
         if first.startswith("%%writefile "):
             Path(first.split()[1]).write_text(rest, encoding="utf-8")
             continue
-        if name in MODULES and MODULES[name] in block:
-            pytest.importorskip(MODULES[name])
+        module = TABLES["modules"].get(name)
+        if module and module in block:
+            pytest.importorskip(module)
         exec(compile(block, f"{name}, block {number}", "exec"), names)

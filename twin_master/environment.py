@@ -21,7 +21,6 @@ from twin_master.errors import MissionInputError
 from twin_master.fleet.flight import source_of
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.truth import Plant
-from twin_master.network.rewards import health_reward
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.sentences import said
 
@@ -156,10 +155,9 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         reading = self._plant.turn(control, before)
         sensed, happened = reading.observed, reading.happened
         assert happened is not None
-        settings, weights = self.knowledge.rewards.settings, self.scenario.rewards
-        chosen = slice(None) if settings.health_sensors is None else list(settings.health_sensors)
-        health = float(health_reward(happened.observation[chosen], settings.limit))
-        worth = settings.control_reward[control]
+        rewards, weights = self.knowledge.rewards, self.scenario.rewards
+        health = float(rewards.health(happened.observation))
+        worth = rewards.control_reward[control]
         reward = weights.health_weight * health + weights.control_weight * worth
         info = {
             "observed": sensed,

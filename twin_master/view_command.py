@@ -8,7 +8,7 @@ import typer
 
 def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
     """Show a flight in the browser, turn by turn or while it goes on, or a whole fleet."""
-    from twin_master.fleet.view import is_fleet, serve_fleet
+    from twin_master.fleet.report import is_fleet, serve_fleet
     from twin_master.viewer.server import serve
 
     def ready(address: str) -> None:

@@ -110,7 +110,7 @@ def _write(text: str, *, flush: bool) -> bool:
 
 def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:
     """Return a decision for people: a line of a terminal."""
-    from twin_master.mission.replay import health_in_words
+    from twin_master.mission.loop import health_in_words
 
     health = ", ".join(f"{name} {said}" for name, said in health_in_words(decision).items())
     line = (

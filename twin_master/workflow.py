@@ -1,8 +1,12 @@
-"""The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report."""
+"""The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report.
+
+A scenario can be checked before: only it and the small files beside it are read, so that it takes no time.
+"""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +18,20 @@ from reporting.files import atomic_write_text
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import AssetSource, calibrated_with, shown_without_noise
-from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
+from twin_master.assets.resolution import (
+    Overrides,
+    asset_source,
+    believed_source,
+    given_overrides,
+    resolve_scenario,
+)
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.planning import policy_file, read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
+from twin_master.network.memory import scenario_bytes
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import (
@@ -33,7 +44,7 @@ from twin_master.run_folder import (
     with_inputs,
 )
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.scenario.schema import Scenario
+from twin_master.scenario.schema import WATCHED_KIND, Scenario
 from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
@@ -298,3 +309,42 @@ def _report(folder: Path) -> None:
     from twin_master.report.page import write_report
 
     write_report(folder)
+
+
+def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -> dict[str, Any]:
+    """Return what a scenario is with the overrides, once everything that it names was looked at.
+
+    Beside what it flies and believes, in words, these are the sizes of the twin: `levels` of each factor,
+    joint `states`, `controls`, `sensors`, and the `memory` of all its arrays [bytes].
+
+    Raises
+    ------
+    MissionInputError
+        A file is missing, or a name of the scenario is none of its binding's.
+    InvalidModelError
+        The twin does not fit in memory.
+    BindingError, InvalidDesignError, DesignFileError
+        The binding or the design is wrong.
+    """
+    scenario = resolve_scenario(loaded, overrides or Overrides())
+    watched = scenario.asset.kind == WATCHED_KIND
+    source = believed_source(scenario) if watched else asset_source(scenario)
+    source.check()
+    origin, mission, calibration = source.origin, scenario.mission, scenario.calibration
+    levels = {factor.name: len(factor.levels) for factor in scenario.state}
+    return {
+        "name": mission.name,
+        "title": mission.title,
+        "flown": "nothing, a real asset is watched" if watched else origin.asset,
+        "believed": origin.model,
+        "uncertain": f"{calibration.parameter}, from {calibration.source.replace('_', ' ')}",
+        "draws": 1 if calibration.source == "fixed" else calibration.draws,
+        "levels": levels,
+        "states": prod(levels.values()),
+        "controls": scenario.control_names,
+        "sensors": scenario.observation.count,
+        "turns": mission.steps,
+        "prediction_steps": mission.prediction_steps,
+        "step_name": mission.step_name,
+        "memory": sum(scenario_bytes(scenario).values()),
+    }

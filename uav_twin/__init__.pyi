@@ -22,7 +22,7 @@ from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
 from scenarios import structure_files as structure_files
 from twin_master.environment import ScenarioEnvironment as ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet as fly_fleet
-from twin_master.fleet.lessons import learn_from_fleet as learn_from_fleet
+from twin_master.fleet.learn import learn_from_fleet as learn_from_fleet
 from twin_master.fleet.reading import open_fleet as open_fleet
 from twin_master.learning.monitor import WatchfulEstimator as WatchfulEstimator
 from twin_master.mission.preparation import prepare_twin as prepare_twin

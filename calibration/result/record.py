@@ -5,7 +5,7 @@ A wing's from the folder of its laboratory and any model's from a campaign are o
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -171,7 +171,7 @@ class Calibration:
     Raises
     ------
     CalibrationRecordError
-        If arrays do not fit each other or hold values that are not finite, or a name cannot be printed.
+        If the name cannot be printed.
     """
 
     asset: str
@@ -199,18 +199,6 @@ class Calibration:
 
     def __post_init__(self) -> None:
         check_name(self.asset)
-        if self.procedure not in get_args(Procedure):
-            raise CalibrationRecordError(said("posterior.procedure", known=get_args(Procedure), self=self))
-        for which in ("samples", "prior_samples"):
-            values = np.array(getattr(self, which), dtype=np.float64, order="C")
-            values.setflags(write=False)
-            columns = len(self.figures)
-            if values.ndim != 2 or not len(values) or values.shape[1] != columns:
-                came = str(values.shape)
-                raise CalibrationRecordError(said("posterior.shape", which=which, columns=columns, came=came))
-            if not np.all(np.isfinite(values)):
-                raise CalibrationRecordError(f"{which} hold a value that is not finite.")
-            object.__setattr__(self, which, values)
 
     # ------------------------------------------------------------ figures
 

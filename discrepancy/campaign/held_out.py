@@ -48,17 +48,12 @@ def choose_held_out(campaign: Campaign) -> Campaign:
                 parts = _split(trial, {item.name for item in campaign.trials})
                 if parts:
                     split[trial.name] = parts
-    trials = []
+    kept: list[Trial] = []
     for trial in campaign.trials:
-        if trial.name in split:
-            trials += split[trial.name]
-        else:
-            trials.append(replace(trial, held_out=True) if trial.name in chosen else trial)
-    held = [trial.name for trial in trials if trial.held_out]
-    if not held:
-        return replace(campaign, remarks=(*campaign.remarks, said("remarks.nothing_held_out")))
-    remark = said("remarks.held_out", names=", ".join(held))
-    return replace(campaign, trials=tuple(trials), remarks=(*campaign.remarks, remark))
+        kept += split.get(trial.name, (replace(trial, held_out=trial.name in chosen),))
+    held = ", ".join(trial.name for trial in kept if trial.held_out)
+    remark = said("remarks.held_out", names=held) if held else said("remarks.nothing_held_out")
+    return replace(campaign, trials=tuple(kept), remarks=(*campaign.remarks, remark))
 
 
 def level(trial: Trial) -> float:

@@ -42,7 +42,7 @@ class Release:
     Raises
     ------
     CampaignFileError
-        The displacement is zero, or no mode is free.
+        The displacement is zero.
     """
 
     displacement: Number
@@ -57,8 +57,6 @@ class Release:
     def __post_init__(self) -> None:
         if self.displacement == 0.0:
             raise CampaignFileError(said("campaign.no_side"))
-        if self.mode_count < 1:  # its amplitude would count as exact, unseen
-            raise CampaignFileError(said("campaign.mode_count", count=self.mode_count))
 
 
 @dataclass(frozen=True)

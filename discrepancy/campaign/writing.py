@@ -53,8 +53,8 @@ def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) 
     Raises
     ------
     CampaignFileError
-        The campaign cannot be told in the format: temperatures without a reference, noise records with
-        several intervals, or what `parse_campaign` refuses, such as a channel that is called like an input.
+        The campaign cannot be told in the format: noise records with several intervals, or what
+        `parse_campaign` refuses, such as a channel that is called like an input.
     FileNotWrittenError, DiskFullError
         As `reporting.files.atomic_file`.
     """
@@ -85,9 +85,7 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
     if trial.kind is TrialKind.FLIGHT:
         columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
-        if campaign.reference_temperature is None:
-            raise CampaignFileError(said("campaign.temperature_of_none", trial=trial))
-        columns["temperature"] = campaign.reference_temperature + trial.temperature
+        columns["temperature"] = trial.temperature + (campaign.reference_temperature or 0.0)
     for index, region in enumerate(trial.regions):
         name = region if region in USUAL_REGIONS else f"{schema.OF_REGION}{region}"
         for key, values in ((name, trial.health), (f"{name}_deviation", trial.health_deviation)):

@@ -183,22 +183,20 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
 
 def _scales(campaign: Campaign, predictions: dict[str, FloatArray]) -> dict[tuple[str, str], float]:
     """Return the data's scale over the prediction's by (channel, trial), signed, where it can be told."""
-    largest: dict[tuple[str, Quantity], float] = defaultdict(float)
-    for trial in campaign.trials:
-        for column, name in enumerate(trial.channels):
-            key = (trial.name, campaign.channels[name].quantity)
-            largest[key] = max(largest[key], _amplitude(predictions[trial.name][:, column], trial))
     result = {}
     for trial in campaign.trials:
-        for column, name in enumerate(trial.channels):
-            channel = campaign.channels[name]
+        channels = [campaign.channels[name] for name in trial.channels]
+        whole = [_amplitude(values, trial) for values in predictions[trial.name].T]
+        for column, channel in enumerate(channels):
             if np.isinf(channel.gain_deviation) or channel.quantity is Quantity.SIGNAL:
                 continue
             used = trial.used[:, column]
             data, model = trial.values[used, column], predictions[trial.name][used, column]
             expected = _amplitude(model, trial)
             noise = channel.noise_in(trial)
-            if expected <= _VISIBLE * largest[trial.name, channel.quantity] or expected == 0.0:
+            sizes = zip(channels, whole, strict=True)
+            largest = max(size for other, size in sizes if other.quantity is channel.quantity)
+            if expected <= _VISIBLE * largest or expected == 0.0:
                 continue
             scale = _slope(data, model) if not trial.is_dynamic else _dynamic_scale(data, model, trial, used)
             shown = float(np.median(data) * np.sign(np.median(model)))
@@ -206,7 +204,7 @@ def _scales(campaign: Campaign, predictions: dict[str, FloatArray]) -> dict[tupl
                 continue  # a reversed channel would show the other sign: this slope is a temperature's, say
             # What stays in the noise has no scale, unless the noise itself is beyond what the model shows.
             if abs(scale) * expected > _ABOVE_NOISE * noise and np.isfinite(scale) and scale != 0.0:
-                result[name, trial.name] = scale
+                result[channel.name, trial.name] = scale
     return result
 
 

@@ -1,5 +1,6 @@
 """Samples of the posterior of a model's parameters: by quadrature, of a checked Gaussian, or drawn."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -93,10 +94,11 @@ class Marginal:
         """
         problem = copy(trials or self._problem)
         shared = problem.shared
-        held = self.free if fixed is None else self.free[fixed]
+        fixed = np.ones(len(self.free), dtype=bool) if fixed is None else fixed
+        held = self.free[fixed]
         moments = {name: getattr(shared, name).copy() for name in ("centre", "low", "high", "scale")}
         for values in moments.values():
-            values[held] = self.values(u)[np.isin(self.free, held)]
+            values[held] = self.values(u)[fixed]
         moments["scale"][held] = 0.0
         problem.shared = replace(shared, **moments)
         start = near or (self._near if trials is None else problem.start(NOTHING))
@@ -105,7 +107,7 @@ class Marginal:
         try:
             return fit(problem, NOTHING, replace(start, shared=at))
         except ModelError as cause:
-            self.refused.append((np.where(np.isin(self.free, held), u, np.nan), str(cause)))
+            self.refused.append((np.where(fixed, u, np.nan), str(cause)))
             raise
 
     def __call__(self, u: FloatArray) -> float:
@@ -127,22 +129,17 @@ class Marginal:
             If the model fails at its prior mean.
         """
         problem = self._problem
-        found = [self._within(fit(problem, NOTHING, problem.start(NOTHING), iterations=40))]
+        fits = [self._within(fit(problem, NOTHING, problem.start(NOTHING), iterations=40))]
         generator = np.random.default_rng(seed)
         for _ in range(STARTS):
-            u = np.clip(generator.standard_normal(len(self.free)), self.low, self.high)
-            shared = problem.start(NOTHING).shared
-            shared[self.free] = u
-            start = Point(shared, problem.start(NOTHING).local, np.empty(0))
-            try:
-                other = self._within(fit(problem, NOTHING, start, iterations=40))
-            except (FitError, ModelError):
-                continue
-            near = [item for item in found if self._same(item, other)]
-            if not near:
-                found.append(other)
-            elif other.objective < near[0].objective - 1e-3:
-                found[next(at for at, item in enumerate(found) if item is near[0])] = other
+            start = problem.start(NOTHING)
+            start.shared[self.free] = np.clip(generator.standard_normal(len(self.free)), self.low, self.high)
+            with suppress(FitError, ModelError):
+                fits.append(self._within(fit(problem, NOTHING, start, iterations=40)))
+        found: list[CandidateFit] = []
+        for item in sorted(fits, key=lambda item: round(item.objective, 3)):  # of equal ones the first
+            if not any(self._same(other, item) for other in found):
+                found.append(item)
         found.sort(key=lambda item: -item.log_evidence)
         best = found[0]
         self._near = best.point
@@ -283,104 +280,71 @@ def cut_off(
 def _along_the_widest(
     marginal: Marginal, optima: tuple[CandidateFit, ...], count: int, generator: np.random.Generator
 ) -> FloatArray:
-    """Return draws (count, P): the parameter that is told least by quadrature, the others given it."""
-    free = marginal.free
-    deviations = np.sqrt(np.diag(optima[0].covariance)[free])
-    widest = int(np.argmax(deviations))
-    low, high = max(float(marginal.low[widest]), -REACH), min(float(marginal.high[widest]), REACH)
-    places = [np.linspace(low, high, WIDE)]
-    for item in optima:
-        deviation = float(np.sqrt(np.diag(item.covariance)[free][widest]))
-        near = float(item.point.shared[free][widest]) + deviation * np.linspace(-3.0, 3.0, NEAR)
-        places.append(np.clip(near, marginal.low[widest], marginal.high[widest]))
-    nodes = np.unique(np.concatenate(places))
-    nodes = nodes[np.concatenate(([True], np.diff(nodes) > LEAST_SPREAD * (nodes[-1] - nodes[0])))]
-    slices = Slices(marginal, widest, optima[0])
-    slices.visit(nodes)
-    fine, mass = slices.mass()
-    while len(slices.nodes) < MOST_NODES:
-        shares = np.diff(mass[::BETWEEN])
-        largest = int(np.argmax(shares))
-        if shares[largest] <= LARGEST_MASS:
-            break
-        slices.visit(np.array([0.5 * (slices.nodes[largest] + slices.nodes[largest + 1])]))
-        fine, mass = slices.mass()
-    return slices.others(np.interp(stratified(generator, count), mass, fine), generator)
+    """Return draws (count, P): the parameter that is told least by quadrature, the others given it.
 
-
-class Slices:
-    """The posterior at fixed values of one parameter, the others fitted and integrated with the nuisances.
-
-    The others are Gaussian given the one and cut off at the model's range: the evidence of a slice has the
-    share of the Gaussian that lies within.
+    At each node of the one the others are fitted and integrated with the nuisances: Gaussian given the one,
+    and cut off at the model's range. The evidence of a node has the share of that Gaussian that lies within.
     """
+    free, best = marginal.free, optima[0]
+    widest = int(np.argmax(np.diag(best.covariance)[free]))
+    one = np.arange(len(free)) == widest
+    ends = marginal.low[~one], marginal.high[~one]
+    centre = float(best.point.shared[free[widest]])
+    fits: dict[float, CandidateFit] = {}
+    energy: dict[float, float] = {}
 
-    def __init__(self, marginal: Marginal, index: int, best: CandidateFit) -> None:
-        self._marginal, self._index, self._best = marginal, index, best
-        self._fits: dict[float, CandidateFit | None] = {}
-        self.nodes = np.empty(0)
+    def others(found: CandidateFit) -> tuple[FloatArray, FloatArray]:
+        """Return mean (P - 1,) and covariance of the others at a node."""
+        return found.point.shared[free[~one]], found.covariance[np.ix_(free[~one], free[~one])]
 
-    def visit(self, nodes: FloatArray) -> None:
-        """Fit at further nodes, each from what was found beside it, the optimum first."""
-        marginal, index = self._marginal, self._index
-        free, best = marginal.free, self._best.point
-        fixed = np.arange(len(free)) == index
-        centre = float(best.shared[free][index])
-        known = {centre: best} | {u: item.point for u, item in self._fits.items() if item is not None}
-        for node in sorted(nodes.tolist(), key=lambda node: abs(node - centre)):
-            near = known[min(known, key=lambda place: abs(place - node))]
-            u = np.zeros(len(free))
-            u[index] = node
-            self._fits[node] = None
-            with suppress(FitError, ModelError):
-                self._fits[node] = found = marginal.fitted(u, fixed=fixed, near=near)
-                known[node] = found.point
-        self.nodes = np.array(sorted(self._fits))
+    def visit(node: float) -> None:
+        """Fit at a node, from what was found beside it; infinite where the model cannot be had."""
+        known = {centre: best.point} | {u: item.point for u, item in fits.items()}
+        near = known[min(known, key=lambda place: abs(place - node))]
+        energy[node] = np.inf
+        with suppress(FitError, ModelError):
+            fits[node] = found = marginal.fitted(np.where(one, node, 0.0), fixed=one, near=near)
+            share = 1.0 if one.all() else mass_inside(*others(found), *ends)
+            energy[node] = 0.5 * node**2 - found.log_evidence - float(np.log(max(share, np.exp(-EMPTY))))
 
-    def mass(self) -> tuple[FloatArray, FloatArray]:
-        """Return points and the posterior's distribution function at them, `BETWEEN` to an interval."""
-        nodes = self.nodes
-        energy = np.array([self._energy(node) for node in nodes.tolist()])
-        energy = np.minimum(energy - energy.min(), EMPTY)
-        share = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)
-        fine = np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * share).ravel(), nodes[-1])
-        density = np.exp(-Akima1DInterpolator(nodes, energy)(fine))
-        mass = np.concatenate(([0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))))
-        return fine, mass / mass[-1]
-
-    def _rest(self, found: CandidateFit) -> tuple[FloatArray, FloatArray]:
-        """Return mean (P - 1,) and covariance of the others in a slice."""
-        free = self._marginal.free
-        rest = np.arange(len(free)) != self._index
-        return found.point.shared[free][rest], found.covariance[np.ix_(free, free)][np.ix_(rest, rest)]
-
-    def _energy(self, node: float) -> float:
-        """Return the energy of a slice; infinite where the model could not be had."""
-        if (found := self._fits[node]) is None:
-            return np.inf
-        marginal, share = self._marginal, 1.0
-        rest = np.arange(len(marginal.free)) != self._index
-        if rest.any():
-            share = mass_inside(*self._rest(found), marginal.low[rest], marginal.high[rest])
-        return 0.5 * node**2 - found.log_evidence - float(np.log(max(share, np.exp(-EMPTY))))
-
-    def others(self, values: FloatArray, generator: np.random.Generator) -> FloatArray:
-        """Return draws (N, P) of all parameters given the one, cut off at the model's range."""
-        marginal, count = self._marginal, len(self._marginal.free)
-        draws = np.zeros((len(values), count))
-        rest = np.flatnonzero(np.arange(count) != self._index)
-        draws[:, self._index] = values
-        if not len(rest):
-            return draws
-        found = {node: item for node, item in self._fits.items() if item is not None}
-        nodes = np.array(sorted(found))
-        centres = np.array([self._rest(found[node])[0] for node in nodes.tolist()])
-        centre = Akima1DInterpolator(nodes, centres)(np.clip(values, nodes[0], nodes[-1]))
+    for node in sorted(_first_nodes(marginal, optima, widest), key=lambda node: abs(node - centre)):
+        visit(node)
+    fine, mass = _distribution(energy)
+    while len(energy) < MOST_NODES and np.max(shares := np.diff(mass[::BETWEEN])) > LARGEST_MASS:
+        largest = int(np.argmax(shares))
+        visit(0.5 * sum(sorted(energy)[largest : largest + 2]))
+        fine, mass = _distribution(energy)
+    values = np.interp(stratified(generator, count), mass, fine)
+    draws = np.repeat(values[:, None], len(free), axis=1)
+    if not one.all():
+        nodes = np.array(sorted(fits))
+        means, spreads = zip(*(others(fits[node]) for node in nodes.tolist()), strict=True)
+        centres = Akima1DInterpolator(nodes, np.array(means))(np.clip(values, nodes[0], nodes[-1]))
         nearest = np.abs(values[:, None] - nodes).argmin(axis=1)
-        for at, node in enumerate(nodes.tolist()):
+        for at, spread in enumerate(spreads):
             rows = np.flatnonzero(nearest == at)
-            block = self._rest(found[node])[1]
-            draws[np.ix_(rows, rest)] = cut_off(
-                centre[rows], block, marginal.low[rest], marginal.high[rest], generator
-            )
-        return draws
+            draws[np.ix_(rows, ~one)] = cut_off(centres[rows], spread, *ends, generator)
+    return draws
+
+
+def _first_nodes(marginal: Marginal, optima: tuple[CandidateFit, ...], index: int) -> list[float]:
+    """Return values of one parameter over the whole prior, and closer about each optimum."""
+    low, high, place = marginal.low[index], marginal.high[index], marginal.free[index]
+    places = [np.linspace(max(low, -REACH), min(high, REACH), WIDE)]
+    for item in optima:
+        near = np.sqrt(item.covariance[place, place]) * np.linspace(-3.0, 3.0, NEAR)
+        places.append(np.clip(item.point.shared[place] + near, low, high))
+    nodes = np.unique(np.concatenate(places))
+    apart = np.diff(nodes, prepend=-np.inf) > LEAST_SPREAD * (nodes[-1] - nodes[0])
+    return [float(node) for node in nodes[apart]]
+
+
+def _distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Return points and the distribution function of a density at them, `BETWEEN` between its nodes."""
+    nodes, values = np.array(sorted(energy.items())).T
+    values = np.minimum(values - values.min(), EMPTY)
+    share = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)
+    fine = np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * share).ravel(), nodes[-1])
+    density = np.exp(-Akima1DInterpolator(nodes, values)(fine))
+    mass = np.concatenate(([0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))))
+    return fine, mass / mass[-1]

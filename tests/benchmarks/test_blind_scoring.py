@@ -9,46 +9,20 @@ from scipy.stats import binomtest
 from benchmarks.blind.__main__ import main
 from benchmarks.blind.effects import DRAWS
 from benchmarks.blind.scoring import FAMILIES, Outcome, coverage, outcome, wilson
+from tests.refusals import Inputs
 
 
-def _truth(*identifiers: str, kind: str = "catalogue", **more: Any) -> dict[str, Any]:
-    return {"identifiers": list(identifiers), "kind": kind, "accepted": [], "places": {}, "truth": {}, **more}
+def _truth(**given: Any) -> dict[str, Any]:
+    return {"identifiers": [], "kind": "catalogue", "accepted": [], "places": {}, "truth": {}} | given
 
 
-def _said(kind: str, *identifiers: str, **more: Any) -> dict[str, Any]:
-    return {"kind": kind, "identifiers": list(identifiers), **more}
+def _said(**given: Any) -> dict[str, Any]:
+    return {"identifiers": []} | given
 
 
-@pytest.mark.parametrize(
-    ("truth", "verdict", "wanted"),
-    [
-        (_truth("a"), _said("named", "a"), Outcome.RIGHT),
-        (_truth("a"), _said("named", "b"), Outcome.WRONG),
-        (_truth("a"), _said("named", "a", "b"), Outcome.WRONG),
-        (_truth("a"), _said("group", group=["a", "b"]), Outcome.GROUP),
-        (_truth("a"), _said("group", group=["b", "c"]), Outcome.WRONG),
-        (_truth("a"), _said("group", group=["a + b", "c"]), Outcome.WRONG),
-        (_truth("a", "b"), _said("group", group=["a + b", "a + c"]), Outcome.GROUP),
-        (_truth("a", "b"), _said("group", group=["a + c", "b + c"]), Outcome.WRONG),
-        (_truth("a"), _said("nothing missing"), Outcome.MISSED),
-        (_truth("a"), _said("unexplained"), Outcome.OPEN),
-        (_truth("coulomb_friction"), _said("family", family="damping |v|^p |x|^a"), Outcome.GROUP),
-        (_truth("coulomb_friction"), _said("family", family="dead zone"), Outcome.WRONG),
-        (_truth(kind="null"), _said("nothing missing"), Outcome.RIGHT),
-        (_truth(kind="null"), _said("named", "a"), Outcome.WRONG),
-        (_truth(kind="null"), _said("unexplained"), Outcome.OPEN),
-        (_truth("a", kind="outside"), _said("unexplained"), Outcome.OPEN),
-        (_truth("a", kind="outside"), _said("named", "b"), Outcome.WRONG),
-        (_truth("a", "b", kind="pair"), _said("named", "b", "a"), Outcome.RIGHT),
-        (_truth("a", "b", kind="pair"), _said("named", "b"), Outcome.PART),
-        (_truth("a", "b", kind="pair"), _said("named", "b", "c"), Outcome.WRONG),
-        (_truth(kind="trap", accepted=["data error"]), _said("data error"), Outcome.RIGHT),
-        (_truth(kind="trap", accepted=["data error"]), _said("named", "a"), Outcome.WRONG),
-        (_truth("a", kind="trap", accepted=["unexplained"]), _said("named", "a"), Outcome.RIGHT),
-    ],
-)
+@pytest.mark.parametrize(("truth", "verdict", "wanted"), Inputs(__file__).table("outcomes.toml")["outcomes"])
 def test_outcomes(truth, verdict, wanted):
-    assert outcome(truth, verdict) is wanted
+    assert outcome(_truth(**truth), _said(**verdict)) is Outcome[wanted]
 
 
 def test_every_effect_has_a_family():
@@ -56,7 +30,7 @@ def test_every_effect_has_a_family():
 
 
 def test_interval_is_compared_at_the_port_where_the_effect_was_named():
-    truth = _truth("quadratic_damping", places={"quadratic_damping": "planform"})
+    truth = _truth(identifiers=["quadratic_damping"], places={"quadratic_damping": "planform"})
     truth["truth"] = {
         "quadratic_damping.coefficient@planform": 3.0,
         "quadratic_damping.coefficient@span": 10.0,
@@ -67,14 +41,16 @@ def test_interval_is_compared_at_the_port_where_the_effect_was_named():
         ("span", 9.0, 11.0, True), ("span", 0.4, 0.6, False), ("tip", 0.4, 0.6, True), ("", 9.0, 11.0, None),
         ("planform", 2.0, 4.0, True), ("planform", 9.0, 11.0, False),
     ):  # fmt: skip
-        verdict = _said("named", estimates={name: [low, 1.0, high]}, places={"quadratic_damping": port})
+        verdict = _said(kind="named", estimates={name: [low, 1.0, high]}, places={"quadratic_damping": port})
         assert coverage(truth, verdict) == {name: wanted}
-    local = _truth("free_play", places={"free_play": "root"}, truth={"free_play.stiffness": 4.0})
+    local = _truth(
+        identifiers=["free_play"], places={"free_play": "root"}, truth={"free_play.stiffness": 4.0}
+    )
     estimates = {"free_play.stiffness": [3.0, 4.0, 5.0], "gauge_gain.gain": [0.0, 0.1, 0.2]}
-    assert coverage(local, _said("named", estimates=estimates, places={"free_play": "root"})) == {
+    assert coverage(local, _said(kind="named", estimates=estimates, places={"free_play": "root"})) == {
         "free_play.stiffness": True
     }
-    assert coverage(local, _said("named", estimates=estimates, places={"free_play": "tip"})) == {
+    assert coverage(local, _said(kind="named", estimates=estimates, places={"free_play": "tip"})) == {
         "free_play.stiffness": None
     }
 
@@ -97,7 +73,9 @@ def test_command_line(tmp_path, capsys):
     for file in sealed:
         truth = json.loads(file.read_text(encoding="utf-8"))
         names = truth["identifiers"]
-        verdict = _said("named" if names else "nothing missing", *names, gap_closed=0.95, seconds=1.0)
+        verdict = _said(
+            kind="named" if names else "nothing missing", identifiers=names, gap_closed=0.95, seconds=1.0
+        )
         (tmp_path / "verdicts" / file.name).write_text(json.dumps(verdict), encoding="utf-8")
     capsys.readouterr()
     assert main(["score", *out]) == 0

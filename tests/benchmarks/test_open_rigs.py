@@ -15,6 +15,7 @@ from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
 from fe.runtime.patch import BoucWen, FreePlay, ModelPatch, Overflow, PowerDamping, PowerStiffness, Primitive
+from tests.refusals import Inputs
 
 SAMPLES = 40
 
@@ -100,33 +101,17 @@ def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path):
     assert np.abs(rows[:, 2] - plain[:, 2]).max() > bench.noise[0]
 
 
+FIRST, *OTHERS = Inputs(__file__).table("outcomes.toml")["rigs"]
+
+
 @pytest.mark.parametrize(
     ("seed", "number", "kind", "named"),
-    [
-        (1, 25, "unexplained", []),  # a loose body on the cart: its position alone is measured
-        *(
-            pytest.param(*row, marks=pytest.mark.long)
-            for row in (
-                (1, 8, "named in part", ["quadratic_damping"]),  # not with what imitates a square and a sine
-                (1, 13, "named in part", ["cubic_stiffness"]),  # not with half a per cent of a sensor's gain
-                (11, 1, "named in part", ["coulomb_friction"]),  # though a loose body moves the mass
-                (11, 19, "named in part", ["outflow"]),  # by its exponent of 5/4, not an overflow
-                (
-                    12,
-                    0,
-                    "named in part",
-                    ["coulomb_friction"],
-                ),  # not with a spring that a random force looks like
-                (11, 28, "unexplained", []),  # a clock and a gain do the same, and neither is true
-                (11, 20, "named in part", ["quadratic_damping"]),  # not with a filter of the one channel
-            )
-        ),
-    ],
+    [FIRST, *(pytest.param(*row, marks=pytest.mark.long) for row in OTHERS)],
 )
 def test_what_is_left_takes_no_name(seed, number, kind, named, tmp_path):
     row = judge(tmp_path, seed, number, "plain")
     assert (row["kind"], row["named"]) == (kind, named), row["sentence"]
-    if (seed, number) == (1, 25):
+    if [seed, number] == FIRST[:2]:
         assert "'mass' 12.8 stated deviations off" in row["sentence"]
         assert "with one channel these data cannot tell them apart" in row["sentence"]
 

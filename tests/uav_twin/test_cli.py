@@ -17,7 +17,7 @@ from tests.command_line import command, refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
 from twin_master.errors import MissionInputError, ScenarioError
-from twin_master.scenario_check import check_scenario
+from twin_master.workflow import check_scenario
 from uav_twin import assemble, cli, load_design, load_scenario
 
 

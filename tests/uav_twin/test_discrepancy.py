@@ -80,3 +80,5 @@ def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path)
     error = refused("discrepancy", "run", str(campaign), *RIG, "--out", str(tmp_path / "v"))
     assert "1000" in error or "10^" in error or "unit" in error
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
+    page = (tmp_path / "v" / "report.html").read_text(encoding="utf-8")
+    assert "Proof" not in page

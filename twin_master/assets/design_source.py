@@ -3,7 +3,7 @@
 It is a structure whose mesh follows from its design, and can carry effects.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -29,10 +29,6 @@ from twin_master.assets.parameter import (
     ParameterDraws,
     check_calibration,
 )
-from twin_master.assets.reduced_model import (
-    check_model_patch,
-    strains_with_effects,
-)
 from twin_master.assets.structure_source import NamedStructure, StructureFmuSource, StructureSource
 from twin_master.errors import MissingObservationModelError, MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
@@ -42,6 +38,7 @@ from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
+    from fe.runtime.patch_arrays import PatchArrays
     from fe.runtime.reduced import ReducedModel
     from fmu_asset.packing.patch_file import PatchFile
 
@@ -282,7 +279,6 @@ class DesignSource(_Wing, StructureSource):
         from fmu_asset.slaves.base import UnacceptableValuesError
 
         scenario, where = self._scenario, str(self.patch_path)
-        check_model_patch(patch, self.wing.gauge_count, where)
         ask = strains_with_effects(self.wing, patch, arrays_for(self.wing_design, patch))
         force = scenario.asset.constant_load.get("tip_force", 0.0)
         try:
@@ -293,3 +289,51 @@ class DesignSource(_Wing, StructureSource):
         except UnacceptableValuesError as error:
             raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
         return np.array(tables)
+
+
+def strains_with_effects(
+    wing: "ReducedModel", patch: "PatchFile", arrays: "PatchArrays | None"
+) -> Callable[[float, float, Mapping[str, float], Mapping[str, float]], Float]:
+    """Return what gives the strains (G,) of a wing with the effects of a patch, all of them switched on.
+
+    It is asked with the factor of Young's modulus, the tip force [N], the control, and the losses by region.
+    """
+    from fmu_asset.slaves.behaviour import StructureBehaviour
+    from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
+    from fmu_asset.slaves.table import structure_table
+
+    effects = patch.for_gauges(wing.gauge_count).plain
+    rows, roles = structure_table(wing, {})
+    behaviour = StructureBehaviour(wing, rows, roles, Effects(effects, wing.gauge_count, arrays))
+    on = {switch_of(effect): 1.0 for effect in effects}
+    behaviour.tune({row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, on)}, 0.0)
+    nominal = {row.name: row.start or 0.0 for row in rows}
+    inputs = [row.name for row in rows if row.causality == "input"]
+
+    def ask(e: float, force: float, control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+        losses = {f"health.{name}": loss for name, loss in health.items()}
+        given = {**nominal, "tip_force": force, **control, **losses}
+        start = {**nominal, "young_modulus_factor": e}
+        return np.array(behaviour.start(start, 0.0, [given[name] for name in inputs])[: wing.gauge_count])
+
+    return ask
+
+
+def check_model_patch(patch: "PatchFile", gauge_count: int, where: str = "The patch") -> None:
+    """Check that a model without time can carry the effects of a patch.
+
+    Raises
+    ------
+    MissionInputError
+        An effect depends on time or on what happened before.
+    PatchFileError
+        The wing cannot carry an effect.
+    """
+    from fe.runtime.patch import PortForce, SensorDrift
+
+    for effect in patch.for_gauges(gauge_count, where).effects:
+        for item in effect.patch:
+            drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
+            if drifts or (isinstance(item, PortForce) and item.hysteretic):
+                what = "time" if drifts else "the loads before"
+                raise MissionInputError(said("assets.remembers", effect=effect, what=what))

@@ -43,7 +43,7 @@ def watch(
     worst assets in the place of decisions. Ctrl-C ends it in order; the command repeated goes on.
     """
     from twin_master.fleet.plan import load_fleet
-    from twin_master.fleet.view import is_fleet, serve_fleet
+    from twin_master.fleet.report import is_fleet, serve_fleet
     from twin_master.fleet.watching import FleetWatch
     from twin_master.watch.intake import listening
 
@@ -119,7 +119,7 @@ def _heading(standing: Mapping[str, Any]) -> str:
 
 def _watched_table(standing: Mapping[str, Any]) -> "Table":
     from reporting.console_table import console_table
-    from twin_master.mission.replay import health_in_words
+    from twin_master.mission.loop import health_in_words
 
     def badness(row: tuple[str, dict[str, Any]]) -> tuple[int, float]:
         return row[1]["alarms"], sum(known["mean"] for known in row[1]["last"]["health"].values())
@@ -161,7 +161,7 @@ def learn(
     folder: Path, *, out: Path = Path("learnt.toml"), no_report: bool = False, json: bool = False
 ) -> None:
     """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
-    from twin_master.fleet.lessons import learn_from_fleet, lesson_rows
+    from twin_master.fleet.learn import learn_from_fleet, lesson_rows
 
     record = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:

@@ -1,12 +1,14 @@
 """The page of a fleet: its assets by health, who needs attention next, what was learnt, what failed.
 
 From nothing but the folder of the fleet, which may still be growing. What it shows does not grow with the
-number of assets: a cell of a map for each, and tables of the few that matter.
+number of assets: a cell of a map for each, and tables of the few that matter. The same page follows a fleet
+in the browser: while it flies, while it is watched, or afterwards.
 """
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,16 +20,20 @@ from numpy.typing import NDArray
 
 from reporting import figures as style
 from reporting.arrays import Float
+from reporting.errors import ReportingError
 from reporting.files import atomic_write_text
 from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND, WATCHED_KIND, fleet_config, told_of
-from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
+from twin_master.fleet.learn import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
 from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, has_flown, open_group
-from twin_master.fleet.watching import counts_of, read_standing
-from twin_master.report.view import printed_factors
+from twin_master.fleet.watching import STATE_NAME, counts_of, read_standing
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.report.reading import printed_factors
+from twin_master.run_folder import folder_config
 from twin_master.scenario.schema import Scenario
+from twin_master.viewer.server import serve_page, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -276,3 +282,45 @@ def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
         axes.set_ylabel(f"{factor.title} ({factor.unit})")
         style.panel_label(axes, "abcdefgh"[number % 8])
     return figure
+
+
+WORST = 50
+"""Assets in the table."""
+
+
+def is_fleet(folder: Path) -> bool:
+    """Return whether a folder is that of a fleet, flown or watched."""
+    return folder_config(folder, KIND, WATCHED_KIND) is not None
+
+
+def serve_fleet(
+    folder: Path, port: int, ready: Callable[[str], None], wanted: Callable[[], bool] = lambda: True
+) -> None:
+    """Show a fleet to browsers of this machine, as `viewer.server.serve` shows a flight."""
+    seen, version, html = _stamp(folder), 0, fleet_page(folder, WORST)
+
+    def current() -> str:
+        """Make the page again where the fleet has changed; what cannot be read is looked at again."""
+        nonlocal seen, version, html
+        with suppress(TwinMasterError, ReportingError, OSError, ValueError):  # it was just being written
+            if (stamp := _stamp(folder)) != seen:
+                html = fleet_page(folder, WORST)
+                seen, version = stamp, version + 1
+        return str(version)
+
+    def page() -> str:
+        tag = f'<script src="/view.js" data-version="{current()}"></script></body>'
+        return html.replace("</body>", tag)
+
+    texts = {
+        "/": (page, "text/html"),
+        "/version": (current, "text/plain"),
+        "/view.js": (text_of("twin_master.fleet", "view.js"), "text/javascript"),
+    }
+    serve_page(texts, port, ready, wanted)
+
+
+def _stamp(folder: Path) -> list[tuple[str, int, int]]:
+    paths = [folder / name for name in (JOURNAL_NAME, STATE_NAME, LESSONS_NAME)]
+    stats = [(path.name, path.stat()) for path in paths if path.is_file()]
+    return [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats]

@@ -34,9 +34,8 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import FAILED, outcomes_of
-from twin_master.mission.loop import operate
+from twin_master.mission.loop import BelievedModel, filtered_again, operate
 from twin_master.mission.preparation import Knowledge, kept_knowledge
-from twin_master.mission.replay import BelievedModel, filtered_again
 from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice

@@ -1,22 +1,236 @@
-"""The one loop: a source gives observations, the twin decides; and a mission, resumable at any turn."""
+"""The one loop: a source gives observations, the twin decides; and a mission, resumable at any turn.
+
+The journal of a run or a watch is read back: what was told, the twin as it was, turns to be stored.
+"""
 
 import base64
+import math
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from typing import Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
 
 from reporting.progress import Progress, SilentProgress
-from twin_master.errors import ImpossibleObservation, InvalidObservationError, TwinMasterError
-from twin_master.mission.journal import JournalFile, damaged, records_backwards, turn_record
+from twin_master.errors import (
+    ImpossibleObservation,
+    InvalidObservationError,
+    NotResumableError,
+    TwinMasterError,
+)
+from twin_master.learning.expectation import expected_of
+from twin_master.mission.journal import (
+    JournalFile,
+    array_of,
+    damaged,
+    reading_of,
+    records_backwards,
+    turn_record,
+)
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.truth import Plant
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.network.estimator import Notice
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import known_control
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
+from twin_master.sentences import said
+
+_SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
+"""What is told of a suspicion."""
+
+
+def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
+    """Return what the operator is told with a line of a journal: never a control without its certainty.
+
+    Nothing where it tells no decision.
+    """
+    if "quiet" in line:
+        return dict(line["quiet"])
+    if "filtered" not in line:
+        return {}
+    filtered = array_of(line["filtered"])
+    mean, deviation = model.states.mean(filtered), model.states.standard_deviation(filtered)
+    controls, coming = scenario.control_names, line["next_control"]
+    record = {
+        "turn": line["turn"],
+        "control": controls[line.get("control_in_force", line["control_index"])],
+        "health": {
+            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
+            for index, factor in enumerate(scenario.state)
+        },
+        "next_control": controls[coming],
+        "probability": min(float(line["decision_probability"][coming]), 1.0),
+        "lost_sensors": line["observed"][: scenario.observation.count].count(None),
+        "log_evidence": line["log_evidence"],
+        "notices": line.get("notices", []),
+    }
+    if "suspicion" in line:
+        record |= {name: line["suspicion"][name] for name in _SUSPECTED}
+    if "control_in_force" in line:
+        record["revised_by_turn"] = line["observation_turn"]
+    if "learnt" in line:
+        record["learnt"] = line["learnt"]
+    return record
+
+
+def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
+    """Return mean and standard deviation of each factor of the state, as a decision tells them."""
+    told = {}
+    for name, known in decision["health"].items():
+        scale, unit = printed_state(known["unit"])
+        digits = ".0f" if unit == "%" else ".3g"
+        mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))
+        told[name] = f"{mean} ± {deviation} {unit}"
+    return told
+
+
+def gap_of(history: History, skipped: int, knowledge: Knowledge) -> dict[str, Any]:
+    """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
+
+    The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
+    """
+    left, learns, sensors = history.behind(skipped), knowledge.expectation, knowledge.sensor_model
+    if not left.turns or np.isnan(left.observed).all():
+        return {"rms_residual": None, "log_evidence": None}
+    if learns is None:
+        joint = known_control(left.filtered, left.control_index, sensors.control_count)
+        expected = expected_of(sensors, knowledge.rewards, joint, None, quantiles=False)
+    else:
+        expected = learns.filtered([turn.concluded.carried for turn in left.turns], left.observed)
+    residual = (left.observed - expected.mean) / expected.noise
+    return {
+        "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
+        "log_evidence": float(np.sum(left.log_evidence)),
+    }
+
+
+@dataclass(frozen=True)
+class BelievedModel:
+    """What the twin believes from a turn on.
+
+    Attributes
+    ----------
+    from_turn : int
+        The first turn that is filtered with it.
+    knowledge : Knowledge
+        Its predicted observations.
+    patch : Path or None
+        Of the model, where it has one.
+    """
+
+    from_turn: int
+    knowledge: Knowledge
+    patch: Path | None = None
+
+
+def replay(
+    path: Path, models: Sequence[BelievedModel], lag: int | None, *, first_turn: int | None = None,
+    end: int | None = None, question: BelievedModel | None = None,
+) -> tuple[History, dict[str, Any]]:  # fmt: skip
+    """Filter the turns of a journal again, what came late in its place.
+
+    The journal is read from its end to the last state of the twin that lies before what is wanted.
+
+    Parameters
+    ----------
+    path : Path
+        The journal.
+    models : sequence of BelievedModel
+        The model of the beginning, and those that were adopted later.
+    lag : int or None
+        Of the twin.
+    first_turn : int, optional
+        The first turn whose belief is wanted; if left out the twin alone, from the last state.
+    end : int, optional
+        Bytes of the journal that are read; all of it if left out.
+    question : BelievedModel, optional
+        What would be believed with one model more, from its turn on.
+
+    Returns
+    -------
+    History
+        The turns behind that state, with the twin behind the last one.
+    dict
+        The last line; empty where there is none.
+
+    Raises
+    ------
+    NotResumableError
+        The journal was changed or is damaged, or decided otherwise.
+    """
+    wanted = [] if first_turn is None else [first_turn]
+    wanted += [] if question is None else [question.from_turn]
+    seen: dict[int, Reading] = {}
+    decided, stands = dict[int, int](), math.inf  # decisions from some turn on were revised by later lines
+    settled, last = (-1, b""), dict[str, Any]()
+    behind, place = -1, 0  # the turn of the line behind, and where it begins
+    for record, begin, _ in records_backwards(path, end):
+        try:
+            turn = int(record["turn"]) if begin else -1
+            if last and behind - turn not in (0, 1):
+                raise damaged(path, place if turn < behind else begin, f"turn {behind} is out of place")
+            if not begin or turn <= settled[0]:
+                break
+            last, behind, place = last or record, turn, begin
+            if settled[0] < 0 and "settled" in record:
+                kept, state = int(record["settled"]["turn"]), record["settled"]["state"]
+                # Only one before what is wanted, and before all models that are adopted behind it.
+                if all(kept < other for other in wanted):
+                    settled = kept, zlib.decompress(base64.b64decode(state))
+            if turn < stands:
+                decided.setdefault(turn, record["next_control"])
+            if "model" in record:
+                stands = min(stands, int(record["model"]["from_turn"]))
+                wanted.append(int(record["model"]["from_turn"]))
+            elif "observed" in record:
+                observed = int(record.get("observation_turn", turn))
+                stands = min(stands, observed)
+                seen.setdefault(observed, reading_of(record))
+        except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
+            raise damaged(path, begin, f"it has another layout, {error}") from error
+    found = filtered_again(seen, [*models, *([question] if question else [])], lag, settled)
+    for again in found.turns if question is None else ():
+        number, control = again.concluded.turn, again.concluded.next_control
+        if decided.get(number, control) != control:
+            other = f"begin another watch, in another folder, with `--observations {path.parent}`"
+            advice = other if "intake" in last else "fly the mission again with --replace"
+            raise NotResumableError(said("mission.decided", turn=number, advice=advice))
+    return found, last
+
+
+def filtered_again(
+    seen: Mapping[int, Reading], given: Sequence[BelievedModel], lag: int | None = None,
+    settled: tuple[int, bytes] = (-1, b""),
+) -> History:  # fmt: skip
+    """Return the turns that a twin filters of what was seen in each, from a settled state on."""
+    # A model that was adopted from an earlier turn on than one before it takes its place altogether.
+    models = [
+        model
+        for index, model in enumerate(given)
+        if all(later.from_turn > model.from_turn for later in given[index + 1 :])
+    ]
+    at = max(
+        index for index, model in enumerate(models) if not index or model.from_turn <= max(settled[0], 0)
+    )
+    twin = models[at].knowledge.twin(lag=lag)
+    if settled[1]:
+        twin.restore_state(settled[1])
+    found = History(twin, models[at].knowledge.scenario.observation.count)
+    while twin.turns in seen:
+        if at + 1 < len(models) and models[at + 1].from_turn <= twin.turns:
+            at += 1
+            state, twin = twin.save_state(), models[at].knowledge.twin(lag=lag)
+            twin.restore_state(state)
+            found.twin = twin
+        reading = seen[twin.turns]
+        found.add(Turn(reading, twin.turn(reading.observed, reading.control)))
+    return found
 
 
 class Source(Protocol):

@@ -32,7 +32,7 @@ from twin_master.network.estimator import Estimator, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy
-from twin_master.network.rewards import RewardModel, RewardSettings
+from twin_master.network.rewards import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
@@ -265,7 +265,7 @@ def knowledge_of(
         model_error=section.model_error,
         interval=within(predicted.mean(axis=0)) if within else None,
     )
-    rewards = RewardModel(sensor_model, reward_settings(scenario), true)
+    rewards = reward_model(scenario, sensor_model, true)
     return Knowledge(
         scenario, model, draws, sensor_model, rewards, planned(scenario, model, sensor_model, rewards, policy)
     )
@@ -325,11 +325,12 @@ def prepared_alone(scenario: Scenario, source: AssetSource, progress: Progress |
         return prepare_knowledge(scenario, source, scenario.mission.seed)
 
 
-def reward_settings(scenario: Scenario) -> RewardSettings:
-    """Return the figures of the rewards in the order of the scenario's controls."""
+def reward_model(scenario: Scenario, sensor_model: GaussianSensorModel, true: Float | None) -> RewardModel:
+    """Return the rewards of a scenario; what is there at the sensors as of `knowledge_of`."""
     section = scenario.rewards
     norm = section.normalise_error_by
-    return RewardSettings(
+    return RewardModel(
+        sensor_model,
         limit=section.health_limit,
         control_reward=tuple(section.control[name] for name in scenario.control_names),
         error_scale=section.error_scale,
@@ -337,6 +338,7 @@ def reward_settings(scenario: Scenario) -> RewardSettings:
         health_sensors=None
         if section.health_sensors == "all"
         else tuple(number - 1 for number in section.health_sensors),
+        true_per_draw=true,
     )
 
 

@@ -176,7 +176,7 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
         flying &= np.array(flights.failure) == ""
         observed[~flying] = np.nan
         likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
-        found, failed = filter_many(model, control[:, None], likelihood[:, None], *before)
+        found, failed = filter_many(model.transition, control[:, None], likelihood[:, None], *before)
         now, impossible = found[:, 0], failed >= 0
         for twin in np.flatnonzero(impossible & flying).tolist():
             worst = knowledge.sensor_model.worst_residuals(observed[twin], int(control[twin]))

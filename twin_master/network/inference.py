@@ -17,7 +17,7 @@ from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.kernels import backward_pass, forward_pass, move
+from twin_master.network.kernels import backward_pass, forward_pass
 from twin_master.network.transition import TransitionModel
 
 
@@ -55,21 +55,22 @@ class Predicted:
     ----------
     predicted : (H, S)
         p(D_{t+h} | o_0..o_t), h = 1..H.
-    control_probability : (H, U)
-        p(U_{t+h} | o_0..o_t).
     joint : (H, S, U)
         p(D_{t+h}, U_{t+h} | o_0..o_t): quantities and rewards depend on both.
     """
 
     predicted: Float
-    control_probability: Float
     joint: Float
+
+    @property
+    def control_probability(self) -> Float:
+        """p(U_{t+h} | o_0..o_t): (H, U)."""
+        return np.asarray(self.joint.sum(axis=1))
 
     def mixed(self, share: float, control: Float) -> "Predicted":
         """Return it where with probability `share` the controls are p(U) (U,), whatever the state is."""
-        chosen = (1.0 - share) * self.control_probability + share * control
-        joint = (1.0 - share) * self.joint + share * self.predicted[..., None] * control
-        return Predicted(self.predicted, chosen, joint)
+        chosen = self.predicted[..., None] * control
+        return Predicted(self.predicted, (1.0 - share) * self.joint + share * chosen)
 
 
 def _checked(
@@ -87,22 +88,18 @@ def _checked(
     return control[None], rows[None]
 
 
-def log_forecast(transition: TransitionModel, control: ArrayLike, log_filtered: ArrayLike) -> Float:
-    """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
-    before = np.array(log_filtered, dtype=np.float64, order="C")
-    after = np.empty_like(before)
-    move(transition.forward_lists, np.array(control, dtype=np.int64), before, after)
-    return after
-
-
 def filter_many(
-    model: GraphicalModel, control: Index, rows: Float, log_before: Float, control_before: ArrayLike = -1
+    transition: TransitionModel,
+    control: Index,
+    rows: Float,
+    log_before: Float,
+    control_before: ArrayLike = -1,
 ) -> tuple[Filtered, Index]:
     """Filter B twins without any check.
 
     Parameters
     ----------
-    model : GraphicalModel
+    transition : TransitionModel
     control : (B, T)
     rows : (B, T, S)
         log p(o_t | D_t, u_t).
@@ -120,8 +117,15 @@ def filter_many(
     log_evidence, failed = np.empty(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
     found = forecast, filtered, log_filtered, log_evidence
     first = np.full((len(rows), rows.shape[2]), log_before), np.full(len(rows), control_before)
-    forward_pass(model.transition.forward_lists, control, *first, rows, *found, failed)
+    forward_pass(transition.forward_lists, control, *first, rows, *found, failed)
     return Filtered(*found), failed
+
+
+def log_forecast(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
+    """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
+    nothing = np.zeros_like(log_filtered)[:, None]
+    found, _ = filter_many(transition, control[:, None], nothing, log_filtered, control)
+    return np.asarray(found.log_filtered[:, 0] + found.log_evidence)
 
 
 def smooth_many(transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float) -> Float:
@@ -159,7 +163,7 @@ def filter_sequence(
         If shapes do not fit, or a log-likelihood is NaN or plus infinity.
     """
     control, rows = _checked(model, control_index, log_likelihood, what="log-likelihood")
-    found, failed = filter_many(model, control, rows, *(before or (model.log_prior,)))
+    found, failed = filter_many(model.transition, control, rows, *(before or (model.log_prior,)))
     if failed[0] >= 0:
         raise ImpossibleObservation("twin", int(failed[0]))
     return found[0]
@@ -228,8 +232,7 @@ def predict(
             flows = enumerate((now[:, None] * policy).T)
             now = np.sum([transition.forward(u, flow) for u, flow in flows], axis=0)
         predicted[h] = now
-    joint = predicted[:, :, None] * policy
-    return Predicted(predicted=predicted, control_probability=joint.sum(axis=1), joint=joint)
+    return Predicted(predicted, predicted[:, :, None] * policy)
 
 
 def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: int) -> Float:

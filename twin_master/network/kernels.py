@@ -97,17 +97,6 @@ def _move(
 
 
 @compiled
-def move(lists: Lists, control: Index, log_before: Float, log_after: Float) -> None:
-    """Fill after (B, S) with the logarithms of beliefs one transition later, each under its control (B,)."""
-    size = log_before.shape[1]
-    before, after, work = np.empty(size), np.empty(size), np.empty((2, size))
-    for row in range(len(control)):
-        for state in range(size):
-            before[state] = _exp(log_before[row, state])
-        _move(lists, control[row], before, log_before[row], after, log_after[row], work)
-
-
-@compiled
 def forward_pass(
     lists: Lists,
     control: Index,
@@ -145,7 +134,7 @@ def forward_pass(
                 log_now[state] += log_likelihood[twin, t, state]
                 best = max(best, log_now[state])
             if best == -np.inf:
-                failed[twin] = t
+                failed[twin], log_evidence[twin, t] = t, best
                 break
             before, log_before, total = filtered[twin, t], log_now, 0.0
             for state in range(size):

@@ -42,33 +42,6 @@ def _error_moments(observation: Float, shown: Float, variance: Float, scale: Flo
 
 
 @dataclass(frozen=True)
-class RewardSettings:
-    """What the scenario says about rewards.
-
-    Attributes
-    ----------
-    limit : float or tuple of float
-        Sensor value at which the health reward is zero, in its unit, positive; one, or one for each of the
-        sensors that count.
-    control_reward : tuple of float
-        One for each control.
-    error_scale : float or tuple of float
-        Normalised error that costs one, in its unit, positive; one, or one for each sensor.
-    control_normaliser : tuple of float or None
-        For each control the figure by which observation and model are divided before their distance is
-        taken (the load factor); None for ones.
-    health_sensors : tuple of int or None
-        Indices of the sensors that count for the health reward; None for all.
-    """
-
-    limit: float | tuple[float, ...]
-    control_reward: tuple[float, ...]
-    error_scale: float | tuple[float, ...]
-    control_normaliser: tuple[float, ...] | None = None
-    health_sensors: tuple[int, ...] | None = None
-
-
-@dataclass(frozen=True)
 class RewardExpectation:
     """Rewards under a belief.
 
@@ -82,35 +55,54 @@ class RewardExpectation:
     standard_deviation: Float
 
 
+@dataclass(frozen=True)
 class RewardModel:
     """The three rewards of an asset, and their expectation under a belief.
 
-    Parameters
+    Attributes
     ----------
     quantity : QuantityModel
         What the sensors would show without noise, for each draw, state and control.
-    settings : RewardSettings
+    limit : float or tuple of float
+        Sensor value at which the health reward is zero, in its unit, positive; one, or one for each of the
+        sensors that count.
+    control_reward : tuple of float
+        One for each control.
+    error_scale : float or tuple of float
+        Normalised error that costs one, in its unit, positive; one, or one for each sensor.
+    control_normaliser : tuple of float or None
+        For each control the figure by which observation and model are divided before their distance is
+        taken (the load factor); None for ones.
+    health_sensors : tuple of int or None
+        Indices of the sensors that count for the health reward; None for all.
     true_per_draw : (E, S, U, G), optional
         What is there at the sensors, SI, where that is not what they show: limits and health are of the
         structure, and a gauge that is known to show too little does not make it healthier.
     """
 
-    def __init__(
-        self, quantity: QuantityModel, settings: RewardSettings, true_per_draw: Float | None = None
-    ) -> None:
-        normaliser = settings.control_normaliser or (1.0,) * len(settings.control_reward)
-        self.quantity = quantity
-        self.settings = settings
-        self.true_per_draw = true_per_draw
-        self._error_scale = np.asarray(settings.error_scale) * np.array(normaliser, dtype=np.float64)[:, None]
-        self._control_reward = np.array(settings.control_reward, dtype=np.float64)
+    quantity: QuantityModel
+    limit: float | tuple[float, ...]
+    control_reward: tuple[float, ...]
+    error_scale: float | tuple[float, ...]
+    control_normaliser: tuple[float, ...] | None = None
+    health_sensors: tuple[int, ...] | None = None
+    true_per_draw: Float | None = None
+
+    def health(self, values: Float) -> Float:
+        """Return the health reward of what is there at the sensors (..., G)."""
+        chosen = slice(None) if self.health_sensors is None else list(self.health_sensors)
+        return health_reward(values[..., chosen], self.limit)
 
     @cached_property
     def health_per_draw(self) -> Float:
         """Health reward of each draw, state and control (E, S, U)."""
-        values, chosen = self.true_per_draw, self.settings.health_sensors
-        values = self.quantity.value_per_draw if values is None else values
-        return health_reward(values if chosen is None else values[..., list(chosen)], self.settings.limit)
+        return self.health(self.quantity.value_per_draw if self.true_per_draw is None else self.true_per_draw)
+
+    @cached_property
+    def _error_scale(self) -> Float:
+        """Error that costs one under each control (U, 1) or (U, G)."""
+        normaliser = self.control_normaliser or (1.0,) * len(self.control_reward)
+        return np.asarray(self.error_scale * np.array(normaliser)[:, None])
 
     @cached_property
     def _health_moments(self) -> tuple[Float, Float]:
@@ -121,7 +113,8 @@ class RewardModel:
 
     def planning_reward(self, health_weight: float, control_weight: float) -> Float:
         """Return the expected reward of each state and control for planning, eq. (36): (S, U)."""
-        return np.asarray(health_weight * self._health_moments[0] + control_weight * self._control_reward)
+        worth = np.multiply(control_weight, self.control_reward)
+        return np.asarray(health_weight * self._health_moments[0] + worth)
 
     def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> RewardExpectation:
         """Return mean and standard deviation of each reward.
@@ -151,8 +144,8 @@ class RewardModel:
         spread += health_variance
         variance[:, 0] = np.einsum("bsu,bsu->b", flat, spread)
         control = flat.sum(axis=1)
-        mean[:, 1] = control @ self._control_reward
-        variance[:, 1] = np.einsum("bu,bu->b", control, (self._control_reward - mean[:, 1, None]) ** 2)
+        mean[:, 1] = control @ self.control_reward
+        variance[:, 1] = np.einsum("bu,bu->b", control, (self.control_reward - mean[:, 1, None]) ** 2)
         if observation is not None:
             observation = np.asarray(observation, dtype=np.float64)
             for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
@@ -191,7 +184,7 @@ class RewardModel:
         """
         mean = np.full((3, *shown.shape[:-1]), np.nan)
         within = np.zeros_like(mean)
-        mean[0], mean[1] = self.health_per_draw[draw][:, :, controls], self._control_reward[controls]
+        mean[0], mean[1] = self.health_per_draw[draw][:, :, controls], self.control_reward[controls]
         if observation is not None and not np.isnan(observation).all():
             mean[2], within[2] = _error_moments(observation, shown, variance, self._error_scale[controls])
         whole = np.einsum("bksu,rksu->br", weight, mean)

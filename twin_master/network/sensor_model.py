@@ -128,20 +128,13 @@ class GaussianSensorModel(QuantityModel):
         self.total_standard_deviation = np.hypot(independent, np.linalg.norm(self.interval, axis=-1))
         for array in (independent, self.total_standard_deviation, self.interval):
             array.setflags(write=False)
-        by_control = np.ascontiguousarray(1.0 / independent.transpose(1, 0, 2))
-        self._inverse_deviation = by_control
-        self._scaled_interval = np.ascontiguousarray(
-            self.interval.transpose(1, 0, 2, 3) * by_control[..., None]
-        )
         self.averages_inside = average == "inside"
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
-        self._mean = np.ascontiguousarray(self.mean.transpose(1, 0, 2))
-        values = self.value_per_draw.transpose(2, 1, 3, 0)
-        beside = (values - self._mean[..., None]) * by_control[..., None]
-        size = float(np.max(np.abs(values) * by_control[..., None]))
-        part, self._function = separated(beside.reshape(-1, self.draw_count), size)
-        self._part = np.ascontiguousarray(part).reshape(*self._mean.shape, len(self._function))
+        beside = (self.value_per_draw - self.mean) / independent
+        size = float(np.max(np.abs(self.value_per_draw) / independent))
+        part, self._function = separated(np.moveaxis(beside, 0, -1).reshape(-1, self.draw_count), size)
+        self._part = part.reshape(*shape, len(self._function))
         self._shared = dict[int, tuple[Any, ...]]()  # by control, of the sensors that were there last
 
     def checked(self, observation: ArrayLike) -> Float:
@@ -245,12 +238,11 @@ class GaussianSensorModel(QuantityModel):
         there = np.frombuffer(seen, dtype=bool)
         if self._shared.get(control, (b"",))[0] != seen:
             self._shared[control] = seen, *self._shared_by(control, there)
-        _, scale, offset, inverse, outward, part = self._shared[control]
+        _, scale, offset, mean, inverse, outward, part = self._shared[control]
         offset = offset - self._log_weight if draws == 1 else offset
         result = np.empty((len(observations), self.state_count, draws))
         shown = np.ascontiguousarray(np.where(there, observations, 0.0).T)
-        mean, function = self._mean[control], self._function
-        log_densities(shown, mean, inverse, outward, part, function, offset, scale, result)
+        log_densities(shown, mean, inverse, outward, part, self._function, offset, scale, result)
         return result
 
     def _shared_by(self, control: int, there: NDArray[np.bool_]) -> tuple[Float, ...]:
@@ -261,17 +253,16 @@ class GaussianSensorModel(QuantityModel):
         the Cholesky factor L of 1 + interval' interval, outward (F, G) is L^-1 interval'. With d what is
         observed beside the mean, -|d - A b_e|² / 2 of a draw e is -|d|² / 2 + (A'd) b_e - |A b_e|² / 2.
         """
-        interval, part = (
-            np.where(there[:, None], given[control], 0.0) for given in (self._scaled_interval, self._part)
-        )
+        inverse = np.where(there, 1.0 / self.independent_standard_deviation[:, control], 0.0)
+        interval = self.interval[:, control] * inverse[..., None]
+        part = np.where(there[:, None], self._part[:, control], 0.0)
         root = np.linalg.cholesky(np.eye(interval.shape[-1]) + interval.swapaxes(1, 2) @ interval)
         outward = np.linalg.solve(root, interval.swapaxes(1, 2))
         whole = part - outward.swapaxes(1, 2) @ (outward @ part)
         offset = 0.5 * np.sum((whole.swapaxes(1, 2) @ part @ self._function) * self._function, axis=1)
-        inverse = self._inverse_deviation[control] * there
         scale = np.log(inverse[:, there]).sum(axis=1) - LOG_ROOT_TWO_PI * there.sum()
         scale -= np.log(np.einsum("sff->sf", root)).sum(axis=1)
-        return scale, offset, inverse, outward, whole
+        return scale, offset, np.ascontiguousarray(self.mean[:, control]), inverse, outward, whole
 
     def nearest(
         self, observation: Float, control_index: int, value: Float, precision: ArrayLike = 1.0
@@ -289,9 +280,10 @@ class GaussianSensorModel(QuantityModel):
             Of the sensors over the assumed one, where more is known: a sensor that is off tells no place.
         """
         seen, root = ~np.isnan(observation), np.sqrt(precision)
-        scaled = np.where(seen, root, 0.0)[:, None] * self._scaled_interval[control_index]  # (S, G, F)
+        inverse_deviation = 1.0 / self.independent_standard_deviation[:, control_index]
+        scaled = (np.where(seen, root, 0.0) * inverse_deviation)[..., None] * self.interval[:, control_index]
         distance = np.where(seen, observation - value, 0.0).clip(-LARGEST, LARGEST)
-        residual = distance * self._inverse_deviation[control_index] * root
+        residual = distance * inverse_deviation * root
         inverse = np.linalg.inv(np.eye(scaled.shape[-1]) + scaled.swapaxes(1, 2) @ scaled)
         weight = inverse @ scaled.swapaxes(1, 2)  # (S, F, G)
         place = (weight @ residual[..., None])[..., 0]

@@ -19,11 +19,8 @@ from reporting.words import counted, listing, parameter_title, small
 from twin_master.assets.asset_source import calibrated_with
 from twin_master.assets.structure_source import FIELD_NAME
 from twin_master.errors import RunFolderError
-from twin_master.report.belief import belief_figure, policy_figure
-from twin_master.report.calibration import believed, calibration_figure, measured, true_value
-from twin_master.report.check import PredictiveCheck, check_figure, predictive_check
-from twin_master.report.learnt import learnt_figure, sensor_rows, with_interval
-from twin_master.report.mission import choose_sensors, default_now, mission_figure
+from twin_master.report import mission as course
+from twin_master.report import model as tailored
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
 from twin_master.store.summary import Fallback, another_truth, control_changes, find_fallback
@@ -40,7 +37,7 @@ _SURE = 1e-3
 
 def opening_sentences(run: Run) -> tuple[str, ...]:
     """Return at most three sentences on a run; what the run does not hold is not spoken of."""
-    sentences = (_decision(run), _belief(run), _agreement(run, predictive_check(run)))
+    sentences = (_decision(run), _belief(run), _agreement(run, tailored.predictive_check(run)))
     return tuple(sentence for sentence in sentences if sentence)
 
 
@@ -114,7 +111,7 @@ def _state(run: Run, index: int) -> str:
     return f"{_named(factor.title)} at {f'{mean:{form}} {factor.unit}'.rstrip()} ({interval})"
 
 
-def _agreement(run: Run, check: PredictiveCheck) -> str:
+def _agreement(run: Run, check: tailored.PredictiveCheck) -> str:
     """Return whether the observations scatter about the model as the twin assumes."""
     count, spread = int(check.count.sum()), check.standard_deviation
     if count == 0:
@@ -197,7 +194,7 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 
 
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
-    now, last = default_now(run) if now is None else now, run.steps - 1
+    now, last = course.default_now(run) if now is None else now, run.steps - 1
     if not 0 <= now <= last:
         raise RunFolderError(f"The present turn of the report must lie in 0..{last}, and {now} came.")
     units = ", ".join(
@@ -211,26 +208,29 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
         )
         past = "in hindsight" if turn == last else "as seen at the time"
         yield WORDS.figure(
-            "mission", mission_figure(run, turn, choose_sensors(run)), run=run, now=turn, units=units,
+            "mission", course.mission_figure(run, turn), run=run, now=turn, units=units,
             whole=name != MAIN_FIGURE, last=turn == last, past=past, decided=decided,
         )._replace(name=name)  # fmt: skip
-    yield WORDS.figure("belief", belief_figure(run), run=run, units=units)
+    yield WORDS.figure("belief", course.belief_figure(run), run=run, units=units)
     if run.learnt:
-        yield WORDS.figure("learnt", learnt_figure(run), run=run)
+        yield WORDS.figure("learnt", tailored.learnt_figure(run), run=run)
     if len(run.factors) == 2:
-        yield WORDS.figure("policy", policy_figure(run), run=run)
-    check = predictive_check(run)
-    yield WORDS.figure("check", check_figure(run, check), run=run, check=check, **_check_words(run, check))
+        yield WORDS.figure("policy", course.policy_figure(run), run=run)
+    check = tailored.predictive_check(run)
+    yield WORDS.figure(
+        "check", tailored.check_figure(run, check), run=run, check=check, **_check_words(run, check)
+    )
     unit = str(run.tree["calibration/draw_value"].attrs.get("units", "1"))
     yield WORDS.figure(
-        "calibration", calibration_figure(run), run=run, measured=measured(run), truth=true_value(run),
+        "calibration", tailored.calibration_figure(run), run=run,
+        measured=tailored.measured(run), truth=tailored.true_value(run),
         name=parameter_title(run.scenario.calibration.parameter), draws=run["calibration/draw_value"],
         unit="dimensionless" if unit == "1" else unit,
     )  # fmt: skip
     yield from _structure(run, folder, check)
 
 
-def _structure(run: Run, folder: Path, check: PredictiveCheck) -> Iterator[ReportFigure]:
+def _structure(run: Run, folder: Path, check: tailored.PredictiveCheck) -> Iterator[ReportFigure]:
     """Draw the structure itself, where the run holds the planform of its wing or the field of its mesh."""
     planform = planform_of(design_of(folder), run.scenario)
     if (folder / FIELD_NAME).is_file():
@@ -241,7 +241,7 @@ def _structure(run: Run, folder: Path, check: PredictiveCheck) -> Iterator[Repor
         yield WORDS.figure("structure", figure, run=run, picture=None)
 
 
-def _check_words(run: Run, check: PredictiveCheck) -> dict[str, str | bool]:
+def _check_words(run: Run, check: tailored.PredictiveCheck) -> dict[str, str | bool]:
     """Return the assumed noise with its units, the error of the model, and the sensor of lowest coverage."""
     section, sensors = run.scenario.observation, run.sensors
     noise, error = np.asarray(section.standard_deviation), 100.0 * np.asarray(section.model_error)
@@ -287,10 +287,10 @@ def render_page(run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, R
         "blind": turn_ranges(blind, run.step) if len(blind) else "",
         "learnt_asset": whole, "truth": any(learnt.truth is not None for learnt in whole),
         "plain": listing(f"{p:g} in {name}" for name, p in given.items() if isinstance(p, int | float)),
-        "learnt_sensors": sensor_rows(run), "labels": [learnt.label for learnt in own],
+        "learnt_sensors": tailored.sensor_rows(run), "labels": [learnt.label for learnt in own],
         # The prior of the sensors is one, unless the scenario gives one for each.
         "prior": [
-            f"{learnt.title.lower()} {with_interval(np.nanmedian(learnt.prior, axis=0))}" for learnt in own
+            f"{one.title.lower()} {tailored.with_interval(np.nanmedian(one.prior, axis=0))}" for one in own
         ],
         "calibrated": _calibrated(kept), "monitors": _monitors(run),
         "of": asset and model and calibrated_with(kept, asset, model, run.config.get("inputs", {})),
@@ -308,10 +308,10 @@ def _calibrated(kept: Mapping[str, Any]) -> list[Any]:
 
 
 def _another_truth(run: Run) -> str | None:
-    truth, parameter = true_value(run), run.scenario.calibration.parameter
+    truth, parameter = tailored.true_value(run), run.scenario.calibration.parameter
     if truth is None or any(learnt.name == parameter for learnt in run.learnt):
         return None
-    return another_truth(parameter, truth, *believed(run))
+    return another_truth(parameter, truth, *tailored.believed(run))
 
 
 def _monitors(run: Run) -> list[Sequence[str]]:

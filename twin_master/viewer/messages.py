@@ -19,8 +19,8 @@ from reporting.arrays import Float
 from reporting.errors import ReportingError
 from reporting.record_json import plain
 from twin_master.errors import TwinMasterError
+from twin_master.report.reading import NORMAL_95, printed_factors, printed_sensors
 from twin_master.report.structure import design_of, planform_of
-from twin_master.report.view import NORMAL_95, printed_factors, printed_sensors
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.viewer.flight import Belief, Flight, Record
 

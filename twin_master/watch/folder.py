@@ -23,9 +23,8 @@ from twin_master.mission.journal import (
     last_turn,
     records_backwards,
 )
-from twin_master.mission.loop import operate
+from twin_master.mission.loop import BelievedModel, journalled_decision, operate, replay
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
-from twin_master.mission.replay import BelievedModel, journalled_decision, replay
 from twin_master.mission.turns import Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin

@@ -22,8 +22,8 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.mission.journal import damaged, records_backwards
+from twin_master.mission.loop import BelievedModel, gap_of, replay
 from twin_master.mission.preparation import Knowledge, prepared_alone
-from twin_master.mission.replay import BelievedModel, gap_of, replay
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.sentences import said

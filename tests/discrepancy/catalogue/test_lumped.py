@@ -1,20 +1,22 @@
-"""The catalogue on the lumped models that come with the package."""
+"""The catalogue on lumped models: what shows, and which effects are offered where."""
 
 from dataclasses import replace
-from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.cantilever import campaign
+from benchmarks.cantilever import campaign as campaign_of_all
+from benchmarks.tank import tank_setting
 from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Start, TrialKind
 from discrepancy.catalogue.library import library
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
-from fe.runtime.patch import ModelPatch
-from tests.discrepancy.rigs import setting_of
+from fe.runtime.patch import LoggerClock, ModelPatch
+from tests.discrepancy.asking import campaign, seen, trial
+from tests.discrepancy.rigs import INPUTS, chosen, model_of, setting_of
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
@@ -23,29 +25,23 @@ OUTPUTS = {"tip": ("x3", Quantity.DISPLACEMENT), "g0": ("base_strain", Quantity.
 
 @pytest.fixture(scope="module")
 def setting():
-    model = LumpedModel.load(str(files("discrepancy.lumped_models") / "three_mass_chain.toml"))
-    given = campaign()
+    model = LumpedModel.load("three_mass_chain")
+    given = campaign_of_all()
     noise = NoiseRecord(1e-6, 200.0)
     channels = {
         name: Channel(name, quantity, output, noise, 0.005, 1e-5)
         for name, (output, quantity) in OUTPUTS.items()
     }
+    given_to_all = {"channels": tuple(OUTPUTS), "load_place": "end"}
     trials = tuple(
-        replace(
-            trial,
-            channels=tuple(OUTPUTS),
-            values=np.zeros((len(trial.time), 2)),
-            load_place="end",
-            used=np.ones((len(trial.time), 2), dtype=bool),
-            release=Release(0.01) if trial.release else None,
-        )
-        for trial in given.trials
-        if trial.name != "flight"
+        replace(item, **given_to_all, values=item.values[:, :2], used=item.used[:, :2], release=release)
+        for item, release in ((item, item.release and Release(0.01)) for item in given.trials)
+        if item.name != "flight"
     )
     chain = replace(given, channels=channels, trials=trials)
     means = np.array([item.mean for item in model.parameters])
-    for trial in trials:
-        trial.values[:] = observe(model, chain, trial, ModelPatch(), Conditions(means)).values
+    for item in trials:
+        item.values[:] = observe(model, chain, item, ModelPatch(), Conditions(means)).values
     return setting_of(chain, model)
 
 
@@ -65,7 +61,58 @@ def test_an_effect_that_is_available_shows_and_another_says_why(effect, setting)
     for place in effect.places(setting):
         patch = effect.patch(setting, values, place)
         changes = []
-        for trial in setting.campaign.trials:
-            moved = observe(model, setting.campaign, trial, patch, Conditions(means)).values - trial.values
-            changes.append(np.max(np.abs(moved) / np.max(np.abs(trial.values), axis=0)))
+        for item in setting.campaign.trials:
+            moved = observe(model, setting.campaign, item, patch, Conditions(means)).values - item.values
+            changes.append(np.max(np.abs(moved) / np.max(np.abs(item.values), axis=0)))
         assert max(changes) > 1e-3, place
+
+
+# ---------------------------------------------------------------- which effects are offered where
+
+
+def test_flows_are_offered_at_states_and_forces_are_not() -> None:
+    setting = tank_setting()
+    what = setting.campaign.trials[0]
+    for effect in chosen("outflow", "overflow"):
+        assert effect.unavailable(setting) is None
+        assert effect.places(setting) == ("outlet",)
+        middle = {item.name: item.prior.value(0.0) for item in effect.parameters}
+        shown = seen(setting.model, what, {"level": Quantity.LEVEL}, *effect.patch(setting, middle, "outlet"))
+        assert 0.02 < np.abs(shown - what.values).max() / what.values.max() < 0.9
+    (friction,) = chosen("coulomb_friction")
+    assert "are of states, where flows act and no forces" in str(friction.unavailable(setting))
+
+
+def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
+    """A body that falls shows drag and no hysteresis; one that is pushed to and fro may show both."""
+    model = model_of(INPUTS.text("falling_body.toml"))
+    falls = trial(TrialKind.DRIVEN, np.linspace(0.0, 1.0, 101), begins=Start.STILL)
+    given = campaign(falls, height=Channel("height", Quantity.DISPLACEMENT, "height", None))
+    setting = setting_of(given, model)
+    assert not setting.scales.ports["air"].turns
+    remember = "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"
+    for effect in chosen(*remember):
+        assert "motion that turns" in (effect.unavailable(setting) or "")
+    assert chosen("quadratic_damping")[0].unavailable(setting) is None
+    still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
+    assert model.scales(still).ports["air"].turns
+
+
+ALL, BOTH = {"all": ("shaker", "laser", "camera")}, {"rack": ("shaker", "laser"), "film": ("camera",)}
+
+
+@pytest.mark.parametrize(
+    ("loggers", "places", "motion"), [({}, ("",), True), (ALL, ("",), False), (BOTH, ("rack", "film"), True)]
+)
+def test_each_logger_may_have_a_wrong_clock(loggers: dict[str, Any], places: Any, motion: bool) -> None:
+    model = model_of(INPUTS.text("shaken_mass.toml"))
+    read = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
+    what = trial(TrialKind.FORCED, 400, channels=tuple(read), force=np.ones(400), load_place="shaker")
+    shared, own = chosen("logger_clock", "clock_error")
+    given = replace(campaign(what, **read), loggers=loggers)
+    setting = setting_of(given, model)
+    assert shared.unavailable(setting) is None
+    assert shared.places(setting) == places
+    assert (own.unavailable(setting) is None) is motion
+    patch = shared.patch(setting, {"rate_error": 4e-3}, places[0])
+    assert patch == ModelPatch((LoggerClock(places[0] or "*", 4e-3),))

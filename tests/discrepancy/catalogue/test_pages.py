@@ -2,8 +2,6 @@
 
 import struct
 
-import pytest
-
 from benchmarks.effect_pages import FOLDER, pages, paragraphs
 from benchmarks.effect_pictures import PICTURES, draw, picture_setting
 from discrepancy.catalogue.library import library
@@ -34,17 +32,14 @@ def test_every_effect_has_paragraphs():
             assert any(author in full and f"({year})" in full for full in text["references"]), short
 
 
-@pytest.mark.parametrize("name", sorted(IDENTIFIERS))
-def test_a_picture_is_small(name):
-    data = (FOLDER / "images" / f"{name}.png").read_bytes()
-    assert len(data) <= 40 * 1024
-    width, height = struct.unpack(">II", data[16:24])
-    assert 500 <= width <= 700
-    assert 150 <= height <= 300
-
-
-def test_no_picture_is_left_over():
-    assert {path.stem for path in (FOLDER / "images").iterdir()} == IDENTIFIERS
+def test_every_effect_has_a_small_picture():
+    pictures = {path.stem: path.read_bytes() for path in (FOLDER / "images").iterdir()}
+    assert pictures.keys() == IDENTIFIERS
+    for name, data in pictures.items():
+        width, height = struct.unpack(">II", data[16:24])
+        assert len(data) <= 40 * 1024, name
+        assert 500 <= width <= 700, name
+        assert 150 <= height <= 300, name
 
 
 def test_a_picture_can_be_drawn_again(monkeypatch):

@@ -181,6 +181,5 @@ def test_events_survive_the_files(pump, tmp_path):
     assert pump.event_times("quiet") == {}
     assert read_campaign(write_campaign(pump, tmp_path / "again")).events == pump.events
     every = ("campaign.toml", 'trial = "pumping", time', "time")
-    assert read_campaign(campaign_folder(tmp_path / "a", "pump", every)).events[0].trials == (
-        "quiet", "pumping",
-    )  # fmt: skip
+    (event,) = read_campaign(campaign_folder(tmp_path / "a", "pump", every)).events
+    assert event.trials == ("quiet", "pumping")

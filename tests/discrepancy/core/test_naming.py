@@ -26,10 +26,6 @@ from tests.refusals import Inputs
 
 from . import kit
 
-NOTHING, BELOW, UNEXPLAINED, GROUP, FAMILY, NAMED = (
-    VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT, VerdictKind.UNEXPLAINED, VerdictKind.GROUP,
-    VerdictKind.FAMILY, VerdictKind.NAMED,
-)  # fmt: skip
 CASES = Inputs(__file__).table("verdicts.toml")
 RIVALS = {name: kit.chosen(*effects) for name, effects in CASES["rivals"].items()} | {"all": kit.CATALOGUE}
 FEW, SLOW = RIVALS["few"], RIVALS["slow"]
@@ -104,17 +100,17 @@ def test_the_verdict_on_what_is_hidden(case, seed):
     verdict, found, fit = name(bench.problem(seed, patch, **how), rivals)
     assert verdict.kind in kinds, verdict.sentence
     wanted = sorted(item[0] for item in hidden)
-    if verdict.kind is NAMED:
+    if verdict.kind is VerdictKind.NAMED:
         assert sorted(effect.identifier for effect in verdict.effects) == wanted
-    if verdict.kind is GROUP and names:
+    if verdict.kind is VerdictKind.GROUP and names:
         assert names <= set(verdict.group)
         assert bench is TIP or names == set(verdict.group)
-    if verdict.kind is UNEXPLAINED:
+    if verdict.kind is VerdictKind.UNEXPLAINED:
         assert all(words in verdict.sentence for words in names)
-    if kinds == (NOTHING,):
+    if kinds == (VerdictKind.NOTHING_MISSING,):
         assert verdict.log_bayes_factor < 3.0
         assert verdict.effects == ()
-    if kinds != (NAMED,):
+    if kinds != (VerdictKind.NAMED,):
         return
     assert verdict.probability >= 0.95
     assert all(gate.passed is not False for gate in verdict.gates)
@@ -143,13 +139,13 @@ def test_a_joint_that_slips_is_named_though_it_has_more_elements(slip_ratio):
     values = {"stiffness_share": 0.3, "slip_ratio": slip_ratio}
     (joint,) = SMALL.patch("joint_micro_slip", values, "joint")
     verdict, _, _ = name(SMALL.problem(5, ModelPatch((replace(joint, element_count=400),))), HYSTERESIS)
-    assert verdict.kind is NAMED, verdict.sentence
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     (effect,) = verdict.effects
     assert effect.identifier == "joint_micro_slip"
     assert_held(effect, values)
 
 
-@pytest.mark.parametrize(("gain", "kind"), [(4e-4, NOTHING), (4e-2, NAMED)])
+@pytest.mark.parametrize(("gain", "kind"), [(4e-4, VerdictKind.NOTHING_MISSING), (4e-2, VerdictKind.NAMED)])
 def test_a_gain_of_half_a_thousandth_is_no_name(gain, kind):
     """Read so finely that it is certain; a gain of four per cent, as certain, is one."""
     bench = static({})
@@ -168,7 +164,7 @@ def test_a_gain_of_half_a_thousandth_is_no_name(gain, kind):
     patch = fine.patch("load_cell", {"gain_error": gain, "tare_ratio": 0.0})
     verdict, found, fit = name(fine.problem(2, patch), kit.chosen("load_cell"))
     assert verdict.kind is kind, verdict.sentence
-    if kind is NOTHING:
+    if kind is VerdictKind.NOTHING_MISSING:
         assert "below 0.1 % of what it acts on" in verdict.sentence
         assert verdict.effects == ()
         assert fit is found.none
@@ -177,7 +173,11 @@ def test_a_gain_of_half_a_thousandth_is_no_name(gain, kind):
 
 def test_without_a_noise_record_the_sentence_says_so():
     """Neither that nothing is missing nor that the name is all can be said of an absolute fit."""
-    for effect, noise, kind in ((0.0, None, NOTHING), (0.4, None, NAMED), (0.4, kit.NOISE, NAMED)):
+    for effect, noise, kind in (
+        (0.0, None, VerdictKind.NOTHING_MISSING),
+        (0.4, None, VerdictKind.NAMED),
+        (0.4, kit.NOISE, VerdictKind.NAMED),
+    ):
         problem = kit.closed_problem(seed=3, effect=effect, noise=noise)
         verdict, _, _ = name(problem, (kit.offset_effect(),))
         assert verdict.kind is kind, verdict.sentence
@@ -200,7 +200,7 @@ def test_members_that_do_not_fit_are_no_part_of_a_group(searched):
     found.keep(wrong, exact=True)
     right = ("coulomb_friction",)
     verdict, _, nearest = Case(found, {wrong.candidate.identifiers: 0.6, right: 0.38, (): 0.02}).open()
-    assert verdict.kind is GROUP
+    assert verdict.kind is VerdictKind.GROUP
     assert verdict.group == nearest.candidate.identifiers == right
     assert "cannot tell which" not in verdict.sentence
     assert verdict.probability == pytest.approx(0.38)
@@ -216,7 +216,7 @@ def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched):
         found.keep(kit.fitted(problem, *terms), exact=True)
     right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
     outcome = Case(found, {more: 0.7, right: 0.3}).shared()
-    assert outcome[0].kind is NAMED
+    assert outcome[0].kind is VerdictKind.NAMED
     assert [item.identifier for item in outcome[0].effects] == list(right)
     assert outcome[0].probability == pytest.approx(1.0)
     for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
@@ -236,7 +236,7 @@ def test_a_law_between_two_named_ones_is_their_family_once():
     verdict, found, fit = name(
         SMALL.problem(3, ModelPatch((PowerDamping("end", 1.0, 0.5, 0.0, 1.0, 1.0),))), FEW
     )
-    assert verdict.kind is FAMILY, verdict.sentence
+    assert verdict.kind is VerdictKind.FAMILY, verdict.sentence
     families = [item for item in found.exact.values() if item.candidate.is_family]
     laws = [(term.effect.family, term.place) for item in families for term in item.candidate.terms]
     assert len(laws) == len(set(laws))
@@ -257,7 +257,7 @@ def test_a_law_of_free_shape_beside_two_effects_is_no_verdict():
     others = others + SMALL.patch("seating_offset", {"offset_ratio": 0.05}, RUN)
     verdict, found, _ = name(SMALL.problem(3, law + others), FEW)
     assert len(found.best().candidate.terms) == SEARCH.largest_set
-    assert verdict.kind is UNEXPLAINED, verdict.sentence
+    assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
     assert "free shape gains" in verdict.sentence
     assert {"gauge_gain", "seating_offset"} < set(verdict.resembles)
 
@@ -301,7 +301,7 @@ def test_coloured_noise_with_a_short_record_is_no_gap(seed):
         samples -= samples.mean()
         records[key] = NoiseRecord(float(samples.std()), 99.0, samples, 0.012, "pre-trigger")
     verdict, _, _ = name(kit.with_noise(problem, **records), SLOW)
-    assert verdict.kind is NOTHING, verdict.sentence
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
 
 
 def test_shares_and_their_interval():
@@ -357,7 +357,7 @@ def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_o
 # ---------------------------------------------------------------- what a name does not exclude
 
 
-def verdict_on(*identifiers, kind=NAMED):
+def verdict_on(*identifiers, kind=VerdictKind.NAMED):
     effects = tuple(
         NamedEffect(item.identifier, item.name, "", item.family, (), (), ModelPatch())
         for item in kit.chosen(*identifiers)
@@ -367,7 +367,9 @@ def verdict_on(*identifiers, kind=NAMED):
 
 def test_only_names_are_remarked_on_and_likeness_counts_both_ways():
     for kind in VerdictKind:
-        assert bool(look_alike_remark(verdict_on("load_cell", kind=kind), kit.CATALOGUE)) is (kind is NAMED)
+        assert bool(look_alike_remark(verdict_on("load_cell", kind=kind), kit.CATALOGUE)) is (
+            kind is VerdictKind.NAMED
+        )
     for effect in kit.CATALOGUE:
         for other in effect.confusable:
             assert effect.identifier in look_alike_remark(verdict_on(other), kit.CATALOGUE)
@@ -384,7 +386,7 @@ def test_only_names_are_remarked_on_and_likeness_counts_both_ways():
 
 def test_a_group_says_last_what_these_trials_cannot_test():
     setting = kit.chain_bench(amplitudes=()).setting
-    group = replace(verdict_on("load_cell", kind=GROUP), sentence="Either is missing.")
+    group = replace(verdict_on("load_cell", kind=VerdictKind.GROUP), sentence="Either is missing.")
     sentence = with_untested(group, setting, kit.CATALOGUE).sentence
     assert sentence.startswith("Either is missing. ")
     told = {effect.name for effect in kit.CATALOGUE if effect.name in sentence}

@@ -151,28 +151,21 @@ def test_white_noise_has_no_remainder(freedom):
     for seed in range(40):
         problem, found, left = ringing(seed, 150, noise=NoiseRecord(0.02, freedom))
         wrong += left.acts
+        assert np.all(left.factor >= 1.0)
         if seed == 0:
             assert refitted(problem, widened(problem, left), found) is found
     assert wrong <= 1
 
 
-def test_white_noise_beyond_its_record_forgets_at_once():
-    """Noise a fifth above its record: of some size, and no time over which it forgets."""
-    generator = np.random.default_rng(4)
-    loud = 0.02 * np.sqrt(0.2)
-    problem, _, left = ringing(3, 600, lambda rows: loud * generator.standard_normal(len(rows)))
-    first = problem.channel_names.index("y1")
-    assert left.size[first] == pytest.approx(np.sqrt(0.2), rel=0.3)
-    assert left.time[first] < 0.05
-    assert np.all(left.factor >= 1.0)
-
-
-@pytest.mark.parametrize(("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0)])
+@pytest.mark.parametrize(
+    ("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0), (np.sqrt(0.2), 1e-6, 0.0)]
+)
 def test_size_time_and_frequency_are_found(size, tau, frequency):
+    """And of white noise a fifth above its record a size, and no time over which it forgets."""
     problem, _, left = ringing(4, 900, coloured(size, tau, frequency))
     first = problem.channel_names.index("y1")
     assert left.size[first] == pytest.approx(size, rel=0.4)
-    assert left.time[first] == pytest.approx(tau, rel=0.6)
+    assert left.time[first] == pytest.approx(tau, rel=0.6, abs=0.04)
     assert 2.0 * np.pi * left.frequency[first] == pytest.approx(frequency, abs=1.0)
     assert np.all(np.delete(left.size, first) == 0.0)
     assert not left.is_noise
@@ -190,20 +183,6 @@ def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():
     np.testing.assert_allclose(found.covariance, said.covariance, rtol=1e-3, atol=1e-9)
     assert found.log_evidence == pytest.approx(said.log_evidence, abs=0.05)
     assert found.chi_square > 3.0 * said.chi_square  # told against the recorded noise
-
-
-def test_evidence_counts_independent_samples():
-    """A drift of the same channel gains much by white noise from a slow remainder, and little beside it."""
-    gains = []
-    for seed in range(6):
-        problem, none, _ = ringing(seed, 400, coloured(4.0, 0.4, 0.0, seed), offset_deviation=0.0)
-        drift = kit.fitted(problem, Term(kit.drift_effect(channel="y1"), "y1"))
-        wide = widened(problem, left_by(problem, drift))
-        pair = [refitted(problem, wide, item).log_evidence for item in (none, drift)]
-        gains.append((drift.log_evidence - none.log_evidence, pair[1] - pair[0]))
-    white, honest = np.array(gains).T
-    assert white.max() > 20.0
-    assert honest.max() < 4.0
 
 
 def test_colour_of_the_noise_is_told_from_a_remainder():

@@ -28,6 +28,7 @@ from fe.runtime.patch import (
     SensorGain,
     SensorRotation,
 )
+from tests.refusals import Inputs
 
 PLAN = ExamplePlan(
     (
@@ -101,19 +102,7 @@ def test_sound_data_have_no_fault(cantilever, seed):
 # ---------------------------------------------------------------- units, signs, exchanged channels
 
 
-@pytest.mark.parametrize(
-    ("name", "factor", "guess"),
-    [
-        ("g0", 1e6, "microstrain given as strain"),
-        ("g1", 1e-6, "strain given as microstrain"),
-        ("g0", 100.0, "percent given as strain"),
-        ("x", 1e3, "mm given as m"),
-        ("x", 1e-3, "m given as mm"),
-        ("x", 100.0, "100 times"),
-        ("x", 0.8e6, "1e\\+06 times"),
-        ("g0", -1e6, "microstrain"),
-    ],
-)
+@pytest.mark.parametrize(("name", "factor", "guess"), Inputs(__file__).table("faults.toml")["scaled"])
 def test_unit_slips(cantilever, campaign, name, factor, guess):
     """The noise record slips with the channel, or stays in the right unit."""
     slipped = scaled(campaign, name, factor)

@@ -20,7 +20,8 @@ from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
-MODEL = Inputs(__file__).text("mass_on_a_spring.toml")
+INPUTS = Inputs(__file__)
+MODEL = INPUTS.text("mass_on_a_spring.toml")
 CHANNEL = """
 [[channel]]
 name = "{0}"
@@ -234,27 +235,10 @@ def test_what_moves_alike_is_no_copy(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "quantity", "stated", "drive", "pair"),
-    [
-        (1.0 / 25.0, Quantity.DISPLACEMENT, "mm", False, "inch given as mm"),
-        (38.0, Quantity.DISPLACEMENT, "m", False, "inch given as m"),
-        (-1e3, Quantity.DISPLACEMENT, "m", False, "mm given as m"),
-        (0.102, Quantity.FORCE, "N", False, "kgf given as N"),
-        (9.6, Quantity.FORCE, "N", True, "kgf given as N"),
-        (4.5, Quantity.FORCE, "N", True, "lbf given as N"),
-        (60.0, Quantity.ANGLE, "rad", False, "deg given as rad"),
-        (1.0 / 57.0, Quantity.ANGLE, "deg", False, "rad given as deg"),
-        (1.0 / 6.25, Quantity.ANGULAR_VELOCITY, "rad/s", False, "Hz given as rad/s"),
-        (9.4, Quantity.ANGULAR_VELOCITY, "rad/s", False, "rpm given as rad/s"),
-        (62.0, Quantity.FLOW, "l/s", False, "l/min given as l/s"),
-        (0.1, Quantity.ACCELERATION, "m/s2", False, "g given as m/s2"),
-        (1.5, Quantity.FORCE, "N", False, ""),
-        (3.0, Quantity.FORCE, "N", True, ""),
-        (30.0, Quantity.STRAIN, "microstrain", False, ""),
-    ],
+    ("scale", "quantity", "stated", "drive", "pair"), INPUTS.table("faults.toml")["slips"]
 )
 def test_a_factor_names_its_pair_of_units(scale, quantity, stated, drive, pair):
-    assert str(slip_between(scale, quantity, stated, drive=drive) or "").strip("(?)") == pair
+    assert str(slip_between(scale, Quantity(quantity), stated, drive=drive) or "").strip("(?)") == pair
 
 
 # ---------------------------------------------------------------- at rest

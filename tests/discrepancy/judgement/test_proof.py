@@ -1,17 +1,28 @@
-"""Proof: scores of calibrated predictions, gaps, standard errors over trials."""
+"""Proof: scores of calibrated predictions, gaps, errors over trials. Consistency: statistic, level, power."""
 
 from dataclasses import replace
-from math import isnan, log, pi
+from math import inf, isnan, log, pi
 
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.signal import lfilter
+from scipy.stats import binom, kstest
 
-from discrepancy.campaign.records import NoiseRecord
+from discrepancy.campaign.records import NoiseRecord, TrialKind
 from discrepancy.errors import FitError
+from discrepancy.fits.gates import absolute_gate
+from discrepancy.judgement.consistency_gate import (
+    CONSISTENCY_LEVEL,
+    consistency_gate,
+    directions,
+    score_tests,
+)
+from discrepancy.judgement.naming import name
 from discrepancy.judgement.proof import correlation_time, gap_closed, log_density, prove, score_gain, scores
+from discrepancy.verdict import VerdictKind
 from tests.discrepancy.bench import Bench, with_noise
+from tests.discrepancy.core import kit
 
 
 def lacking(bench, size):
@@ -135,3 +146,168 @@ def test_correlation_time_of_an_autoregression():
     assert np.mean(found) == pytest.approx(1.8 / 0.2, rel=0.15)
     assert correlation_time(np.ones(10)) == 1.0
     assert correlation_time(np.array([1.0, -1.0] * 50)) == 1.0
+
+
+# ---------------------------------------------------------------- the gate of consistency
+
+
+STATIONS = {"y1": 0.2, "y2": 0.6, "y3": 0.9}
+
+
+def changed(problem, *, record=None, size=None, shift=0.0, place="middle", flight=False):
+    """Return the problem with stations, its second static trial under another load place or in flight.
+
+    `record` replaces the channels' noise records; `size` multiplies the readings of channels in that trial,
+    `shift` is added to all of them.
+    """
+    campaign = problem.campaign
+    channels = {
+        key: replace(item, station=STATIONS[key], noise=record or item.noise)
+        for key, item in campaign.channels.items()
+    }
+    trials = []
+    for trial in campaign.trials:
+        if trial.run == "B":
+            values = trial.values * [(size or {}).get(key, 1.0) for key in trial.channels] + shift
+            trial = replace(trial, load_place=place, values=values)
+        if trial.run == "B" and flight:
+            load = {"load_factor": trial.force, "force": 0.0 * trial.force}
+            trial = replace(trial, kind=TrialKind.FLIGHT, **load)
+        trials.append(trial)
+    return kit.problem_of(replace(campaign, channels=channels, trials=tuple(trials)), problem.model)
+
+
+def asked(problem, term=kit.OFFSET):
+    """Return the fit of a term, the directions beside it and their tests."""
+    found = kit.fitted(problem, term)
+    along = directions(problem, found)
+    return found, along, score_tests(problem, found, along)
+
+
+def test_statistic_is_the_fall_of_the_penalised_sum_of_squares():
+    """Dense least squares with and without the directions; the effect without its prior in both."""
+    problem = kit.closed_problem(seed=3, effect=0.4, samples=30)
+    found, _, _ = asked(problem)
+    generator = np.random.default_rng(5)
+    columns = [
+        {n: 0.02 * generator.standard_normal(problem.trials[n].weight.shape) for n in numbers}
+        for numbers in ((0,), (1, 2, 3))
+    ]
+    (test,) = score_tests(problem, found, {"both": {"a": columns[0], "b": columns[1]}})
+    dense = kit.Linear(problem, found.candidate)
+    y, matrix, _ = dense.dense()
+    extra = np.zeros((len(y), 2))
+    ends = np.cumsum([0, *(int((data.weight > 0.0).sum()) for data in problem.trials)])
+    for k, direction in enumerate(columns):
+        for number, column in direction.items():
+            data = problem.trials[number]
+            extra[ends[number] : ends[number + 1], k] = data.standardised(column)[data.weight > 0.0]
+    precision = dense.precision.copy()
+    precision[problem.shared.size : problem.shared.size + found.candidate.size] = 0.0
+    left = []
+    for a, p in ((matrix, precision), (np.hstack((matrix, extra)), np.concatenate((precision, [0.0, 0.0])))):
+        x = np.linalg.solve(a.T @ a + np.diag(p), a.T @ y)
+        left.append(float(np.sum((y - a @ x) ** 2) + p @ x**2))
+    assert test.count == 2
+    assert test.statistic == pytest.approx(left[0] - left[1], rel=1e-5)
+    # what is free already is no direction: the derivative by the effect itself, and one that is nothing
+    own = {n: part.effect[0] for n, part in enumerate(found.linearisations) if np.any(part.effect)}
+    nothing = {0: np.zeros_like(problem.trials[0].weight)}
+    assert score_tests(problem, found, {"own": {"offset": own}, "nothing": {"zero": nothing}}) == []
+    assert score_tests(problem, found, {}) == []
+
+
+@pytest.mark.parametrize("freedom", [pytest.param(inf, marks=pytest.mark.long), 30.0])
+def test_p_values_are_uniform_where_the_name_is_right(freedom):
+    """100 campaigns with the effect that is named: Kolmogorov-Smirnov, and the rejections at 5 %."""
+    generator = np.random.default_rng(11)
+    found = {"static loads": [], "zeros of the static runs": [], "channel y1": []}
+    for seed in range(100):
+        scale = 1.0 if freedom == inf else float(np.sqrt(generator.chisquare(freedom) / freedom))
+        drawn = kit.closed_problem(seed=seed, effect=0.3 * generator.standard_normal(), samples=20)
+        _, _, tests = asked(changed(drawn, record=NoiseRecord(0.02 * scale, freedom)))
+        for test in tests:
+            found[test.name].append(test.p_value)
+    for values in found.values():
+        assert len(values) == 100
+        assert kstest(values, "uniform").pvalue > 1e-3
+        assert sum(p < 0.05 for p in values) <= binom.isf(1e-3, 100, 0.05)
+
+
+MIDDLE = np.mean(list(STATIONS.values()))
+OFFSET = {"seed": 4, "effect": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("made", "term", "change", "words"),
+    [
+        # drift of y2 named where y2 reads 15 % more under one of two loads
+        ({"seed": 2}, kit.DRIFT, {"size": {"y2": 1.15}}, ("channel y2", "middle")),
+        # a load 5 % too large at one of two places
+        (OFFSET, kit.OFFSET, {"size": dict.fromkeys(STATIONS, 1.05)}, ("static loads",)),
+        # lift 4 % too small inboard and too large outboard, which a size alone does not hold
+        (OFFSET, kit.OFFSET,
+         {"flight": True, "size": {name: 1.0 + 0.12 * (at - MIDDLE) for name, at in STATIONS.items()}},
+         ("loads of flight", "the slope over the span in flight")),
+        # all displacements of one run off by four deviations, with zeros that are known to be small
+        ({**OFFSET, "offset_deviation": 0.005}, kit.OFFSET, {"shift": 0.08},
+         ("zero of displacement in run B",)),
+    ],
+)  # fmt: skip
+def test_what_the_sum_of_squares_does_not_show_is_seen(made, term, change, words):
+    """Few wrong readings among many samples of motion; what fails the gate is not named."""
+    truth = kit.closed_problem(samples=1500, **made)
+    flight = change.get("flight", False)
+    right, wrong = changed(truth, flight=flight), changed(truth, **change)
+    assert consistency_gate(right, asked(right, term)[0]).passed
+    found, _, tests = asked(wrong, term)
+    assert absolute_gate(wrong, found).passed
+    gate = consistency_gate(wrong, found)
+    assert gate.passed is False
+    assert gate.statistic < CONSISTENCY_LEVEL
+    assert all(word in gate.reason for word in words)
+    flights = ["loads of flight"] * flight
+    place = f"channel {term.place}"
+    assert [test.name for test in tests] == ["static loads", *flights, "zeros of the static runs", place]
+    if words != ("static loads",):
+        return
+    verdict, _, _ = name(right, (term.effect,))
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert [gate.name for gate in verdict.gates] == [
+        "absolute fit",
+        "shape",
+        "consistency",
+        "held-out trials",
+    ]
+    verdict, _, _ = name(wrong, (term.effect,))
+    assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
+    assert "static loads" in verdict.sentence
+    assert verdict.effects == ()
+
+
+def test_directions_of_zeros():
+    """One for runs without a label; as large in a noisy trial; none of loads where there are none."""
+    problem = changed(kit.closed_problem(seed=4, effect=0.5))
+    trials = tuple(replace(trial, run="") for trial in problem.campaign.trials)
+    whole = kit.problem_of(replace(problem.campaign, trials=trials), problem.model)
+    (zeros,) = (test for test in asked(whole)[2] if test.name == "zeros of the static runs")
+    assert zeros.strongest.startswith("the zero of displacement in the runs without a label (")
+    # the second ring-down has 1.5 times the noise
+    assert {data.trial.noise_factor for data in problem.trials} == {1.0, 1.5}
+    starts = {n: data.trial.start for n, data in enumerate(problem.trials)}
+    assert len(set(starts.values())) == 4
+    moves = asked(problem)[1]["channel y1"]["the zero over time"]
+    drift = {n: column.max() for n, column in moves.items()}
+    assert drift == pytest.approx({n: drift[3] * start / starts[3] for n, start in starts.items()})
+    # two static trials of one run have other channels
+    first, second, *others = (replace(trial, run="A") for trial in problem.campaign.trials)
+    assert second.channels[0] == "y3"
+    fewer = {"channels": second.channels[1:], "values": second.values[:, 1:], "used": second.used[:, 1:]}
+    campaign = replace(problem.campaign, trials=(first, replace(second, **fewer), *others))
+    other = kit.with_noise(kit.problem_of(campaign, problem.model), y3=NoiseRecord(0.1, inf))
+    (zeros,) = asked(other)[1]["zeros of the static runs"].values()
+    assert {float(value) for column in zeros.values() for value in column.ravel()} == {0.02}
+    without = kit.closed_problem(seed=1, kinds=("ringdown",))
+    gate = consistency_gate(without, kit.fitted(without))
+    assert gate.passed is None
+    assert np.isnan(gate.statistic)

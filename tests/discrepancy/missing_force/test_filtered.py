@@ -101,24 +101,32 @@ def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
     return rows @ kernel @ rows.T, nearest @ kernel @ rows.T
 
 
-@pytest.mark.parametrize("rough", [False, True], ids=["bends", "jumps"])
-@pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
-def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven):
+@pytest.mark.parametrize(
+    ("rough", "uneven", "unknown"),
+    [(False, False, 0), (False, True, 0), (True, False, 0), (True, True, 0), (False, False, 2)],
+)
+def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unknown):
+    """And those beside unknowns of the trial and coloured noise of a channel."""
     random = np.random.default_rng(3)
     time = 0.02 * np.arange(40)
     if uneven:
         time = time + np.r_[0.0, random.uniform(-0.006, 0.006, 39)]
     residual = random.standard_normal((40, 2)) * [3.0, 1.0]
     used = random.uniform(size=(40, 2)) > 0.2
-    trial = trial_of(time, residual, used=used)
+    local, share = random.standard_normal((unknown, 40, 2)) * used, 0.4 * unknown
     process = Process(2.0, 0.15, rough)
+    trial = trial_of(time, residual, used=used, local=local, coloured=((0, share, 12.0),) if share else ())
     filtered = Filtered(trial, [(0, process)])
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
-    covariance = covariance[np.ix_(at, at)] + np.eye(len(at))
+    noise = np.kron(share * np.exp(-12.0 * np.abs(time[:, None] - time)), np.diag([1.0, 0.0]))
+    noise += np.kron(np.eye(40), np.diag([1.0 - share, 1.0]))
+    flat = local.reshape(unknown, 80)
+    covariance = (covariance + noise + flat.T @ flat)[np.ix_(at, at)]
     readings = residual.ravel()[at]
-    wanted = gaussian(covariance, readings)
-    assert evidence(filtered) == pytest.approx(wanted, abs=0.05 if rough else 0.02)
+    assert evidence(filtered) == pytest.approx(gaussian(covariance, readings), abs=0.05 if rough else 0.02)
+    if unknown:
+        return
     _, (force,), (deviation, _) = filtered.smoothed(trial.residual)
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
     np.testing.assert_allclose(force[::PARTS], mean, atol=0.02 * process.size)
@@ -181,25 +189,6 @@ def test_states_and_noise_by_closed_forms():
         pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
     )  # fmt: skip
     assert decaying_part(noise, 0.02) is None
-
-
-def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning():
-    random = np.random.default_rng(6)
-    time = 0.02 * np.arange(60)
-    residual = random.standard_normal((60, 2))
-    local = random.standard_normal((2, 60, 2))
-    share, rate = 0.8, 12.0
-    trial = trial_of(time, residual, local=local, coloured=((0, share, rate),))
-    covariance, _ = dense(trial, PROCESS)
-    noise = np.eye(120)
-    first = np.arange(0, 120, 2)
-    decay = share * np.exp(-rate * np.abs(time[:, None] - time))
-    noise[np.ix_(first, first)] = decay + (1.0 - share) * np.eye(60)
-    flat = local.reshape(2, -1)
-    covariance = covariance + noise + flat.T @ flat
-    readings = residual.ravel()
-    wanted = gaussian(covariance, readings)
-    assert evidence(Filtered(trial, [(0, PROCESS)])) == pytest.approx(wanted, abs=0.02)
 
 
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])

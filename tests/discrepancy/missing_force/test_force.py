@@ -166,14 +166,6 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
     assert found.missing is None or (gain != 1.0 and not found.verdict.effects)
 
 
-def test_ports_move_the_same_at_finer_samples(tmp_path):
-    problem = blind(tmp_path, SERVO)
-    data, start = problem.trials[0], problem.start(Candidate())
-    conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(start.shared), start.local[0])
-    coarse, fine = (problem.model.port_motion(data.trial, conditions, parts)[0] for parts in (1, 4))
-    np.testing.assert_allclose(fine[::4], coarse, atol=1e-6 * np.ptp(coarse))
-
-
 STIFF = PowerStiffness("slide", 2.0, 3.0, 0, 0.02)
 DAMPED = PowerDamping("slide", 0.5, 2.0, 0.0, 0.6, 1.0)
 

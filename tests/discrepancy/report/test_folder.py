@@ -4,8 +4,6 @@ import os
 import re
 import stat
 from contextlib import suppress
-from dataclasses import replace
-from html import unescape
 
 import pytest
 
@@ -115,14 +113,3 @@ def test_a_null_has_no_patch_and_is_replaced_on_demand_only(tmp_path):
     for place, words in ((other, "not touched"), (other / "chapter.tex", "no folder")):
         with pytest.raises(FileNotWrittenError, match=words):
             check_verdict_folder(place, replace_it=True)
-
-
-def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path):
-    campaign, model = measured(kind="static")
-    wrong = tuple(replace(trial, values=1e6 * trial.values) for trial in campaign.trials)
-    found = investigate(replace(campaign, trials=wrong), model, library())
-    assert found.verdict.kind is VerdictKind.DATA_ERROR
-    page = write_verdict_folder(tmp_path / "v", ReportInput(found, ORIGIN)).read_text(encoding="utf-8")
-    assert found.verdict.sentence.split(",")[0] in unescape(page)
-    assert "Proof" not in page
-    assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]

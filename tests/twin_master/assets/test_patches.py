@@ -20,7 +20,7 @@ from fe.runtime.patch import (
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from tests.command_line import refused
 from tests.twin_master.runs import figures_of, text_of, written
-from twin_master.assets.reduced_model import check_model_patch
+from twin_master.assets.design_source import check_model_patch
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, ScenarioError

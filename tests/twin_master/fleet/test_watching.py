@@ -24,9 +24,8 @@ from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import attention, group_figures, leaving
-from twin_master.fleet.report import fleet_page, write_fleet_report
+from twin_master.fleet.report import WORST, fleet_page, serve_fleet, write_fleet_report
 from twin_master.fleet.shard import Engine
-from twin_master.fleet.view import WORST, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import kept_knowledge

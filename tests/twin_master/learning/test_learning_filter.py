@@ -17,7 +17,7 @@ from twin_master.learning.learning_filter import (
 )
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
-from twin_master.network.rewards import RewardModel, RewardSettings
+from twin_master.network.rewards import RewardModel
 from uav_twin import Carried, Estimate, GaussianSensorModel, GraphicalModel
 
 Float = NDArray[np.float64]
@@ -197,7 +197,7 @@ def test_a_belief_that_underflows_comes_back():
     np.testing.assert_allclose(log_belief[2][0], -1800.0, rtol=1e-12)
 
 
-SETTINGS = RewardSettings(2.0, (-0.1, 0.1), 0.8, (2.0, 3.0))
+SETTINGS = 2.0, (-0.1, 0.1), 0.8, (2.0, 3.0)
 POLICY = np.array([[0.0, 1.0], [0.3, 0.7], [1.0, 0.0]])
 
 
@@ -208,7 +208,7 @@ def turns() -> list[Estimate]:
 
 @pytest.fixture(scope="module")
 def expectation() -> LearntExpectation:
-    return LearntExpectation(learner_of_all(), RewardModel(sensors(), SETTINGS), POLICY)
+    return LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
 
 
 def moments(values: Float, weight: Float) -> tuple[Float, Float]:
@@ -222,7 +222,7 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
     carried, seen, rewards = (
         [turn.carried for turn in turns],
         observations(),
-        RewardModel(sensors(), SETTINGS),
+        RewardModel(sensors(), *SETTINGS),
     )
     filtered, smoothed = expectation.filtered(carried, seen), expectation.smoothed(carried, seen)
     value = sensors().value_per_draw
@@ -287,7 +287,7 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     squares = 10.0 + left @ left - mean @ design.T @ left
     scale2 = squares / (10.0 + 6.0 - 2.0)
     row = design[-1]
-    rewards = RewardModel(sensor, RewardSettings(9.0, (0.0, 0.0), 0.8))
+    rewards = RewardModel(sensor, 9.0, (0.0, 0.0), 0.8)
     found = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]])).filtered(carried, seen[:, None])
     spread = 0.5 * np.sqrt(scale2 * row @ covariance @ row)
     assert found.mean[-1, 0] == pytest.approx(shown[-1] + 0.5 * row @ mean)
@@ -316,7 +316,7 @@ def test_quantiles_are_those_of_the_mixture():
 def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
     sensor = sensors()
     learner = LearningFilter(model(), sensor, LearntPriors("e", [1.1, 0.9, 1.0]))
-    rewards = RewardModel(sensor, RewardSettings(1.0, (0.0, 0.1), 1.0))
+    rewards = RewardModel(sensor, 1.0, (0.0, 0.1), 1.0)
     joint = np.zeros((1, 3, 2))
     joint[0, 1, 1] = 1.0
     told = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}  # half way between draws on both sides

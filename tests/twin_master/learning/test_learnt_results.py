@@ -14,9 +14,9 @@ from scipy.stats import invgamma
 from reporting.page import ReportFigure
 from tests.command_line import said
 from tests.twin_master.runs import journal, text_of, written
-from twin_master.mission.replay import gap_of
+from twin_master.mission.loop import gap_of
 from twin_master.mission.turns import History, Reading, Turn
-from twin_master.report.learnt import learnt_figure, sensor_rows
+from twin_master.report.model import learnt_figure, sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.store.writing import open_run

@@ -114,7 +114,7 @@ def test_many_twins_equal_one_by_one():
     rng = np.random.default_rng(6)
     control = rng.integers(0, 2, (7, 15))
     log_likelihood = rng.normal(size=(7, 15, 25)) * 100
-    filtered, failed = filter_many(MODEL, control, log_likelihood, MODEL.log_prior)
+    filtered, failed = filter_many(MODEL.transition, control, log_likelihood, MODEL.log_prior)
     smoothed = smooth_many(MODEL.transition, control, np.exp(filtered.log_filtered), filtered.log_filtered)
     np.testing.assert_array_equal(failed, -1)
     for twin in range(7):
@@ -131,7 +131,7 @@ def test_an_impossible_observation_names_its_step():
     with pytest.raises(ImpossibleObservation, match="step 3:"):
         filter_sequence(MODEL, [1] * 5, log_likelihood)
     many = np.stack([np.zeros((5, 25)), log_likelihood, log_likelihood])
-    _, failed = filter_many(MODEL, np.ones((3, 5), dtype=int), many, MODEL.log_prior)
+    _, failed = filter_many(MODEL.transition, np.ones((3, 5), dtype=int), many, MODEL.log_prior)
     np.testing.assert_array_equal(failed, [-1, 3, 3])
 
 

@@ -11,7 +11,7 @@ from twin_master.errors import InvalidDistributionError, InvalidModelError, Plan
 from twin_master.network.inference import known_control
 from twin_master.network.planner import given_policy, value_iteration
 from twin_master.network.quantity import QuantityModel
-from twin_master.network.rewards import RewardModel, RewardSettings, health_reward
+from twin_master.network.rewards import RewardModel, health_reward
 from twin_master.network.transition import TransitionModel
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -60,9 +60,7 @@ def test_moments_and_quantiles_are_those_of_the_mixture(seed, ties):
 
 
 LIMIT, LOAD = 2500e-6, (2.0, 3.0)
-SETTINGS = RewardSettings(
-    limit=LIMIT, control_reward=(-0.1, 0.1), error_scale=125e-6, control_normaliser=LOAD
-)
+SETTINGS = LIMIT, (-0.1, 0.1), 125e-6, LOAD
 
 
 def strains(seed):
@@ -82,7 +80,7 @@ def test_rewards_are_sums_over_states_controls_and_draws(seed):
         np.broadcast_to([-0.1, 0.1], probability.shape),
         -np.nanmean(np.abs(observation - value), axis=3) / 125e-6 / LOAD,
     ]
-    found = RewardModel(quantity, SETTINGS).expectation(joint, observation)
+    found = RewardModel(quantity, *SETTINGS).expectation(joint, observation)
     for i, reward in enumerate(rewards):
         mean = (probability * reward).sum()
         spread = np.sqrt((probability * (reward - mean) ** 2).sum())
@@ -92,7 +90,7 @@ def test_rewards_are_sums_over_states_controls_and_draws(seed):
 
 def test_a_known_control_has_no_spread_and_without_an_observation_there_is_no_error():
     _, quantity, joint = strains(1)
-    model = RewardModel(quantity, SETTINGS)
+    model = RewardModel(quantity, *SETTINGS)
     found = model.expectation(known_control(np.full((6, 3), 1 / 3), np.array([0, 1, 0, 1, 0, 1]), 2))
     assert found.mean.shape == (6, 3)
     np.testing.assert_allclose(found.mean[:, 1], [-0.1, 0.1] * 3, rtol=1e-14)
@@ -163,7 +161,7 @@ MOVES = TransitionModel((TABLE,))
 VALUES, WEIGHT, JOINT = random_case(0)
 HOLED = np.where(np.arange(VALUES.size).reshape(VALUES.shape) == 12, np.nan, VALUES)  # at (0, 1, 0, 2)
 QUANTITY = QuantityModel(VALUES, WEIGHT)
-REWARDS = RewardModel(QUANTITY, RewardSettings(1.0, (0.0, 1.0), 1.0))
+REWARDS = RewardModel(QUANTITY, 1.0, (0.0, 1.0), 1.0)
 REFUSED = [
     (lambda: QuantityModel(VALUES[0]), r"\(draws, states, controls, sensors\)"),
     (lambda: QuantityModel(HOLED), r"\(0, 1, 0, 2\) is nan"),

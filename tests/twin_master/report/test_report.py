@@ -20,9 +20,8 @@ from tests.refusals import Inputs
 from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
 from twin_master.errors import RunFolderError
 from twin_master.report import page as report
-from twin_master.report.calibration import true_value
-from twin_master.report.check import predictive_check
 from twin_master.report.mission import default_now, mission_figure
+from twin_master.report.model import predictive_check, true_value
 from twin_master.report.page import lost_ranges, opening_sentences
 from twin_master.report.reading import Run
 from twin_master.run_folder import to_json

@@ -15,12 +15,16 @@ from reporting.figures import to_svg
 from tests.twin_master.report.drawn import altered, line, panel, rescripted, stored
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
-from twin_master.report.belief import belief_figure, belief_turns, policy_figure
-from twin_master.report.calibration import calibration_figure, measured
-from twin_master.report.check import predictive_check
-from twin_master.report.mission import choose_sensors, mission_figure
+from twin_master.report.mission import (
+    belief_figure,
+    belief_turns,
+    choose_sensors,
+    mission_figure,
+    policy_figure,
+)
+from twin_master.report.model import calibration_figure, measured, predictive_check
+from twin_master.report.reading import short_number
 from twin_master.report.structure import planform_figure, planform_of
-from twin_master.report.view import short_number
 
 
 def test_the_mission_figure_draws_the_stored_arrays(run):

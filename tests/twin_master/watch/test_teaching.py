@@ -19,8 +19,8 @@ from tests.twin_master.runs import check_same, figures_of, journal
 from tests.twin_master.watch.watches import beliefs_of, decided, of_gauge, patch_of, ran, viewed, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.loop import replay
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
-from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.store.writing import open_run
 from twin_master.viewer.messages import Request, Teller

@@ -34,7 +34,7 @@ from tests.twin_master.watch.watches import (
 )  # fmt: skip
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
-from twin_master.mission.replay import BelievedModel, journalled_decision
+from twin_master.mission.loop import BelievedModel, journalled_decision
 from twin_master.mission.turns import History
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run

@@ -19,7 +19,7 @@ from paho.mqtt import client as paho
 from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.replay import BelievedModel
+from twin_master.mission.loop import BelievedModel
 from twin_master.scenario.tables import Noticing
 from twin_master.viewer.flight import Flight
 from twin_master.watch.folder import Watch
