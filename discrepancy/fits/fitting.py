@@ -289,7 +289,9 @@ def _bounded(point: Point) -> Point:
     return replace(point, effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))
 
 
-def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateFit | None:
+def free_shape(
+    problem: Problem, named: CandidateFit, number: int, give_up: float | None = None
+) -> CandidateFit | None:
     """Fit the family of one effect of a fit: its shape free, from the canonical one.
 
     Parameters
@@ -300,6 +302,8 @@ def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateF
         With canonical shapes.
     number : int
         Of the effect among its terms.
+    give_up : float, optional
+        See `fit`.
 
     Returns
     -------
@@ -313,7 +317,8 @@ def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateF
     canonical = [item.prior.normal(item.canonical) for item in term.effect.shape]
     parts[number] = replace(term, free_shape=True), np.append(values, canonical)
     terms, begin = zip(*parts, strict=True)
-    return attempt(problem, Candidate(terms), replace(named.point, effect=np.concatenate(begin)))
+    start = replace(named.point, effect=np.concatenate(begin))
+    return attempt(problem, Candidate(terms), start, give_up=give_up)
 
 
 def is_box(candidate: Candidate) -> bool:

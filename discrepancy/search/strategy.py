@@ -23,7 +23,7 @@ from discrepancy.fits.screening import Change, Screen
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import SENSORS
+from fe.runtime.patch import SENSORS, MicroSlip
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
@@ -344,17 +344,38 @@ class Search:
         return not absolute_gate(self.problem, self.best()).passed
 
     def settle(self) -> None:
-        """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
+        """Compute the best candidate finely enough that its evidence is its own, not that of the steps.
+
+        Joints that slip are divided more finely; time steps are halved while they cost too much.
+        """
+        setting = self.problem.setting
+        if setting.joint_elements < SEARCH.fine_joint and self._slips(self.best()):
+            ranked = self._ranked()
+            self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
+            self._fit_again([item for item in ranked if self._slips(item)])
+            if self._slips(self.best()):
+                self.keep(around(self.problem, self.best()), exact=True)
         while (
             self.problem.refinement < SEARCH.finest
             and solver_share(self.problem, self.best()) > SEARCH.solver_share
         ):
             self.problem.refinement *= 2
-            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[: SEARCH.refitted]
-            for item in ranked:
-                again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
-                if again is not None:  # else the rough one stands
-                    self.exact[item.candidate.key] = again
+            self._fit_again(self._ranked())
+
+    def _ranked(self) -> list[CandidateFit]:
+        return sorted(self.exact.values(), key=lambda item: -self.score(item))
+
+    def _slips(self, found: CandidateFit) -> bool:
+        """Whether a fit has a joint that slips."""
+        patch = found.candidate.patch(self.problem.setting, found.effect)
+        return any(isinstance(item, MicroSlip) for item in patch)
+
+    def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
+        """Replace the best exact fits by those of the finer model from where they stand."""
+        for item in rough[: SEARCH.refitted]:
+            again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
+            if again is not None:  # else the rough one stands
+                self.exact[item.candidate.key] = again
 
     def longer(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
@@ -384,9 +405,11 @@ class Search:
             singles = [item for item in fitting if self.score(item) > close]
             if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
                 return
+        # a rival that fits is followed to its end; one that does not has to promise more than the best
+        give_up = None if fitting else self.best().objective
         kept: dict[tuple[str, str], CandidateFit] = {}
         for named in singles:
-            family = free_shape(self.problem, named, 0)
+            family = free_shape(self.problem, named, 0, give_up=give_up)
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
