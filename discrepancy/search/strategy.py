@@ -27,8 +27,7 @@ from fe.runtime.patch import SENSORS, MicroSlip
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
-Start = tuple[Candidate, Point]
-Starts = list[Start]
+Starts = list[tuple[Candidate, Point]]
 
 
 def in_silence(what: str) -> None:
@@ -73,7 +72,7 @@ def are_related(one: Effect, other: Effect) -> bool:
     return named or one.family == other.family
 
 
-def beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:
+def beside(base: CandidateFit, term: Term, values: FloatArray) -> tuple[Candidate, Point]:
     """Return a base with one more effect, and where a fit of it begins."""
     effect = np.concatenate((base.effect, values))
     return base.candidate.plus(term), replace(base.point, effect=effect)
@@ -344,10 +343,7 @@ class Search:
         return not absolute_gate(self.problem, self.best()).passed
 
     def settle(self) -> None:
-        """Compute the best candidate finely enough that its evidence is its own, not that of the steps.
-
-        Joints that slip are divided more finely; time steps are halved while they cost too much.
-        """
+        """Compute the best candidate finely: joints that slip by more elements, motions by smaller steps."""
         setting = self.problem.setting
         if setting.joint_elements < SEARCH.fine_joint and self._slips(self.best()):
             ranked = self._ranked()
