@@ -16,7 +16,6 @@ from math import sqrt
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.signal import find_peaks
 from scipy.special import ndtri
 
 from discrepancy.campaign.records import FloatArray, TrialKind
@@ -180,10 +179,14 @@ class Screen:
         found: list[float] = []
         for (count, interval), power in spectra.items():
             resolution = 1.0 / (SEARCH.padded * count * interval)
-            lines = find_peaks(power, distance=2 * SEARCH.padded + 1)[0]
-            best = lines[np.argsort(power[lines])[::-1][: SEARCH.peaks]]
+            inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+            best = inner[np.argsort(power[inner])[::-1][: 4 * SEARCH.peaks]]
+            kept: list[int] = []
+            for index in best:
+                if all(abs(index - other) > 2 * SEARCH.padded for other in kept) and len(kept) < SEARCH.peaks:
+                    kept.append(int(index))
             first = problem.setting.scales.angular_frequency / (2.0 * np.pi)
-            found += (best * resolution / first).tolist()
+            found += [index * resolution / first for index in kept]
         return tuple(found)
 
     @property
