@@ -37,7 +37,7 @@ def plan(
     from reporting.files import atomic_write_bytes
     from reporting.page import Words
     from twin_master.mission.planning import compared, policy_file, risk_of
-    from twin_master.report.plan import plan_figure
+    from twin_master.report.structure import plan_figure
 
     knowledge, _ = _knowledge(scenario, seed, calibration)
     blind = _without(knowledge, [value_of]) if value_of is not None else None
@@ -200,7 +200,7 @@ def _draw_design(
     import numpy as np
 
     from fe.structure.operators import write_vtu
-    from twin_master.report.plan import design_figure
+    from twin_master.report.structure import design_figure
 
     places, outlines = where
     if vtu is not None:

@@ -68,24 +68,28 @@ class EventSearch:
         A force that acts throughout: the scale of both forces' priors.
     turning : bool
         Whether the force of events turns its sign with the speed of its port.
+    every : int
+        Of so many readings one is looked at.
 
     Attributes
     ----------
+    trials, columns : sequence of SeenTrial, sequence of (K, N, C) ndarray
+        What is looked at: stamps, and which readings count; residuals and columns of all unknowns.
     flips : sequence of (N,) ndarray of bool
         By trial, the samples at which it does.
     """
 
-    def __init__(self, view: View, port: int, process: Process, *, turning: bool = False) -> None:
+    def __init__(
+        self, view: View, port: int, process: Process, *, turning: bool = False, every: int = 1
+    ) -> None:
         self.view, self.port, self.process, self.turning = view, port, process, turning
-        self.flips = [np.zeros(len(trial.time), dtype=bool) for trial in view.trials]
+        self.trials = [replace(one, time=one.time[::every], used=one.used[::every]) for one in view.trials]
+        self.columns = [rows[:, ::every] for rows in view.rows]
+        self.flips = [np.zeros(len(trial.time), dtype=bool) for trial in self.trials]
         if turning and view.motions:  # of readings alone nothing moves
-            speeds = [motion.speeds[:, port] for motion in view.motions]
-            fine = zip(view.trials, speeds, strict=True)
-            self.flips = [np.r_[False, np.diff(speed[:: trial.parts] > 0.0)] for trial, speed in fine]
-        self.columns = [
-            np.concatenate((residual[None], columns, trial.local))
-            for trial, residual, columns in zip(view.trials, view.residuals, view.columns, strict=True)
-        ]
+            moves = zip(view.trials, view.motions, strict=True)
+            speeds = [motion.speeds[:: trial.parts * every, port] for trial, motion in moves]
+            self.flips = [np.r_[False, np.diff(speed > 0.0)] for speed in speeds]
 
     def told(self, forces: Forces, paths: Sequence[BoolArray]) -> list[Told]:
         """Return what each trial tells of the shared unknowns."""
@@ -151,7 +155,7 @@ class SwitchedRecord:
     def __init__(
         self, search: EventSearch, number: int, forces: Forces, others: Sequence[Told] = (), parts: int = 1
     ) -> None:
-        self.search, self.others, trial = search, others, search.view.trials[number]
+        self.search, self.others, trial = search, others, search.trials[number]
         self.local_precision = trial.local_precision
         one = Filtered(trial, [(search.port, force) for force in forces])
         generator, intensity, rows, start = one.system
@@ -308,7 +312,7 @@ class Events:
 
     def moments(self, number: int) -> FloatArray:
         """Return median and both ends of the 90 % interval (C, 3) of each change in a trial [s]."""
-        on, time = self.paths[number], self.search.view.trials[number].time
+        on, time = self.paths[number], self.search.trials[number].time
         parts = max(1, FINE // len(on))
         one = self.record(number, parts)
         fine = np.repeat(on, parts)[: (len(on) - 1) * parts + 1]
@@ -342,11 +346,10 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
         With changes where these tell more than a force that acts throughout the records that have one.
     """
     every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
-    coarse = thinned(view, every)
-    off = [np.zeros(len(trial.time), dtype=bool) for trial in coarse.trials]
     event = Process(LARGER * process.size, process.time, rough=True)
     forces = event, replace(process, size=LITTLE * process.size)
-    searches = [EventSearch(coarse, port, process, turning=turning) for turning in (False, True)]
+    searches = [EventSearch(view, port, process, turning=turning, every=every) for turning in (False, True)]
+    off = [np.zeros(len(trial.time), dtype=bool) for trial in searches[0].trials]
     searches = searches[: 1 + any(flips.any() for flips in searches[1].flips)]
     steady = max((_throughout(search, off) for search in searches), key=lambda found: found.score)
     best = max(
@@ -358,7 +361,7 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
             break
         best = again
     if every > 1:
-        best, steady = _in_full(best, view, every), _in_full(steady, view, every)
+        best, steady = _in_full(best, every), _in_full(steady, every)
     changed = any(len(changes(on)) for on in best.paths)
     return best if changed and best.score > max(least, steady.score) else steady
 
@@ -369,37 +372,17 @@ def throughout(view: View, port: int, process: Process) -> Events:
     return Events(EventSearch(view, port, process), (process, process), always, -np.inf)
 
 
-def _in_full(found: Events, view: View, every: int) -> Events:
+def _in_full(found: Events, every: int) -> Events:
     """Return events found in a part of the readings, placed among all."""
     part = found.search
-    search = EventSearch(view, part.port, part.process, turning=part.turning)
-    paths = [
-        np.repeat(on, every)[: len(trial.time)] for on, trial in zip(found.paths, view.trials, strict=True)
-    ]
+    search = EventSearch(part.view, part.port, part.process, turning=part.turning)
+    moves = zip(found.paths, search.trials, strict=True)
+    paths = [np.repeat(on, every)[: len(trial.time)] for on, trial in moves]
     whole = Events(search, found.forces, paths, -np.inf)
     for number in range(len(paths)):
         paths[number] = whole.record(number, 1).placed(paths[number])
     score = float(search.evidence(search.told(found.forces, paths)))
     return replace(whole, score=score - prices(paths))
-
-
-def thinned(view: View, every: int) -> View:
-    """Return a view with every so many one of the readings."""
-    trials, motions = [], []
-    for number, trial in enumerate(view.trials):
-        at = slice(None, None, every)
-        fine = slice((len(trial.time) - 1) // every * every * trial.parts + 1)
-        known = sum(item[number].readings for item in (view.known, view.own) if item is not None)
-        trials.append(
-            replace(
-                trial, time=trial.time[at], residual=(trial.residual - known)[at], used=trial.used[at],
-                shared=trial.shared[:, at], local=trial.local[:, at], parts=trial.parts * every,
-                positions=trial.positions[fine], speeds=trial.speeds[fine],
-            )
-        )  # fmt: skip
-        if view.motions:
-            motions.append(view.motions[number].part(fine))
-    return replace(view, trials=trials, motions=motions, known=None, own=None)
 
 
 def _throughout(search: EventSearch, off: Sequence[BoolArray]) -> Events:

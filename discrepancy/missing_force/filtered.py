@@ -237,15 +237,13 @@ def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> 
     return products[..., :count, :count] - np.swapaxes(along, -1, -2) @ along, halves
 
 
-def regression(
-    filtered: Sequence[Filtered], residuals: Sequence[FloatArray], columns: Sequence[FloatArray]
-) -> Regression:
-    """Return the products of residuals (N, C) and columns (K, N, C), one of a trial each, whitened alike."""
+def regression(filtered: Sequence[Filtered], rows: Sequence[FloatArray]) -> Regression:
+    """Return the products of residuals and columns (1 + K + L, N, C), of a trial each, whitened alike."""
     total: FloatArray | float = 0.0
     log_determinant = 0.0
     alike: dict[tuple[bytes, ...], list[tuple[Filtered, FloatArray]]] = {}
-    for one, residual, given in zip(filtered, residuals, columns, strict=True):
-        alike.setdefault(one.key, []).append((one, np.concatenate((residual[None], given, one.trial.local))))
+    for one, given in zip(filtered, rows, strict=True):
+        alike.setdefault(one.key, []).append((one, given))
     for group in alike.values():
         whole, half_of = group[0][0].products(np.concatenate([given for _, given in group]))
         ends = np.cumsum([0, *(len(given) for _, given in group)]).tolist()

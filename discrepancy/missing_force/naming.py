@@ -18,10 +18,8 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
-from .columns import Columns
 from .filtered import Process, Solution
-from .hypotheses import LARGEST, both_signs, log_prior, scaled, stepped, variants
-from .trial import seen_trial
+from .hypotheses import LARGEST, Columns, both_signs, log_prior, scaled, stepped, variants
 from .view import Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
@@ -166,7 +164,7 @@ class ForceSearch:
         for turn in range(2):
             bare = self._view()
             for port, name in enumerate(self.ports):
-                view = self._along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
+                view = self.columns.along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
                 first = self.about((port,))
                 self.at[name] = seen(view, first, self.at[name].processes if turn else first)
             if not turn and about is None:
@@ -187,7 +185,7 @@ class ForceSearch:
         view = best.view
         for near in (False, True):
             found = seen(view, self.about(begin), begin, near=near)
-            view = self._along(view, found.motions)
+            view = self.columns.along(view, found.motions)
             begin = dict(found.processes)
         return found
 
@@ -206,14 +204,8 @@ class ForceSearch:
 
     def _view(self) -> View:
         """Return the trials as they are seen about the point, where columns are from then on, too."""
-        self.columns = Columns(self.problem, self.numbers, self.point)
-        trials = [seen_trial(self.problem, number, self.point) for number in self.numbers]
-        return View(trials, self.problem.shared.precision)
-
-    def _along(self, view: View, motions: Sequence[Motion]) -> View:
-        """Return a view along motions, the laws that the model has itself included."""
-        own = self.columns.of_patch(view, motions, self.laws) if len(self.laws) else None
-        return replace(view, motions=motions, own=own)
+        self.columns = Columns(self.problem, self.numbers, self.point, self.laws)
+        return self.columns.bare()
 
     def rough(self, port: str) -> Explained:
         """Return the missing force at a port as one that may jump, linear about the motion that it gives."""
@@ -222,7 +214,7 @@ class ForceSearch:
             self.point = self._point(found)
             view = self._view()
             for _ in range(2):
-                view = self._along(view, view.smoothed(found.processes)[2])
+                view = self.columns.along(view, view.smoothed(found.processes)[2])
             begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
             found = seen(view, self.about(begin), begin)
         return found
@@ -396,10 +388,9 @@ class ForceSearch:
             if ends[0] is None or ends[1] is None:
                 return None
             slopes.append(combined((ends[0], ends[1]), (0.5 / SLOPE, -0.5 / SLOPE)))
-        return replace(
-            self._along(view, motions), effects=tuple(slopes), precision=(1.0,) * len(effect),
-            known=combined((at, *slopes), (1.0, *-effect)) if at else None,
-        )  # fmt: skip
+        known = combined((at, *slopes), (1.0, *-effect)) if at else None
+        view = columns.along(view, motions, known)
+        return replace(view, effects=tuple(slopes), precision=(1.0,) * len(effect))
 
 
 def seen(

@@ -17,10 +17,9 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
 
-from .columns import Columns
-from .hypotheses import scaled, sees_forces
+from .hypotheses import Columns, scaled, sees_forces
 from .naming import Explained, ForceSearch
-from .trial import SeenTrial, seen_trial
+from .trial import SeenTrial
 from .view import Motion, View
 
 WINDOWS, SHORTEST = 12, 8
@@ -114,8 +113,8 @@ class ForceShares:
             problem = search.problem.with_trials(held)
             numbers = range(len(problem.trials))
             point = Point(search.point.shared, problem.start(search.whole.candidate).local, np.zeros(0))
-            trials = [seen_trial(problem, number, point) for number in numbers]
-            self._outside = Columns(problem, numbers, point), View(trials, problem.shared.precision)
+            columns = Columns(problem, numbers, point, search.laws)
+            self._outside = columns, columns.bare()
 
     @property
     def has_held_out(self) -> bool:
@@ -184,8 +183,7 @@ class ForceShares:
         motions = view.smoothed(wide, solution)[2]
         for _ in range(TURNS):
             known = columns.of(view, motions, found.candidate, found.effect) if len(found.effect) else None
-            own = columns.of_patch(view, motions, self.search.laws) if len(self.search.laws) else None
-            view = replace(view, motions=motions, known=known, own=own)
+            view = columns.along(view, motions, known)
             motions = view.smoothed(wide, solution)[2]
         return view, motions
 

@@ -58,14 +58,6 @@ class Motion:
     speeds: FloatArray
     deviations: Mapping[int, tuple[FloatArray, float]]
 
-    def part(self, at: slice) -> "Motion":
-        """Return the motion at some of the fine stamps."""
-        forces, left = ({port: item[at] for port, item in of.items()} for of in (self.forces, self.left))
-        return replace(
-            self, added=self.added[at], forces=forces, left=left, explained=self.explained[at],
-            positions=self.positions[at], speeds=self.speeds[at],
-        )  # fmt: skip
-
     @property
     def laws(self) -> dict[int, FloatArray]:
         """Forces of the hypothesis (F,) by port."""
@@ -121,44 +113,34 @@ class View:
         return np.concatenate((self.shared_precision, self.precision))
 
     @cached_property
-    def turned(self) -> list[dict[int, Part]]:
-        """What a unit of shared unknowns, by their numbers, makes of the added state, by trial."""
-        found: list[dict[int, Part]] = [{} for _ in self.trials]
+    def parts(self) -> list[dict[int, tuple[Part, float]]]:
+        """What a unit of unknowns, by number, does along the motion, and which values are in it; by trial."""
+        found: list[dict[int, tuple[Part, float]]] = [{} for _ in self.trials]
         for trial, motion, of_trial in zip(self.trials, self.motions, found, strict=False):
             for k, slope in enumerate(trial.slopes):
                 if slope is not None:
-                    of_trial[k] = trial.turned(slope, motion.added, motion.forces)
+                    of_trial[k] = trial.turned(slope, motion.added, motion.forces), float(trial.about[k])
             shown = trial.readings(motion.added, motion.forces)
             for k, channel, scale in trial.gains:
-                of_trial[k] = Part(shown * scale * np.eye(shown.shape[1])[channel])
+                of_trial[k] = Part(shown * scale * np.eye(shown.shape[1])[channel]), float(trial.about[k])
+        for k, effect in enumerate(self.effects, start=len(self.shared_precision)):
+            for part, of_trial in zip(effect, found, strict=True):
+                of_trial[k] = part, 0.0
         return found
 
     @cached_property
-    def columns(self) -> list[FloatArray]:
-        """What all unknowns do to the readings (K, N, C), by trial."""
-        found = []
+    def rows(self) -> list[FloatArray]:
+        """Residuals beside what is known, and what all unknowns do to them (1 + K + L, N, C), by trial."""
+        found, count = [], 1 + len(self.precisions)
         for number, trial in enumerate(self.trials):
-            effects = [item[number].readings for item in self.effects]
-            columns = (
-                np.moveaxis(np.stack([*trial.shared, *effects], axis=-1), -1, 0)
-                if len(trial.shared) + len(effects)
-                else np.zeros((0, *trial.residual.shape))
-            )
-            for k, turned in self.turned[number].items():
-                columns[k] += turned.readings
-            found.append(columns)
-        return found
-
-    @cached_property
-    def residuals(self) -> list[FloatArray]:
-        """Residuals (N, C) beside what is known, by trial."""
-        known = [item for item in (self.known, self.own) if item is not None]
-        found = []
-        for number, trial in enumerate(self.trials):
-            left = trial.residual - sum(item[number].readings for item in known)
-            for k, turned in self.turned[number].items():
-                left = left + trial.about[k] * turned.readings
-            found.append(left)
+            rows = np.moveaxis(np.zeros((*trial.residual.shape, count + len(trial.local))), -1, 0)
+            known = [item[number].readings for item in (self.known, self.own) if item is not None]
+            rows[0] = trial.residual - sum(known)
+            rows[1 : 1 + len(trial.shared)], rows[count:] = trial.shared, trial.local
+            for k, (part, there) in self.parts[number].items():
+                rows[1 + k] += part.readings
+                rows[0] += there * part.readings
+            found.append(rows)
         return found
 
     def filtered(self, processes: Processes) -> list[Filtered]:
@@ -167,7 +149,7 @@ class View:
 
     def products(self, processes: Processes) -> Regression:
         """Return the products of all columns beside missing forces."""
-        return regression(self.filtered(processes), self.residuals, self.columns)
+        return regression(self.filtered(processes), self.rows)
 
     def solve(self, processes: Processes) -> Solution:
         """Return evidence and values of all unknowns beside missing forces."""
@@ -254,7 +236,8 @@ class View:
         count = len(self.shared_precision)
         for number, one in enumerate(self.filtered(processes)):
             trial = one.trial
-            left = self.residuals[number] - np.tensordot(solution.mean, self.columns[number], 1)
+            rows = self.rows[number]
+            left = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
             products, _ = one.products(np.concatenate((left[None], trial.local)))
             prior = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
             values = np.linalg.solve(products[1:, 1:] + prior, products[1:, 0])
@@ -262,10 +245,8 @@ class View:
             free, forces, deviations = one.smoothed(left)
             remaining = dict(zip(processes, forces, strict=True))
             what = Part(left, free, remaining)
-            for k, turned in self.turned[number].items():
-                what = what.plus(turned, float(solution.mean[k] - trial.about[k]))
-            for mean, item in zip(solution.mean[count:], self.effects, strict=True):
-                what = what.plus(item[number], float(mean))
+            for k, (part, there) in self.parts[number].items():
+                what = what.plus(part, float(solution.mean[k] - there))
             what = what if self.known is None else what.plus(self.known[number], 1.0)
             moved = what if self.own is None else what.plus(self.own[number], 1.0)
             assert moved.added is not None

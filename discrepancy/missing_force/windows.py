@@ -161,7 +161,7 @@ def _windows(
 ) -> tuple[GapWindow, ...]:
     """Return the windows of events, given by trial the channels and what these show of the force (N, C)."""
     windows = []
-    for number, (trial, on) in enumerate(zip(best.search.view.trials, best.paths, strict=True)):
+    for number, (trial, on) in enumerate(zip(best.search.trials, best.paths, strict=True)):
         ends = (float(trial.time[0]), float(trial.time[-1]))
         at = changes(on)
         if len(at) > 2 * MOST_EVENTS:

@@ -48,9 +48,7 @@ class Bench:
     noise deviation is known from a record with `noise_freedom` degrees of freedom.
     """
 
-    def __init__(
-        self, *, count=300, amplitudes=(200.0, 200.0), noise_freedom=200.0, static=True, held_out=None
-    ) -> None:
+    def __init__(self, *, count=300, amplitudes=(200.0, 200.0), noise_freedom=200.0, held_out=None) -> None:
         self.noise_freedom = noise_freedom
         self.trials: list[Trial] = []
         self.rates: list[FloatArray | None] = []
@@ -72,13 +70,12 @@ class Bench:
             held = held_out is not None and held_out[number]
             given = {"start": 100.0 * number, "release": Release(amplitude), "held_out": held}
             self._add(f"release {number + 1}", TrialKind.RINGDOWN, time, value, rate, jacobian, **given)
-        if static:
-            force = np.concatenate([np.linspace(0.0, 10.0, 6), np.linspace(8.0, -10.0, 10)])
-            jacobian = np.zeros((len(force), 4, width))
-            jacobian[:, :, -1] = value = np.outer(force, 20.0 * SHAPES[0])
-            given = {"force": force, "temperature": np.linspace(0.0, 3.0, len(force)) ** 2}
-            rows = 10.0 * np.arange(len(force))
-            self._add("steps", TrialKind.STATIC, rows, value, None, jacobian, **given)
+        force = np.concatenate([np.linspace(0.0, 10.0, 6), np.linspace(8.0, -10.0, 10)])
+        jacobian = np.zeros((len(force), 4, width))
+        jacobian[:, :, -1] = value = np.outer(force, 20.0 * SHAPES[0])
+        given = {"force": force, "temperature": np.linspace(0.0, 3.0, len(force)) ** 2}
+        rows = 10.0 * np.arange(len(force))
+        self._add("steps", TrialKind.STATIC, rows, value, None, jacobian, **given)
 
     def _add(self, name, kind, time, value, rate, jacobian, **given) -> None:
         self.trials.append(Trial.plain(name, kind, NAMES, time, values=value, run="A", **given))

@@ -1,4 +1,4 @@
-"""`uav-twin calibrate campaign` and `calibrate ringdown` as a user calls them."""
+"""`uav-twin calibrate campaign`, also of an FMU that is flown then, and `calibrate ringdown`."""
 
 import csv
 import json

@@ -28,20 +28,14 @@ from fe.runtime.state import DigitalState
 from fe.wing.design import SHIPPED_DESIGN
 from tests.command_line import call, command, refused, said
 from tests.kept import FE, ROOT, kept_folder
+from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, cut_off_after, edited, figures_of, text_of, written
 from tests.wings import tip_stiffness
 from uav_twin import FmiAsset, assemble, load_calibration, load_design, reduced_model
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 
-TRUTHS = {
-    "soft": DigitalState(
-        young_modulus_factor=0.97, servo_mass=0.160, pitot_mass=0.150, damping_alpha=0.8, damping_beta=6.0e-4
-    ),
-    "stiff": DigitalState(
-        young_modulus_factor=1.04, servo_mass=0.180, pitot_mass=0.110, damping_alpha=1.4, damping_beta=9.0e-4
-    ),
-}
+TRUTHS = {name: DigitalState(**own) for name, own in Inputs(__file__).table("wings.toml").items()}
 
 
 def simulate(out: Path, *words: object) -> tuple[Any, ...]:

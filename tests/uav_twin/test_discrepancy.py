@@ -1,14 +1,303 @@
-"""`uav-twin discrepancy` as a user calls it: example, check, run, and what goes wrong."""
+"""`uav-twin discrepancy` as a user calls it: import, with a terminal and without, example, check and run."""
 
 import itertools
 import json
+import os
+import pty
 import re
+import select
+import shlex
+import subprocess
+import sys
+import time
+from decimal import Decimal
 from pathlib import Path
 
+import numpy as np
 import pytest
+from openpyxl import Workbook
 
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.files.verdict import read_patch, read_verdict_file
+from discrepancy.model_choice import choose_model
+from discrepancy.sources.examples import example_campaign, plan_for
 from tests.command_line import command, refused, said
+
+MODEL = "single_mass_rig"
+COLUMNS = ("--column", "Weg=displacement", "--column", "Dehnung=leaf_strain")
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(*words: object) -> subprocess.CompletedProcess[str]:
+    return command("discrepancy", "import", *words)
+
+
+def taken(*words: object) -> str:
+    return said("discrepancy", "import", *words)
+
+
+def laboratory(folder: Path) -> Campaign:
+    """Return a simulated campaign, its trials written as a laboratory's programme writes them."""
+    model = choose_model(MODEL).model
+    plan = plan_for(model, ("displacement", "leaf_strain"), model.description.input[0].name)  # type: ignore[attr-defined]
+    campaign = example_campaign(model, "laboratory", 1, plan)
+
+    def german(values: np.ndarray, power: int) -> list[str]:
+        return [str(Decimal(repr(value)).scaleb(power)).replace(".", ",") for value in values.tolist()]
+
+    for trial in campaign.trials:
+        still = trial.kind is TrialKind.STATIC
+        lead = german(trial.force, -3) if still else german(trial.time, 3)
+        head = f"Versuch {trial.name};;\n\n{'Kraft;Weg;Dehnung' if still else 'Zeit;Weg;Dehnung'}\n"
+        head += "kN;mm;µm/m\n" if still else "ms;mm;µm/m\n"
+        columns = (lead, german(trial.values[:, 0], 3), german(trial.values[:, 1], 6))
+        rows = "".join(";".join(row) + "\n" for row in zip(*columns, strict=True))
+        text = f"{head}{rows}Mittelwert;1,0;2,0\n"
+        (folder / f"{trial.name}.csv").write_bytes(text.encode("latin-1"))
+    return campaign
+
+
+def test_a_folder_of_files_becomes_the_campaign(tmp_path, monkeypatch):
+    campaign = laboratory(Path())
+    files = [f"{trial.name}.csv" for trial in campaign.trials]
+    kinds = [f"{trial.name}.csv={trial.kind.value}" for trial in campaign.trials]
+    releases = [f"{t.name}.csv={1e3 * t.release.displacement!r}mm" for t in campaign.trials if t.release]
+    options = [word for kind in kinds for word in ("--kind", kind)]
+    options += [word for release in releases for word in ("--release", release)]
+    done = call(*files, *options, *COLUMNS, "--out", "lab", "--load-place", "mass", "--model", MODEL)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "release 1.csv: ringdown; lines 5 to" in done.stdout
+    assert "semicolons between cells; what stands from" in done.stdout
+    assert "Next: uav-twin discrepancy check lab --model single_mass_rig" in done.stdout
+    read = read_campaign("lab")
+    assert [trial.name for trial in read.trials] == [trial.name for trial in campaign.trials]
+    for ours, theirs in zip(read.trials, campaign.trials, strict=True):
+        assert ours.kind is theirs.kind
+        for name in ("values", "time", "force"):
+            if name != "time" or ours.is_dynamic:
+                np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-15)
+        assert ours.load_place == "mass"
+        if theirs.release is not None:
+            assert ours.release.displacement == pytest.approx(theirs.release.displacement, rel=1e-15)
+    origin = next(remark for remark in read.remarks if "release 1.csv" in remark)
+    assert "Imported from release 1.csv (SHA-256 " in origin
+    assert "'Zeit' [ms] is time, 'Weg' [mm] is displacement and 'Dehnung' [µm/m] is leaf_strain" in origin
+    toml = Path("lab/campaign.toml").read_text("utf-8")
+    assert 'unit = "m"' in toml
+    assert 'unit = "1"' in toml
+    checked = command("discrepancy", "check", "lab", "--model", MODEL)
+    assert checked.returncode == 0, checked.stderr
+    # a second time nothing is touched
+    again = call(*files, *options, *COLUMNS, "--out", "lab")
+    assert (again.returncode, "not an empty folder" in again.stderr) == (1, True)
+
+
+TWO = {
+    "pull.csv": b"F;Weg;Temp [K];U [V];q\n1;1,234;293;0;5\n2;2,345;293;1;5\n",
+    "swing.csv": b"t [ms];Weg\n" + b"".join(b"%d;%d,000\n" % (2 * k, k % 7 + 1) for k in range(9)),
+}
+
+
+def test_everything_that_is_not_said_is_named_at_once(tmp_path, monkeypatch):
+    for name, content in TWO.items():
+        Path(name).write_bytes(content)
+    done = call(*TWO, "--kind", "swing.csv=ringdown")
+    assert done.returncode == 1
+    sentence = done.stderr.strip()
+    assert "\n" not in sentence
+    for part in (
+        "13 answers are missing, and nothing was written",
+        "--kind NAME=... for 'pull.csv' (static, ringdown, forced, driven, flight or noise)",
+        "--decimal NAME=... for 'pull.csv' (. or ,: '1,234' in line 2 can be read as both)",
+        "--decimal NAME=... for 'swing.csv' (. or ,: '1,000' in line 2 can be read as both)",
+        "--column NAME=... for 'F', 'Weg', 'Temp', 'U' and 'q' (the model's output",
+        "--unit NAME=... for 'F', 'Weg' and 'q' (such as mm, kN or ms",
+        "--quantity NAME=... for 'U' (signal or voltage: V is a unit of each)",
+        "--release NAME=... for 'swing.csv' (how far the point was held",
+    ):
+        assert part in sentence
+    assert sorted(path.name for path in Path().iterdir()) == sorted(TWO)
+    columns = [
+        word for item in ("Weg=x", "F=force", "q=-", "Temp=-", "U=bridge") for word in ("--column", item)
+    ]
+    units = ("--quantity", "U=signal", "--unit", "F=kgf", "--unit", "Weg=in", "--release", "-0.5in")
+    given = (*columns, *units, "--kind", "pull.csv=static", "--decimal", ",")
+    taken(*TWO, "--kind", "swing.csv=ringdown", *given, "--out", "lab")
+    read = read_campaign("lab")
+    assert read.trials[0].force.tolist() == [9.80665, 2 * 9.80665]
+    assert read.trials[0].values[0].tolist() == [1.234 * 0.0254, 0.0]
+    assert read.trials[1].time.tolist()[1] == 0.002
+    assert read.trials[1].release.displacement == -0.0127
+
+
+def test_faults_of_the_data_name_the_laboratory_s_own_lines(tmp_path, monkeypatch):
+    rows = "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14))
+    Path("a.csv").write_text(f"Versuch\n\nt [ms];Weg [mm]\n{rows}", "utf-8")
+    done = call("a.csv", "--kind", "driven", "--column", "Weg=x")
+    assert done.returncode == 1
+    assert "a.csv: the time of the trial 'a' does not increase after sample 4" in done.stderr
+    Path("b.csv").write_text("F [N];Weg [mm]\n1;0,5\n;0,75\n3;0,8\n", "utf-8")
+    done = call("b.csv", "--kind", "static", "--column", "Weg=x")
+    assert "b.csv, line 3" in done.stderr
+    assert not Path("a").exists()
+    assert not Path("b").exists()
+
+
+def test_samples_at_rest_inputs_and_temperatures(tmp_path, monkeypatch):
+    rest = "".join(f"{k / 100},{(k * 7) % 11 - 5},20\n" for k in range(40))
+    Path("rest.csv").write_text(f"time [s],x [um],temperature [degC]\n{rest}", "utf-8")
+    moved = "".join(f"{k / 100},{k % 5},{k},{20 + k / 8}\n" for k in range(16))
+    Path("moved.csv").write_text(f"time [s],x [um],Motor [mA],temperature [°C]\n{moved}", "utf-8")
+    taken(
+        "rest.csv", "moved.csv", "--kind", "rest.csv=noise", "--kind", "moved.csv=driven", "--column", "x=x",
+        "--column", "Motor=input:current", "--reference-temperature", "20", "--out", "lab",
+    )  # fmt: skip
+    read = read_campaign("lab")
+    noise = read.channels["x"].noise
+    assert noise.samples is not None
+    assert noise.interval == pytest.approx(0.01)
+    (trial,) = read.trials
+    assert [item.name for item in trial.inputs] == ["current"]
+    assert trial.inputs[0].values[3] == 3e-3
+    assert trial.temperature[8] == 1.0
+
+
+def test_noise_is_of_one_file_and_remarks_are_the_origins_only(tmp_path, monkeypatch):
+    for name in ("n1", "n2"):
+        rest = "".join(f"{k / 100},{(k * 7) % 11 - 5}\n" for k in range(40))
+        Path(f"{name}.csv").write_text(f"time [s],x [um]\n{rest}", "utf-8")
+    rows = "".join(f"{k / 100},{'' if k == 3 else k % 5},{k},{k / 8}\n" for k in range(16))
+    Path("push.csv").write_text(f"time [s],x [um],pull [N],leaf_strain [mV/V]\n{rows}", "utf-8")
+    given = (
+        "--kind", "noise", "--kind", "push.csv=driven", "--column", "x=displacement", "--column",
+        "pull=input:pull", "--model", MODEL, "--out", "lab",
+    )  # fmt: skip
+    done = call("push.csv", "n1.csv", "n2.csv", *given)
+    assert done.returncode == 1
+    assert done.stderr.strip() == "Noise is read from one file, and n1.csv and n2.csv came: give one of them."
+    taken("push.csv", "n1.csv", *given)
+    toml = Path("lab/campaign.toml").read_text("utf-8")
+    assert "begins" not in toml
+    assert toml.count("Imported from") == toml.split("]\n\n[")[0].count('",\n') == 2
+    assert "; 1 cell is empty." in toml
+    read = read_campaign("lab")
+    assert read.channels["leaf_strain"].quantity is Quantity.SIGNAL
+    assert "(assumed: say `begins`" in " ".join(read.remarks)
+    Path("lab/campaign.toml").write_text(toml.replace('"driven"', '"driven"\nbegins = "still"'), "utf-8")
+    assert "assumed" not in " ".join(read_campaign("lab").remarks)
+
+
+def test_a_load_factor_in_g_is_its_number(tmp_path, monkeypatch):
+    Path("turn.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
+    taken("turn.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
+    assert read_campaign("turn").trials[0].load_factor.tolist() == [1.0, 2.5]
+
+
+def test_a_force_is_no_input_of_a_driven_trial_unless_it_is_said(tmp_path, monkeypatch):
+    rows = "".join(f"{k / 100},{k % 5},{k}\n" for k in range(16))
+    Path("push.csv").write_text(f"time [s],force [N],x [mm]\n{rows}", "utf-8")
+    done = call("push.csv", "--kind", "driven", "--column", "x=x")
+    assert "1 answer is missing" in done.stderr
+    assert "--column NAME=... for 'force'" in done.stderr
+    done = call("push.csv", "--kind", "driven", "--column", "x=x", "--column", "force=force")
+    assert "a driven trial has input:NAME in the place of force" in done.stderr
+    taken("push.csv", "--kind", "driven", "--column", "x=x", "--column", "force=input:force", "--out", "a")
+    assert read_campaign("a").trials[0].inputs[0].values[3] == 3.0
+    taken("push.csv", "--kind", "ringdown", "--column", "x=x", "--release", "1mm", "--out", "b")
+    assert read_campaign("b").trials[0].force.tolist() == [0.0] * 16
+
+
+def test_the_sheets_of_a_workbook_are_trials(tmp_path, monkeypatch):
+    book = Workbook()
+    for number in (1, 2):
+        sheet = book.create_sheet(f"pull {number}")
+        for row in (["F [lbf]", "w [in]"], [0, 0.0], [1, 0.5 * number], [2, 1.0]):
+            sheet.append(row)
+    book.save("lab.xlsx")
+    sheets = ("lab.xlsx#pull 1", "lab.xlsx#pull 2")
+    done = call(*sheets, "--kind", "static", "--column", "w=tip", "--out", "out")
+    assert (done.returncode, done.stderr) == (0, "")
+    read = read_campaign("out")
+    assert [trial.name for trial in read.trials] == ["pull 1", "pull 2"]
+    assert read.trials[1].values[:, 0].tolist() == [0.0, 0.0254, 0.0254]
+    assert read.trials[0].force.tolist() == [0.0, 4.4482216152605, 8.896443230521]
+    assert "Imported from lab.xlsx#pull 2 (SHA-256 " in read.remarks[1]
+
+
+def test_the_documented_files_print_the_documented_tables(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "laboratory_files.md").read_text("utf-8")
+    blocks = re.findall(r"^```\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    loading, release, asked, given, written, checked = blocks[:6]
+    Path("loading.csv").write_text(loading, "utf-8-sig")
+    Path("release.csv").write_bytes(release.encode("latin-1"))
+    for block in (asked, given):
+        line, _, screen = block.replace("\\\n", "").partition("\n")
+        done = command(*shlex.split(line)[1:])
+        shown = [row.rstrip() for row in (done.stdout + done.stderr).splitlines() if row.strip()]
+        assert [row.rstrip() for row in screen.splitlines() if row.strip()] == shown
+    assert Path("lab/02_release.csv").read_text("utf-8").startswith(written.rpartition("...")[0])
+    done = command("discrepancy", "check", "lab", "--model", "single_mass_rig")
+    assert done.returncode == 1
+    assert [row for row in done.stdout.splitlines() if row.startswith("Fault: ")] == checked.splitlines()
+
+
+# ---------------------------------------------------------------- a terminal
+
+
+def in_a_terminal(folder: Path, answers: list[str], *words: str) -> tuple[int, str]:
+    """Return exit code and screen of the command, its questions answered one after the other."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "uav_twin", "discrepancy", "import", *words],
+        stdin=slave, stdout=slave, stderr=slave, cwd=folder,
+        env={**os.environ, "TERM": "dumb", "COLUMNS": "160"},
+    )  # fmt: skip
+    os.close(slave)
+    screen, until, left = "", time.monotonic() + 120.0, list(answers)
+    try:
+        while time.monotonic() < until:
+            ready, _, _ = select.select([master], [], [], 0.2)
+            if ready:
+                try:
+                    screen += os.read(master, 65536).decode("utf-8")
+                except OSError:  # the other end is closed
+                    break
+            elif left and screen.rstrip(" ").endswith(":") and screen.endswith(": "):
+                os.write(master, (left.pop(0) + "\n").encode())
+            elif process.poll() is not None:
+                break
+        return process.wait(10.0), screen.replace("\r\n", "\n")
+    finally:
+        process.kill()
+        os.close(master)
+
+
+def test_a_terminal_is_asked(tmp_path):
+    (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
+    answers = ["swinging", "ringdown", ",", "tip", "miles per hour", "mm", "12 mm", "y"]
+    code, screen = in_a_terminal(tmp_path, answers, "swing.csv", "--out", "lab")
+    assert code == 0, screen
+    assert "--kind must be static, ringdown, forced, driven, flight or noise, and 'swinging' came." in screen
+    assert "Write lab?" in screen
+    read = read_campaign(tmp_path / "lab")
+    assert read.trials[0].values[1, 0] == 2e-3
+    assert read.trials[0].release.displacement == 0.012
+
+
+def test_a_no_writes_nothing(tmp_path):
+    (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
+    code, screen = in_a_terminal(tmp_path, ["ringdown", ",", "tip", "mm", "12 mm", "n"], "swing.csv")
+    assert code == 1, screen
+    assert "Nothing was written." in screen
+    assert [path.name for path in Path().iterdir()] == ["swing.csv"]
+
 
 RIG = ("--model", "single_mass_rig")
 

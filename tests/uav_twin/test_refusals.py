@@ -11,7 +11,7 @@ from scenarios import structure_files
 from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of
-from tests.uav_twin.test_discrepancy_import import TWO
+from tests.uav_twin.test_discrepancy import TWO
 
 INPUTS = Inputs(__file__)
 RIG = "--model single_mass_rig"

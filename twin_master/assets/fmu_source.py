@@ -16,7 +16,7 @@ from fmu_asset.folders import scratch_folder
 from reporting.arrays import Float
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from reporting.toml_file import Fault
+from reporting.toml_file import Fault, Number, Positive
 from twin_master.assets.asset_source import (
     BINDING_COPY,
     FLOWN_DESIGN_HASH,
@@ -38,7 +38,7 @@ from twin_master.errors import MissionInputError, check_names
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import AssetSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Flag, Name, Number, Positive
+from twin_master.scenario.section import Flag, Name
 from twin_master.seeds import generator
 from twin_master.sentences import said
 

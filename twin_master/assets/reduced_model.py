@@ -14,8 +14,8 @@ from twin_master.assets.parameter import ParameterDraws, calibrated_means
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import packed_row
 from twin_master.scenario.asset import FileSection
-from twin_master.scenario.observation import ModesSection
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import ModesSection
 from twin_master.seeds import seed_sequence
 
 if TYPE_CHECKING:

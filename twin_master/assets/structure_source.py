@@ -30,8 +30,8 @@ from twin_master.assets.reduced_model import (
 )
 from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.scenario.asset import BeliefSection, FileSection
-from twin_master.scenario.observation import ROLE
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import ROLE
 from twin_master.sentences import said
 
 if TYPE_CHECKING:

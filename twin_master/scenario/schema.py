@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, model_validator
 
+from reporting.toml_file import Fault, NotNegative, Number
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
-from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Count,
-    Fault,
     Name,
-    NotNegative,
-    Number,
+    ObservationSection,
     Probability,
     Section,
     Seed,

@@ -1,16 +1,18 @@
-"""A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
+"""A table of a scenario file: what all tables have in common, and the kinds of values that they hold.
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+The table that says what is observed, and how well: sensors, or modes of a record.
+"""
 
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from reporting import toml_file
-from reporting.toml_file import Fault as Fault
-from reporting.toml_file import NotNegative as NotNegative
-from reporting.toml_file import Number as Number
-from reporting.toml_file import Positive as Positive
-from reporting.toml_file import shown
+from reporting.toml_file import Fault, NotNegative, Positive, shown
 from twin_master.sentences import said
 
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
@@ -129,3 +131,160 @@ def incomplete(table: Mapping[str, object], names: tuple[str, ...], where: str, 
     came = short(list(table)) or "none"
     told = f"`{where}` must have one entry for each {what} ({short(names)}), and has {came}"
     return {*table} != {*names}, told
+
+
+Float = NDArray[np.float64]
+
+
+ROLE = "modes"
+"""The role of an observation whose values are features of modes."""
+Feature = Literal["frequency", "damping_ratio", "shape"]
+
+
+def row_width(sensors: int) -> int:
+    """Return the length of a row of values and, behind them, the lower triangle of their covariance."""
+    return sensors + sensors * (sensors + 1) // 2
+
+
+class ModesSection(Section):
+    """Which modes are observed, and what of each.
+
+    A value is observed for each mode and each feature that has a standard deviation: frequency, damping
+    ratio, and the shape at each accelerometer behind the first, divided by that at the first.
+    """
+
+    accelerometers: Annotated[tuple[Name, ...], Field(min_length=1)]
+    """Acceleration outputs of the model, the first is the one that shapes are relative to."""
+    bands: Annotated[tuple[tuple[Positive, Positive], ...], Field(min_length=1)]
+    """Least and largest frequency of each mode [Hz]: what a record shows most of in it is the mode."""
+    numbers: tuple[Count, ...] = ()
+    """Number of each mode in the model, in rising order; 1, 2, ... without them."""
+    standard_deviation: dict[Feature, Positive]
+    """Of each feature [Hz, 1, 1], beside that with which it was identified: what changes between records,
+    and what the model is wrong by."""
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield what bands, numbers and features may have wrong."""
+        ordered, numbers = pairwise(sorted(self.bands)), len(self.numbers or self.bands)
+        yield any(high <= low for low, high in self.bands), said("scenario.band")
+        yield any(after[0] < before[1] for before, after in ordered), said("scenario.bands")
+        told = said("scenario.mode_numbers", numbers=numbers, bands=len(self.bands))
+        yield numbers != len(self.bands), told
+        yield not self.columns, said("scenario.mode_features")
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """Places of the modes in the model (M,), from 0."""
+        return np.array(self.numbers or range(1, len(self.bands) + 1)) - 1
+
+    @property
+    def columns(self) -> list[int]:
+        """Which of the features are observed."""
+        return [place for place, (_, kind) in enumerate(self.features) if kind in self.standard_deviation]
+
+    @property
+    def features(self) -> list[tuple[str, Feature]]:
+        """Name and kind of frequency, damping ratio and relative shape at each further accelerometer."""
+        shapes: list[tuple[str, Feature]] = [(name, "shape") for name in self.accelerometers[1:]]
+        return [("frequency", "frequency"), ("damping_ratio", "damping_ratio"), *shapes]
+
+    def filled(self) -> dict[str, Any]:
+        """Return the keys of `[observation]` that follow: count, titles, unit, standard_deviation."""
+        observed = [self.features[column] for column in self.columns]
+        each = [(f"{name}_{number + 1}", kind) for number in self.places for name, kind in observed]
+        return {
+            "count": len(each),
+            "titles": tuple(title for title, _ in each),
+            "unit": tuple("Hz" if kind == "frequency" else "1" for _, kind in each),
+            "standard_deviation": tuple(self.standard_deviation[kind] for _, kind in each),
+        }
+
+    def observed(self, values: Float) -> Float:
+        """Return what is observed (..., G) of all values (..., M, 1 + A) of the modes."""
+        return values[..., self.columns].reshape(*values.shape[:-2], -1)
+
+    def covariance(self, of_modes: Float) -> Float:
+        """Return the covariance of what is observed (G, G), of those of the modes (M, 1 + A, 1 + A)."""
+        size = len(self.columns)
+        found = np.zeros((len(of_modes) * size,) * 2)
+        for mode, block in enumerate(of_modes):
+            rows = slice(mode * size, (mode + 1) * size)
+            found[rows, rows] = block[np.ix_(self.columns, self.columns)]
+        return found
+
+
+class RecordSection(Section):
+    """How the record of each turn comes about, for a simulated asset."""
+
+    kind: Literal["ambient", "decay"]
+    """`ambient`: the input is shaken by white noise; `decay`: it is let go."""
+    input: Name
+    """Control input that is shaken or let go."""
+    amplitude: Positive
+    """Root mean square of the shaking, or what is let go, in the unit of the input."""
+    duration: Positive
+    """[s]"""
+    sampling_rate: Positive
+    """[Hz]"""
+    noise: NotNegative = 0.0
+    """Standard deviation of the noise of the accelerometers [m/s^2]."""
+
+
+class ObservationSection(Section):
+    """What is observed (a role of the binding) and the sensor noise that the twin assumes."""
+
+    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain", "model_error": "percent"}
+    role: Name = "strain"
+    count: Count
+    titles: tuple[str, ...] = ()
+    """What each sensor is called in the report; without them they have numbers."""
+    unit: str | tuple[str, ...] = "1"
+    """Unit of the observed values, one for all sensors or one for each; a strain without unit is printed in
+    microstrain."""
+    standard_deviation: PerSensor
+    """Of the noise that the twin assumes, one for all sensors or one for each."""
+    model_error: NotNegative | tuple[NotNegative, ...] = 0.0
+    """Standard deviation of the predicted value as a share of it, one for all sensors or one for each; added
+    to the noise in quadrature."""
+    between_levels: bool = True
+    """Whether the truth may lie between the levels of the states, which then stand for intervals."""
+    average_over_draws: Literal["outside", "inside"] = "outside"
+    """Where the average over the draws of the parameter stands: outside the product over the sensors as in
+    the integral (30), or inside it as eq. (32) is printed."""
+    modes: ModesSection | None = None
+    """With the role `modes`: what is observed; count, titles, unit and standard deviation follow from it."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_modes(cls, table: object) -> object:
+        """Fill in what follows from the modes that are observed."""
+        if not isinstance(table, Mapping):
+            return table
+        if (table.get("role") == ROLE) != (table.get("modes") is not None):
+            raise ValueError(said("scenario.role_of_modes", role=ROLE))
+        if table.get("modes") is None:
+            return table
+        modes = ModesSection.model_validate(table["modes"])
+        filled = modes.filled()
+        for key in table:
+            base, _ = cls.split_unit(key)
+            given = tuple(table[key]) if isinstance(table[key], list) else table[key]
+            if base in filled and given != filled[base]:
+                raise ValueError(f"`{key}` follows from `observation.modes`: leave it out")
+        return {**table, **filled, "modes": modes}
+
+    @property
+    def width(self) -> int:
+        """Length of the row that comes of a turn: values, and their covariance where it comes with them."""
+        return self.count if self.modes is None else row_width(self.count)
+
+    @property
+    def sensor_units(self) -> tuple[str, ...]:
+        """Unit of each sensor."""
+        return (self.unit,) * self.count if isinstance(self.unit, str) else self.unit
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield keys that are given neither once nor for each sensor."""
+        for key in ("unit", "standard_deviation", "titles"):
+            yield one_or_each(f"observation.{key}", getattr(self, key) or None, self.count)
+        yield one_or_each("observation.model_error_percent", self.model_error, self.count)

@@ -7,18 +7,15 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
+from reporting.toml_file import Fault, NotNegative, Number, Positive
 from twin_master.scenario.asset import FileSection
-from twin_master.scenario.observation import RecordSection
 from twin_master.scenario.section import (
     Count,
-    Fault,
     Flag,
     Name,
-    NotNegative,
-    Number,
     PerSensor,
-    Positive,
     Probability,
+    RecordSection,
     Section,
     Step,
     incomplete,

@@ -15,8 +15,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 from reporting.page import script_source
 from twin_master.errors import ViewError
 from twin_master.sentences import said
-from twin_master.viewer.flight import Flight
-from twin_master.viewer.messages import Request, Teller
+from twin_master.viewer.flight import Flight, Request, Teller
 
 ADDRESS = "127.0.0.1"
 POLL_SECONDS = 0.015

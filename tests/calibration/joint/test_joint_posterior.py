@@ -3,8 +3,6 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -13,11 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from calibration.dynamics.damped_cosine import RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError
-from calibration.joint.measurement import PUBLISHED_MODES, _mean_of, measured_modes, modal_readings
+from calibration.joint.measurement import PUBLISHED_MODES, measured_modes, modal_readings
 from calibration.joint.posterior import infer, joint_posterior
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, weighed, wing_priors
 from calibration.result.record import STATE, ParameterPrior, prior_samples
@@ -317,20 +314,17 @@ def test_frequencies_of_spectral_peaks_carry_their_bias():
     assert found["frequency_2"].deviation < 2.0 * bias
 
 
-def _mean_of_values(values, errors):
-    """Return mean and standard error of trials whose fits give these frequencies and standard errors."""
-    pairs = zip(values, errors, strict=True)
-    modes = [SimpleNamespace(frequency=value, standard_error={"frequency": error}) for value, error in pairs]
-    return _mean_of(cast(list[RingDownMode], modes), "frequency")
-
-
-def test_mean_over_trials():
-    mean, error = _mean_of_values([1.0, 1.1, 0.9, 1.05, 0.95], [0.1] * 5)  # scatter as expected
-    assert (mean, error) == (pytest.approx(1.0), pytest.approx(0.1 / math.sqrt(5.0)))
-    _, error = _mean_of_values([1.0, 1.1, 0.9, 1.05, 0.95], [1e-3] * 5)  # scatter beyond the fits' errors
-    assert error == pytest.approx(math.sqrt(2.0) * np.std([1.0, 1.1, 0.9, 1.05, 0.95], ddof=1) / math.sqrt(5))
-    assert _mean_of_values([3.0], [0.2]) == (3.0, pytest.approx(0.2))
-    assert _mean_of_values([1.0, 2.0], [1e-3, 1e-3])[1] == pytest.approx(1.0)
+@pytest.mark.parametrize(
+    ("count", "scatter", "widening"), [(1, 0.05, None), (2, 0.05, 4.0), (5, 0.05, 2.0), (5, 0.0, None)]
+)
+def test_trials_that_scatter_beyond_their_fits_widen_the_error_of_the_mean(count, scatter, widening):
+    fitted = fit_trials(trials(0.0, 1, scatter=scatter)[:count], free=True, start=-1.0)
+    values = [fit.modes[0].frequency for fit in fitted]
+    squares = [fit.modes[0].standard_error["frequency"] ** 2 for fit in fitted]
+    variance = widening * np.var(values, ddof=1) if widening else np.mean(squares)
+    found = by_name(fitted)["frequency_1"]
+    assert found.value == pytest.approx(np.mean(values))
+    assert found.deviation == pytest.approx(math.sqrt(variance / count), rel=1e-9)
 
 
 def test_the_published_records(reference):

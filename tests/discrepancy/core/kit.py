@@ -87,13 +87,12 @@ class ClosedForm(Model):
         return Response(values[:, columns], rates[:, columns] * (1.0 + rate))
 
 
-def blank_trial(name, kind, channels, rows, *, start=0.0, temperature=0.0, **given) -> Trial:
+def blank_trial(name, kind, channels, rows, *, start=0.0, **given) -> Trial:
     """Return a trial without readings; `rows` are forces of a static trial, times of a dynamic one."""
     time = rows
     if kind is TrialKind.STATIC:
         time, given = start + 10.0 * np.arange(len(rows)), {"force": rows, **given}
-    given = {"run": "A", "temperature": np.full(len(rows), temperature), **given}
-    return Trial.plain(name, kind, tuple(channels), time, start=start, **given)
+    return Trial.plain(name, kind, tuple(channels), time, start=start, **{"run": "A", **given})
 
 
 def _effect(identifier, build, deviation, acts_on, place) -> Effect:
@@ -114,13 +113,13 @@ def offset_effect(deviation=0.3) -> Effect:
     return _effect("offset", build, deviation, frozenset({TrialKind.STATIC}), "y1")
 
 
-def drift_effect(deviation=0.3, exponent=1.0, channel="y2") -> Effect:
+def drift_effect(deviation=0.3, exponent=1.0) -> Effect:
     """Return an effect that is linear in its only parameter: a zero that moves with a power of time."""
 
     def build(setting, values, place):
         return ModelPatch((SensorDrift(place, values["size"], 100.0, exponent),))
 
-    return _effect("drift", build, deviation, frozenset(TrialKind), channel)
+    return _effect("drift", build, deviation, frozenset(TrialKind), "y2")
 
 
 OFFSET, DRIFT = Term(offset_effect(), "y1"), Term(drift_effect(), "y2")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.catalogue.entry import Prior
@@ -123,9 +122,6 @@ def ringing(seed, samples, extra=None, **given):
     problem = kit.closed_problem(seed=seed, kinds=("ringdown",), samples=samples, extra=extra, **given)
     none = kit.fitted(problem)
     return problem, none, left_by(problem, none)
-
-
-FloatArray = NDArray[np.float64]
 
 
 def covariance(time, size, tau, frequency):

@@ -115,6 +115,9 @@ def test_unit_slips(cantilever, campaign, name, factor, guess):
         assert (FaultKind.UNIT_SLIP, name) in kinds_of(faults)
         assert {fault.channel for fault in faults} == {name}
         assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
+    if abs(factor) > 1.0:  # at one load factor, too
+        flown = every(slipped, lambda trial: trial.rows(slice(2, 3)), TrialKind.FLIGHT)
+        assert (FaultKind.UNIT_SLIP, name) in kinds_of(check_against_model(flown, cantilever))
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 9.80665, 30.0])

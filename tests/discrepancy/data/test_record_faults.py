@@ -1,11 +1,9 @@
 """Records that no sensor made, in the files of a campaign: held, copied, in another unit, not at rest."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from discrepancy.campaign.reading import read_campaign
@@ -19,7 +17,6 @@ from discrepancy.sources.examples import example_campaign, plan_for
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
-FloatArray = NDArray[np.float64]
 INPUTS = Inputs(__file__)
 MODEL = INPUTS.text("mass_on_a_spring.toml")
 CHANNEL = """
@@ -37,16 +34,16 @@ kind = "driven"
 file = "{0}.csv"
 begins = "unknown"
 """
-NOISE = '\n[noise]\nfile = "rest.csv"\n'
 TIME = 0.005 * np.arange(1600)
-Change = Callable[[FloatArray], None]
 
 
 def campaign_of(folder, ring=None, rest=None, digit=1e-6, trials=2):
     """Write rings of x and y [mm] and a rest, changed in place, and return them as read."""
     generator = np.random.default_rng(5)
     folder.mkdir(exist_ok=True)
-    text = 'format = 1\nname = "rings"\n' + NOISE + CHANNEL.format("x") + CHANNEL.format("y")
+    text = (
+        'format = 1\nname = "rings"\n[noise]\nfile = "rest.csv"\n' + CHANNEL.format("x") + CHANNEL.format("y")
+    )
     tables = {"rest": 0.02 * generator.standard_normal((800, 2))}
     if rest:
         rest(tables["rest"])

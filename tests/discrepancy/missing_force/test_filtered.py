@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from benchmarks.event_moments import found_in as found_in_series
@@ -32,12 +31,11 @@ def gaussian(covariance, readings):
 
 def evidence(filtered):
     """Return the log evidence of a trial's residuals."""
-    residual = filtered.trial.residual
-    found = regression([filtered], [residual], [np.zeros((0, *residual.shape))])
+    trial = filtered.trial
+    found = regression([filtered], [np.concatenate((trial.residual[None], trial.local))])
     return -0.5 * found.products[0, 0] - found.log_determinant
 
 
-FloatArray = NDArray[np.float64]
 FREQUENCY, RATIO, PARTS = 9.0, 0.05, 8
 PROCESS = Process(2.0, 0.15)
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
@@ -30,7 +29,6 @@ from tests.discrepancy.core.kit import problem_of
 from tests.discrepancy.rigs import chosen, fmu_rig, hiding
 from tests.refusals import Inputs
 
-FloatArray = NDArray[np.float64]
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES = 0, 5, 8, 12, 14
 """Campaigns of seed 1: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow."""
 INPUTS = Inputs(__file__)

@@ -8,16 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from benchmarks.public_rigs.__main__ import BLOWN, RIGS, write
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, TrialKind
+from discrepancy.campaign.records import TrialKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import load_model
-from discrepancy.models.interface import Model
 from discrepancy.sources.measured_rigs import (
     READING_ERROR,
     SIGNAL,
@@ -34,7 +32,6 @@ from uav_twin.cli import app
 PUBLIC = os.environ.get("UAV_TWIN_PUBLIC_RIGS")
 """Folder of the files of `benchmarks.public_rigs`, as they were published."""
 PUBLISHED = Path(__file__).parents[3].parent / "shared" / "reference" / "measured"
-Rig = tuple[Campaign, Model]
 
 
 @pytest.fixture(scope="module")
@@ -203,8 +200,6 @@ def test_public_records_have_the_verdict_of_the_page(name, kind, tmp_path):
 
 # ---------------------------------------------------------------- the real wing's measurements
 
-
-FloatArray = NDArray[np.float64]
 
 WING = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 STEP = 8.1112e-3

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,13 +22,16 @@ FREE = ("skin modulus at 0", "flap root spring", "net lift at 3g", "skin density
 def free(some_parameters: tuple[FreeParameter, ...], virtual_design: WingDesign) -> tuple[FreeParameter, ...]:
     """Priors so wide that the virtual data decide."""
     return tuple(
-        FreeParameter(
-            p.name, p.unit, float(values_of(virtual_design, [p])[0]), 10.0 * p.standard_deviation,
-            p.lower - 9.0 * p.standard_deviation, p.upper + 9.0 * p.standard_deviation, p.why, p.path,
+        replace(
+            p,
+            mean=float(values_of(virtual_design, [p])[0]),
+            standard_deviation=10.0 * p.standard_deviation,
+            lower=p.lower - 9.0 * p.standard_deviation,
+            upper=p.upper + 9.0 * p.standard_deviation,
         )
         for p in some_parameters
         if p.name in FREE
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -64,23 +68,21 @@ def test_without_weight_the_prior_decides(virtual_model, some_parameters, virtua
 
 
 def test_bounds_and_the_radius_are_kept(virtual_model, some_parameters, virtual_targets):
-    softer = Targets(**{**virtual_targets.__dict__, "strain": 2.0 * virtual_targets.strain})
+    softer = replace(virtual_targets, strain=2.0 * virtual_targets.strain)
     found = minimise_local(virtual_model, some_parameters, softer, Weights(), 0.3)
     step = scaled(some_parameters, found) - scaled(some_parameters, virtual_model.values)
     assert np.abs(step).max() == pytest.approx(0.3, abs=1e-6)
     bounded = [
-        FreeParameter(p.name, p.unit, p.mean, p.standard_deviation, v - 0.01 * p.standard_deviation,
-                      v + 0.01 * p.standard_deviation, p.why, p.path)
+        replace(p, lower=v - 0.01 * p.standard_deviation, upper=v + 0.01 * p.standard_deviation)
         for p, v in zip(some_parameters, virtual_model.values, strict=True)
-    ]  # fmt: skip
+    ]
     found = minimise_local(virtual_model, bounded, softer, Weights(), 5.0)
     for parameter, value in zip(bounded, found, strict=True):
         assert parameter.lower - 1e-12 <= value <= parameter.upper + 1e-12
 
 
 def test_a_start_outside_the_bounds_is_refused(virtual_design, some_parameters, virtual_targets):
-    one = some_parameters[0]
-    narrow = FreeParameter(one.name, one.unit, one.mean, one.standard_deviation, 1.0, 2.0, one.why, one.path)
+    narrow = replace(some_parameters[0], lower=1.0, upper=2.0)
     with pytest.raises(IdentificationError, match="outside its bounds of 1 to 2"):
         identify(virtual_design, [narrow], virtual_targets)
 

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from fe.full import factorisation, subspace
 from fe.full.dissection import elimination_blocks
 from fe.full.factorisation import Factorisation, analyse, lowest_eigenpairs
-from fe.full.subspace import OrthonormalBasis, ProjectedBasis, affine_product, solved_near
+from fe.full.subspace import OrthonormalBasis, ProjectedBasis, solved_near
 from fe.runtime.errors import SolutionError
 from fe.structure.affine import affine_sum
 
@@ -140,15 +140,6 @@ def _terms() -> tuple[sparse.csr_array, ...]:
 
 TERMS = _terms()
 WHOLE = affine_sum((1.0, 1.0, 1.0), TERMS)
-
-
-def test_sums_are_the_sums():
-    coefficients, vectors = np.array([(1.0, 0.0), (2.0, -1.0), (3.0, 0.5)]), np.eye(SIZE)[:, :2]
-    wanted = [sum(c * term.toarray() for c, term in zip(own, TERMS, strict=True)) for own in coefficients.T]
-    found = affine_product(TERMS, coefficients, vectors)
-    for number, whole in enumerate(wanted):
-        np.testing.assert_allclose(found[:, number], whole[:, number], rtol=0.0, atol=1e-13)
-        np.testing.assert_allclose(affine_sum(coefficients[:, number], TERMS).toarray(), whole, atol=1e-13)
 
 
 def test_several_systems_are_solved_at_once_near_a_factorised_one_or_given_up(monkeypatch):

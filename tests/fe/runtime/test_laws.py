@@ -37,23 +37,22 @@ from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamp
 from fe.runtime.static_path import settle_port
 from fe.runtime.wing_rows import planform_stations
 from tests.fe.runtime.stepping import exact, force_of, rates_of, second_order, simulate, states_of
+from tests.refusals import Inputs
 
 A, W = 0.05, 2.0 * np.pi * np.array([5.6, 20.0, 35.0, 60.0])
 PORTS = {"tip": np.array([1.3, -1.1, 0.2, 1.2]), "root": np.array([0.8, 2.0, -0.3, 3.0])}
 WING = ModalSystem(W, np.diag(0.04 * W), PORTS)
 K1 = float(W[0] ** 2 / 1.3**2)
-AT_EACH = {  # one of each law
-    law.kind: law
-    for law in (
-        PowerDamping(PLANFORM, 2.0, 2.0, 0.5, 0.3, 0.1),
-        PowerStiffness(PLANFORM, 40.0, 3.0, 0, 0.02),
-        FreePlay(PLANFORM, 90.0, 0.004),
-        MicroSlip(PLANFORM, 12.0, 1500.0, -0.3, 8),
-        BoucWen(PLANFORM, 800.0, 0.01, 2.0),
-        patch.SineForce(PLANFORM, 3.0, 2.0, 0.1),
-        patch.Overflow(PLANFORM, 5.0, 1.4, 0.2, 0.1),
-    )
-}
+INPUTS = Inputs(__file__)
+
+
+def named(table: str) -> list[Primitive]:
+    """Laws by their kinds and values, of a table of `laws.toml`."""
+    return [patch.PRIMITIVES[kind](*values) for kind, *values in INPUTS.table("laws.toml")[table]]
+
+
+AT_EACH = {law.kind: law for law in named("each")}
+"""One of each law, over the planform."""
 
 
 def laws(*items: Primitive) -> Laws:
@@ -107,19 +106,7 @@ def test_what_a_law_of_speed_takes_is_its_equation(law, lowest, exponent):
 # ---------------------------------------------------------------- at rest
 
 
-@pytest.mark.parametrize(
-    "law",
-    [
-        PowerStiffness("tip", 300.0, 3.0, 0, 0.1),
-        PowerStiffness("tip", -20.0, 3.0, 0, 0.1),
-        PowerStiffness("tip", -40.0, 1.0, -1, 0.1),
-        FreePlay("tip", 500.0, 0.02),
-        MicroSlip("tip", 10.0, 500.0, -0.5),
-        BoucWen("tip", 500.0, 0.03, 1.7),
-        BoucWen("tip", 900.0, 0.001, 12.0),
-        patch.SineForce("tip", 40.0, 15.0, 0.4),
-    ],
-)
+@pytest.mark.parametrize("law", named("at rest"))
 def test_static_levels_are_in_equilibrium_and_follow_the_path(law):
     compliance = np.array([[1e-3]])  # the structure has 1000 N/m there
     load = np.array([0.0, 20.0, 60.0, 60.0, 10.0, -50.0, -50.1, 0.0])

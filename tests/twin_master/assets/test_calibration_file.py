@@ -12,7 +12,7 @@ from calibration.result.file import description, plain_record, result_bytes, run
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
 from tests.refusals import Inputs
-from tests.twin_master.runs import edited, table_of, text_of, written
+from tests.twin_master.runs import text_of, written
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.parameter import draw_parameter
 from twin_master.assets.resolution import (
@@ -20,9 +20,8 @@ from twin_master.assets.resolution import (
     asset_source,
     resolve_scenario,
 )
-from twin_master.errors import MissionInputError, ScenarioError
+from twin_master.errors import MissionInputError
 from twin_master.run_folder import to_json
-from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Calibration
 from uav_twin import fly, load_calibration, load_scenario
 
@@ -145,21 +144,11 @@ def test_what_is_refused_before_a_folder_is_made(file, tmp_path, library_file):
     for path, words in ((damaged, "damaged"), (tmp_path / "missing.nc", "not there")):
         with pytest.raises(CalibrationRecordError, match=words):
             asset_source(resolve_scenario(loaded, Overrides(calibration=path))).check()
-    table = table_of("level_turns")
-    for calibration, words in (
-        ({"parameter": "young_modulus_factor", "source": "file"}, "source `file` needs `file`"),
-        (
-            {"parameter": "e", "source": "fixed", "mean": 1.0, "file": "x.nc"},
-            "`file` belongs to the calibration source `file`",
-        ),
-    ):
-        with pytest.raises(ScenarioError, match=words):
-            parse_scenario(table | {"calibration": calibration}, "mine.toml")
 
 
 def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, tmp_path):
     design = ('design = "uav_wing"', 'design = "my.toml"')
-    text = edited(text_of("three_fmus"), design, design)
+    text = text_of("three_fmus", design, design)
     scenario = resolve_scenario(load_scenario(written(tmp_path, text)), Overrides(calibration=file))
     assert scenario.belief.kind == "calibration"
     assert scenario.asset.component[1].design == "calibration"

@@ -23,7 +23,7 @@ from tests.twin_master.runs import figures_of, text_of, written
 from twin_master.assets.design_source import check_model_patch
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
-from twin_master.errors import MissionInputError, ScenarioError
+from twin_master.errors import MissionInputError
 from twin_master.store.writing import open_run
 from uav_twin import fly as new_run
 from uav_twin import load_scenario, resume
@@ -56,18 +56,9 @@ def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str
     )
 
 
-def test_combinations_that_mean_nothing_are_refused(tmp_path):
-    design = 'kind = "design"\ndesign = "uav_wing"'
-    for lines, old, new, key in (
-        (PATCH, design, 'kind = "fmu"\nfile = "w.fmu"', "asset"),
-        ("", f"[belief]\n{design}", f'[belief]\nkind = "asset"\n{PATCH}', "belief"),
-    ):
-        text = scenario_of(tmp_path, lines).read_text(encoding="utf-8")
-        with pytest.raises(ScenarioError, match=f"{key}: unknown key `patch`"):
-            load_scenario(written(tmp_path, text, (old, new)))
-    loaded = load_scenario(scenario_of(tmp_path, PATCH))  # a patch is not dropped where another FMU is flown
+def test_a_patch_is_not_dropped_where_another_fmu_is_flown(tmp_path):
     with pytest.raises(MissionInputError, match=r"`asset\.patch` goes into the FMU"):
-        resolve_scenario(loaded, Overrides(fmu=tmp_path / "other.fmu"))
+        resolve_scenario(load_scenario(scenario_of(tmp_path, PATCH)), Overrides(fmu=tmp_path / "other.fmu"))
 
 
 def test_what_changes_within_a_mission_is_no_model_of_the_twin(tmp_path):

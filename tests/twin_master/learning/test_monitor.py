@@ -1,5 +1,6 @@
 """What is noticed, against sums over every course of events, an exact mean, and faults that are put in."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise, product
 
@@ -309,18 +310,15 @@ def wing() -> Knowledge:
 
 
 def fly(
-    wing: Knowledge, turns: int, spoil: dict[int, float], begin: int = 0, words: Words | None = None
+    wing: Knowledge, turns: int, spoil: Callable[[int, Float], None], words: Words | None = None
 ) -> list[Estimate]:
-    """Return 3g turns of the wing with gauges whose gain is off from a turn on."""
+    """Return 3g turns of the wing whose gauges show what `spoil` makes of it."""
     estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values, words=words)
     random, before, estimates = np.random.default_rng(1), None, []
     for turn in range(turns):
         shown = wing.sensor_model.mean[0, 1].copy()
-        if turn >= begin:
-            for gauge, gain in spoil.items():
-                shown[gauge - 1] *= 1.0 + gain
-        seen = shown + 150e-6 * random.normal(size=24)
-        estimates.append(estimator.turn(before, seen, 1, turn))
+        spoil(turn, shown)
+        estimates.append(estimator.turn(before, shown + 150e-6 * random.normal(size=24), 1, turn))
         before = estimates[-1].carried
     return estimates
 
@@ -329,7 +327,10 @@ def fly(
     ("gauge", "gain", "begin", "word"), [(5, 0.2, 0, "much"), (17, -0.2, 0, "little"), (3, 0.2, 15, "much")]
 )
 def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, word):
-    estimates = fly(wing, begin + 25, {gauge: gain}, begin)
+    def spoil(turn: int, shown: Float) -> None:
+        shown[gauge - 1] *= 1.0 + gain * (turn >= begin)
+
+    estimates = fly(wing, begin + 25, spoil)
     alarms = [notice for estimate in estimates for notice in estimate.notices if notice.kind == "alarm"]
     assert [alarm.sensors for alarm in alarms] == [(gauge,)]
     assert alarms[0].kind == "alarm"
@@ -344,22 +345,22 @@ def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, word):
 
 
 def test_an_alarm_names_no_command_where_none_looks_for_causes(wing):
+    def spoil(_turn: int, shown: Float) -> None:
+        shown[4] *= 1.3
+
     words = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
-    estimates = fly(wing, 12, {5: 0.3}, words=words)
-    alarm = next(n.sentence for estimate in estimates for n in estimate.notices if n.kind == "alarm")
+    told = (notice for estimate in fly(wing, 12, spoil, words) for notice in estimate.notices)
+    alarm = next(notice.sentence for notice in told if notice.kind == "alarm")
     assert "gauge 5 (place 5) shows too much" in alarm
     assert alarm.endswith("against the model, alarm from 100)")
 
 
 def test_an_absurd_gauge_is_left_out_with_a_word(wing):
-    estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values)
-    random, before, estimates = np.random.default_rng(1), None, []
-    for turn in range(12):
-        seen = wing.sensor_model.mean[0, 1] + 150e-6 * random.normal(size=24)
+    def spoil(turn: int, shown: Float) -> None:
         if 3 <= turn < 10:
-            seen[11] = np.nan if turn == 6 else seen[11] + 1e8 * (turn - 2)  # 1e14 microstrain a turn
-        estimates.append(estimator.turn(before, seen, 1, turn))
-        before = estimates[-1].carried
+            shown[11] = np.nan if turn == 6 else 1e8 * (turn - 2)  # 1e14 microstrain a turn
+
+    estimates = fly(wing, 12, spoil)
     assert [(turn, n.kind, n.sensors) for turn, e in enumerate(estimates) for n in e.notices] == [
         (3, "gauge_left_out", (12,)), (10, "gauge_back", (12,)),
     ]  # fmt: skip

@@ -140,6 +140,7 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
         ]
         for estimate in found[1:]:
             assert estimate.filtered == pytest.approx(found[0].filtered, abs=1e-5)
+            assert estimate.forecast == pytest.approx(found[0].forecast, abs=1e-5)
         before = [estimate.carried for estimate in found]
     assert found[0].filtered.max() > 0.3  # something was told
 

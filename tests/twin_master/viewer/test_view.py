@@ -32,8 +32,7 @@ from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.report.structure import design_of, planform_of
 from twin_master.store.writing import open_run
-from twin_master.viewer.flight import Belief, Flight
-from twin_master.viewer.messages import LATEST, Request, Teller
+from twin_master.viewer.flight import LATEST, Belief, Flight, Request, Teller
 from uav_twin import fly, load_design, load_scenario
 
 TURNS = 50
@@ -105,9 +104,7 @@ def test_every_number_is_that_of_the_run(run):
     noise2 = np.einsum("ts,stg->tg", filtered["probability"].values, total**2)
     assert np.all(noise2 > 125e-6**2)
     spread = np.hypot(filtered["quantity_standard_deviation"].values, np.sqrt(noise2))
-    np.testing.assert_allclose(
-        np.hypot(believed.expected.standard_deviation, believed.expected.noise), spread, rtol=1e-9
-    )
+    np.testing.assert_allclose(wide(believed), spread, rtol=1e-9)
     decided = filtered["decision_probability"].values
     np.testing.assert_array_equal(believed.control_probability, decided)
     np.testing.assert_array_equal(
@@ -217,10 +214,7 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     )
     np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(flight.seen(0, 29)))
     width = np.subtract(past["sensor_upper"], past["sensor_lower"])
-    np.testing.assert_allclose(
-        width,
-        2 * 1.959963984540054e6 * np.hypot(believed.expected.standard_deviation, believed.expected.noise),
-    )
+    np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * wide(believed))
     assert np.min(past["state_lower"]) >= 0.0
     assert np.max(past["state_upper"]) <= 80.0
     assert answer["ahead"]["reward"][0][2] is None  # no error reward of a turn to come

@@ -23,7 +23,7 @@ from twin_master.mission.loop import replay
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.network.inference import known_control
 from twin_master.store.writing import open_run
-from twin_master.viewer.messages import Request, Teller
+from twin_master.viewer.flight import Request, Teller
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.teaching import Outcome, Teaching, both_patches, patched_model, policy_change

@@ -1,4 +1,4 @@
-"""`uav-twin structure` as a user calls it."""
+"""Structures as a user has them: commands; from matrices of CalculiX and a campaign to FMU and twin."""
 
 import json
 import shutil
