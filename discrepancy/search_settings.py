@@ -55,6 +55,8 @@ class SearchSettings:
     """Screened gain below which an effect is not fitted at all: it could not win a name."""
     worth_adding: float = 4.0
     """The same for one more effect, whose prior is smaller."""
+    pairs_fitted: int = 8
+    """Pairs that are fitted of all that are screened."""
 
     # ---------------------------------------------------------------- rough fits
     rough_steps: int = 8

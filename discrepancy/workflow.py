@@ -38,7 +38,8 @@ from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.search.strategy import Search, Tell
+from discrepancy.search.starts import Tell
+from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign

@@ -5,7 +5,7 @@ derivatives and H the Hessian of the fit, the misfit after the nuisances have ad
 
     F(d) = F(0) - b(d) + G(d, d) / 2,   G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
 
-Changes are scaled, so that their best size costs inner products only. G is also what separates two
+Changes of several effects add, so pairs and scales cost inner products only. G is also what separates two
 effects before data are looked at.
 """
 
@@ -61,9 +61,13 @@ class Change:
     @property
     def gain(self) -> float:
         """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
+        return 0.5 * self.fits * self.scale if self.fits > 0.0 or self.may_turn else 0.0
+
+    @property
+    def may_turn(self) -> bool:
+        """Whether its scale may be negative."""
         sizes = [item.prior.shape for item in self.term.parameters if item.magnitude]
-        turns = not sizes or any(shape != "log_normal" for shape in sizes)
-        return 0.5 * self.fits * self.scale if self.fits > 0.0 or turns else 0.0
+        return not sizes or any(shape != "log_normal" for shape in sizes)
 
     @property
     def best(self) -> FloatArray:

@@ -24,7 +24,8 @@ from discrepancy.fits.predictive import residual_set
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share, missing_force
 from discrepancy.search.honest_evidence import noise_levels, refitted
-from discrepancy.search.strategy import Search, acts_within, are_related
+from discrepancy.search.starts import acts_within, are_related
+from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate

@@ -13,7 +13,8 @@ from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
-from discrepancy.search.strategy import Search, Tell, acts_within, in_silence, search
+from discrepancy.search.starts import Tell, acts_within, in_silence
+from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate, Verdict, VerdictKind

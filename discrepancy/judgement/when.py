@@ -5,7 +5,7 @@ from dataclasses import replace
 from math import floor, log10
 
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.search.strategy import are_related
+from discrepancy.search.starts import are_related
 from discrepancy.sentences import said
 from discrepancy.verdict import GapWindow, Moment, NamedEffect, Verdict, VerdictKind
 from reporting.words import listing

@@ -22,7 +22,8 @@ from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 
-from .strategy import Search, each
+from .starts import each
+from .strategy import Search
 
 LEVEL = 1e-3
 """p-value below which what is left is more than noise, or no white noise."""

@@ -1,97 +1,26 @@
 """The search for the set of effects that explains a campaign: screen, fit, add."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from math import exp
-from typing import TypeVar
 
 import numpy as np
-from scipy.special import logsumexp, ndtri
+from scipy.special import logsumexp
 
-from discrepancy.campaign.records import FloatArray
-from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
-from discrepancy.errors import DiscrepancyError, ModelError
-from discrepancy.fits.candidate import Candidate, Key, Point, Term
-from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box, objective
+from discrepancy.errors import ModelError
+from discrepancy.fits.candidate import Candidate, Key
+from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen
+from discrepancy.fits.screening import Screen
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import SENSORS, MicroSlip
 
-T = TypeVar("T")
-Tell = Callable[[str], None]
-Starts = list[tuple[Candidate, Point]]
-
-
-def in_silence(what: str) -> None:
-    """Tell nobody."""
-
-
-def each(tell: Tell, items: Sequence[T], words: Callable[[T], str]) -> Iterator[T]:
-    """Yield items, and tell of each what is done with it and how many are left."""
-    for number, item in enumerate(items):
-        tell(f"{words(item)}, {len(items) - number - 1} more")
-        yield item
-
-
-def starts(screen: Screen, effect: Effect) -> list[Change]:
-    """Return the most promising changes of an effect; more of them where a box is to be placed.
-
-    Misfit gained, less what the scale costs in the prior.
-    """
-    places = effect.places(screen.problem.setting)
-    few, box = len(places) <= SEARCH.few_places, sum(not item.magnitude for item in effect.parameters) > 1
-    changes = (change for place in places for change in screen.changes(Term(effect, place), fine=few))
-    worth = [(0.5 * float(one.best @ one.best) - one.gain, one) for one in changes if one.size > 0.0]
-    worth.sort(key=lambda row: row[0])
-    return [change for _, change in worth[: SEARCH.starts * (3 if box else 1)]]
-
-
-def acts_within(effect: Effect, setting: Setting) -> bool:
-    """Whether an effect acts within the structure or on its loads, not on readings only."""
-    term = Term(effect, effect.places(setting)[0])
-    try:
-        patch = term.patch(setting, term.start() + 1.0)
-    except DiscrepancyError:  # a law that cannot be so large
-        return True
-    return not all(isinstance(item, SENSORS) for item in patch)
-
-
-def are_related(one: Effect, other: Effect) -> bool:
-    """Whether one of two different effects is easily taken for the other."""
-    if one.identifier == other.identifier:
-        return False
-    named = one.identifier in other.confusable or other.identifier in one.confusable
-    return named or one.family == other.family
-
-
-def beside(base: CandidateFit, term: Term, values: FloatArray) -> tuple[Candidate, Point]:
-    """Return a base with one more effect, and where a fit of it begins."""
-    effect = np.concatenate((base.effect, values))
-    return base.candidate.plus(term), replace(base.point, effect=effect)
-
-
-def tried(problem: Problem, base: CandidateFit, effect: Effect) -> Starts:
-    """Return the most promising points of a grid of an effect's parameters, beside a base."""
-    found = []
-    for place in effect.places(problem.setting):
-        term = Term(effect, place)
-        known, size = SEARCH.far_levels, len(term.parameters)
-        count = known[min(size, len(known) - 1)]
-        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
-        for values in product(levels, repeat=size):
-            candidate, start = beside(base, term, np.array(values))
-            with suppress(DiscrepancyError):  # more than the structure can carry
-                found.append((objective(problem, candidate, start), candidate, start))
-    found.sort(key=lambda row: row[0])
-    return [row[1:] for row in found[: SEARCH.far_starts]]
+from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, slips, starts, tried
 
 
 @dataclass
@@ -298,8 +227,8 @@ class Search:
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, the best of them beside their optimum too, one law of free shape, more effects. The best
-        candidate is computed finely before what rests on its evidence.
+        One effect, the best of them beside their optimum too, one law of free shape, more effects, any
+        two. The best candidate is computed finely before what rests on its evidence.
         """
         ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
         for rank, item in enumerate(ranked[: SEARCH.ridges]):
@@ -309,8 +238,11 @@ class Search:
         self.settle()
         self.families()
         self.settle()
-        if not self.best().candidate.is_family:  # beside one further effects would be anything
+        # beside a law whose shape is free further effects would be anything
+        if not self.best().candidate.is_family:
             self.longer()
+        if not self.best().candidate.is_family and self.unexplained():
+            self.fit_pairs()
         self.settle()
 
     @property
@@ -345,11 +277,11 @@ class Search:
     def settle(self) -> None:
         """Compute the best candidate finely: joints that slip by more elements, motions by smaller steps."""
         setting = self.problem.setting
-        if setting.joint_elements < SEARCH.fine_joint and self._slips(self.best()):
+        if setting.joint_elements < SEARCH.fine_joint and slips(self.problem, self.best()):
             ranked = self._ranked()
             self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
-            self._fit_again([item for item in ranked if self._slips(item)])
-            if self._slips(self.best()):
+            self._fit_again([item for item in ranked if slips(self.problem, item)])
+            if slips(self.problem, self.best()):
                 self.keep(around(self.problem, self.best()), exact=True)
         while (
             self.problem.refinement < SEARCH.finest
@@ -360,11 +292,6 @@ class Search:
 
     def _ranked(self) -> list[CandidateFit]:
         return sorted(self.exact.values(), key=lambda item: -self.score(item))
-
-    def _slips(self, found: CandidateFit) -> bool:
-        """Whether a fit has a joint that slips."""
-        patch = found.candidate.patch(self.problem.setting, found.effect)
-        return any(isinstance(item, MicroSlip) for item in patch)
 
     def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
         """Replace the best exact fits by those of the finer model from where they stand."""
@@ -415,6 +342,22 @@ class Search:
                 kept[key] = family
         for family in kept.values():
             self.keep(family, exact=True)
+
+    def fit_pairs(self) -> None:
+        """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
+        screen = Screen(self.problem, self.none)
+        changes = [change for effect in self.effects for change in starts(screen, effect)]
+        begun = []
+        for _, first, second in pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
+            candidate = Candidate((first.term, second.term))
+            if candidate.key not in self.exact:
+                start = replace(self.none.point, effect=np.concatenate((first.best, second.best)))
+                begun.append([(candidate, start)])
+        rough = self._best_of(begun, self.none, 0.0)
+        for item in rough:
+            self.keep(item, exact=False)
+        rough.sort(key=lambda item: -self.score(item))
+        self.refine(rough, self.score(self.best()) - SEARCH.close)
 
 
 def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:

@@ -14,6 +14,7 @@ from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, ab
 from discrepancy.fits.predictive import ensemble, residual_set, with_draws
 from discrepancy.fits.screening import Screen, grid
 from discrepancy.judgement.conclusion import named_effects
+from discrepancy.search.starts import pairs
 from discrepancy.search_settings import SEARCH
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import ModelPatch, RunOffset
@@ -58,6 +59,17 @@ def test_change_is_the_projected_one(screened):
     for one, other in ((0, 0), (0, 1), (1, 1)):
         product = vectors[one] @ kernel @ vectors[other]
         assert float(vector[one] * screen.sign @ vector[other]) == pytest.approx(product, rel=1e-6)
+
+
+def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
+    problem, none, screen, terms, changes = screened
+    ((misfit, first, second),) = pairs(changes, screen.sign)
+    found = kit.fitted(problem, *terms)
+    assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
+    start = np.concatenate((first.best, second.best))
+    np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
+    same = replace(changes[0], term=terms[1])
+    assert pairs([changes[0], changes[0]], screen.sign) == pairs([changes[0], same], screen.sign) == []
 
 
 def test_gain_is_what_a_fit_achieves(screened):
