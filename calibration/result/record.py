@@ -22,7 +22,7 @@ from reporting.words import brief
 
 Float = NDArray[np.float64]
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
-"""How the samples were made: by quadrature of the parameter that is told least and the others given it, from
+"""How the samples were made: by quadrature of one parameter and the others given it, from
 the Gaussian at the optimum where the posterior is one, from Gaussians at several optima; of a wing by
 importance sampling, or by the paper's procedure."""
 

@@ -68,11 +68,11 @@ class Column:
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
         cells = self.sheet.numbers(self.head, decimal)
-        # one digit less than a float can have, and no rounding shows
+        # two digits less than a float may need, so that no rounding shows: 4.387 mm is 0.004387 m
         return (
             cells
             if self.to_si == 1.0
-            else tuple(cell and f"{float(cell) * self.to_si:.16g}" for cell in cells)
+            else tuple(cell and f"{float(cell) * self.to_si:.15g}" for cell in cells)
         )
 
 

@@ -142,9 +142,6 @@ def _faults(effect: Effect) -> Iterator[str]:
     """Yield what is not sound in an entry, as a sentence goes on after its identifier."""
     if not _IDENTIFIER.fullmatch(effect.identifier):
         yield " must have an identifier of lower-case letters, digits and underscores."
-    for field in ("name", "family", "equation", "signature", "reference"):
-        if not getattr(effect, field).strip():
-            yield f" has no {field}."
     if not effect.acts_on:
         yield " does not say which trials it acts on."
     if not effect.parameters:

@@ -204,10 +204,10 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     """Return `count` draws of the posterior of a problem's parameters.
 
     One parameter is integrated by quadrature. Of several the Gaussian at the optimum is taken where the
-    energy along its principal axes is that of a Gaussian; else the parameter that is told least is
-    integrated by quadrature, the others being Gaussian given it (a nested Laplace approximation, Rue,
-    Martino and Chopin 2009, J. R. Statist. Soc. B 71 (2)). Where several optima tell, each has its Gaussian,
-    weighed by its Laplace evidence.
+    energy along its principal axes is that of a Gaussian; else the parameter that is most cut off, or told
+    least, is integrated by quadrature, the others being Gaussian given it (a nested Laplace approximation,
+    Rue, Martino and Chopin 2009, J. R. Statist. Soc. B 71 (2)). Where several optima tell, each has its
+    Gaussian, weighed by its Laplace evidence.
 
     Raises
     ------
@@ -221,12 +221,15 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     centres = [item.point.shared[free] for item in optima]
     spreads = [item.covariance[np.ix_(free, free)] for item in optima]
     trial = generator.multivariate_normal(centres[0], spreads[0], 4000, method="cholesky")
+    beyond = np.mean((trial < marginal.low) | (trial > marginal.high), axis=0)
     cut = float(np.mean(~marginal.inside(trial)))
     procedure: Procedure = "several optima" if len(optima) > 1 else "Gaussian"
     if len(free) == 1 or (
         len(optima) == 1 and not (cut < CUT and is_gaussian(marginal, centres[0], spreads[0]))
     ):
-        procedure, draws = "quadrature", _along_the_widest(marginal, optima, count, generator)
+        # what is fitted at the end of its range is no Gaussian there: such a parameter is integrated itself
+        index = int(np.argmax(beyond if beyond.max() > CUT else np.diag(spreads[0])))
+        procedure, draws = "quadrature", _along(index, marginal, optima, count, generator)
     else:
         ends = marginal.low, marginal.high
         shares = [mass_inside(*item, *ends) for item in zip(centres, spreads, strict=True)]
@@ -277,19 +280,22 @@ def cut_off(
     return np.clip(drawn, low, high)
 
 
-def _along_the_widest(
-    marginal: Marginal, optima: tuple[CandidateFit, ...], count: int, generator: np.random.Generator
+def _along(
+    index: int,
+    marginal: Marginal,
+    optima: tuple[CandidateFit, ...],
+    count: int,
+    generator: np.random.Generator,
 ) -> FloatArray:
-    """Return draws (count, P): the parameter that is told least by quadrature, the others given it.
+    """Return draws (count, P): one parameter by quadrature, the others given it.
 
     At each node of the one the others are fitted and integrated with the nuisances: Gaussian given the one,
     and cut off at the model's range. The evidence of a node has the share of that Gaussian that lies within.
     """
     free, best = marginal.free, optima[0]
-    widest = int(np.argmax(np.diag(best.covariance)[free]))
-    one = np.arange(len(free)) == widest
+    one = np.arange(len(free)) == index
     ends = marginal.low[~one], marginal.high[~one]
-    centre = float(best.point.shared[free[widest]])
+    centre = float(best.point.shared[free[index]])
     fits: dict[float, CandidateFit] = {}
     energy: dict[float, float] = {}
 
@@ -307,7 +313,7 @@ def _along_the_widest(
             share = 1.0 if one.all() else mass_inside(*others(found), *ends)
             energy[node] = 0.5 * node**2 - found.log_evidence - float(np.log(max(share, np.exp(-EMPTY))))
 
-    for node in sorted(_first_nodes(marginal, optima, widest), key=lambda node: abs(node - centre)):
+    for node in sorted(_first_nodes(marginal, optima, index), key=lambda node: abs(node - centre)):
         visit(node)
     fine, mass = _distribution(energy)
     while len(energy) < MOST_NODES and np.max(shares := np.diff(mass[::BETWEEN])) > LARGEST_MASS:

@@ -82,7 +82,7 @@ def test_a_folder_of_files_becomes_the_campaign(tmp_path, monkeypatch):
         assert ours.kind is theirs.kind
         for name in ("values", "time", "force"):
             if name != "time" or ours.is_dynamic:
-                np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-15)
+                np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-14)
         assert ours.load_place == "mass"
         if theirs.release is not None:
             assert ours.release.displacement == pytest.approx(theirs.release.displacement, rel=1e-15)

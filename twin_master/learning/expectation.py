@@ -58,10 +58,11 @@ def expected_of(
     return Expected(mean, deviation, lower, upper, noise, reward.mean, reward.standard_deviation)
 
 
+@dataclass(frozen=True)
 class LearntExpectation:
     """Expectations of a learning filter.
 
-    Parameters
+    Attributes
     ----------
     learning : LearningFilter
     rewards : RewardModel
@@ -69,20 +70,19 @@ class LearntExpectation:
         p(U | D), which is predicted through.
     """
 
-    def __init__(self, learning: LearningFilter, rewards: RewardModel, policy: Float) -> None:
-        self._learning, self._rewards, self._policy = learning, rewards, policy
-        self._value = learning.sensor_model.value_per_draw
-        self._deviation = learning.sensor_model.total_standard_deviation
+    learning: LearningFilter
+    rewards: RewardModel
+    policy: Float
 
     def filtered(self, carried: Sequence[Carried], observed: Float) -> Expected:
         """Return what is expected of T turns given the observations up to each; observed is (T, G)."""
         rows = zip(carried, observed, strict=True)
-        return stacked(self._known(self._learning.hypotheses(turn), turn, seen) for turn, seen in rows)
+        return stacked(self._known(self.learning.hypotheses(turn), turn, seen) for turn, seen in rows)
 
     def smoothed(self, carried: Sequence[Carried], observed: Float) -> Expected:
         """Return what is expected of T turns given all observations; observed is (T, G)."""
-        rows, own = zip(carried, observed, strict=True), self._learning.smoothed_hypotheses(carried)
-        last = (self._learning.hypotheses(carried[-1], weight) for weight in own)
+        rows, own = zip(carried, observed, strict=True), self.learning.smoothed_hypotheses(carried)
+        last = (self.learning.hypotheses(carried[-1], weight) for weight in own)
         return stacked(self._known(found, *row) for found, row in zip(last, rows, strict=True))
 
     def predicted(self, carried: Sequence[Carried], horizon: int) -> Expected:
@@ -108,8 +108,8 @@ class LearntExpectation:
         seen : (G,) or None
             What the sensors say, SI.
         """
-        sensors, priors = self._value.shape[-1], self._learning.priors
-        share = self._learning.sensor_model.draw_weight
+        model, priors = self.learning.sensor_model, self.learning.priors
+        share = model.draw_weight
         if (parameter := learnt.get(priors.parameter or "")) is not None:
             draws = np.asarray(priors.draws, dtype=np.float64)
             order = np.argsort(draws)
@@ -120,31 +120,25 @@ class LearntExpectation:
 
         def of_sensors(name: str, otherwise: float) -> Float:
             plain = Learnt(otherwise, 0.0, otherwise, otherwise)
-            known = [learnt.get(f"{name}[{number}]", plain) for number in range(1, sensors + 1)]
+            known = [learnt.get(f"{name}[{number}]", plain) for number in range(1, model.sensor_count + 1)]
             return np.array([own.figures[:2] for own in known]).T
 
         (gain, gain_spread), (offset, offset_spread), (scale, scale_spread) = (
             of_sensors(name, otherwise)
             for name, otherwise in (("gauge_gain", 0.0), ("gauge_offset", 0.0), ("noise_scale", 1.0))
         )
-        spread = np.stack([offset_spread**2, np.zeros(sensors), gain_spread**2], axis=-1)
-        count = len(draw)
-        hypotheses = Hypotheses(
-            weight=np.empty(0),
-            draw=draw,
-            offset=np.tile(offset, (count, 1)),
-            gain=np.tile(gain, (count, 1)),
-            covariance=np.tile(spread, (count, 1, 1)),
-            scale2=np.tile(scale**2 + scale_spread**2, (count, 1)),
-        )
+        spread = np.stack([offset_spread**2, np.zeros(model.sensor_count), gain_spread**2], axis=-1)
+        scale2 = scale**2 + scale_spread**2
+        alike = (part[None] for part in (offset, gain, spread, scale2))  # for all draws
+        hypotheses = Hypotheses(np.empty(0), draw, *alike)
         weight = share[draw][None, :, None, None] * joint[:, None]
         return self._of(hypotheses, np.ascontiguousarray(weight), controls, seen)
 
     @cached_property
     def _closed_loop(self) -> Float:
         """p(D' | D) under the policy: (S, S)."""
-        matrix = self._learning.model.transition.matrix
-        return np.asarray(np.einsum("su,usn->sn", self._policy, matrix))
+        matrix = self.learning.model.transition.matrix
+        return np.asarray(np.einsum("su,usn->sn", self.policy, matrix))
 
     def _known(self, hypotheses: Hypotheses, turn: Carried, seen: Float) -> Expected:
         u = slice(turn.control_index, turn.control_index + 1)
@@ -152,25 +146,26 @@ class LearntExpectation:
         return Expected(**{name: values[0] for name, values in vars(found).items()})
 
     def _ahead(self, turn: Carried, horizon: int) -> Expected:
-        hypotheses = self._learning.hypotheses(turn)
+        hypotheses = self.learning.hypotheses(turn)
         rows, coming = hypotheses.weight, np.empty((horizon, *hypotheses.weight.shape))
-        step = self._learning.model.transition.matrix[turn.control_index]
+        step = self.learning.model.transition.matrix[turn.control_index]
         for h in range(horizon):
             rows, step = rows @ step, self._closed_loop
             coming[h] = rows
-        return self._of(hypotheses, coming[..., None] * self._policy, slice(None), None)
+        return self._of(hypotheses, coming[..., None] * self.policy, slice(None), None)
 
     def _of(self, hypotheses: Hypotheses, weight: Float, controls: slice, seen: Float | None) -> Expected:
         """Return what is expected under B beliefs (B, K, S, U') over hypotheses, states and controls."""
         weight = weight / weight.sum(axis=(1, 2, 3), keepdims=True)
-        own = self._value[:, :, controls][hypotheses.draw]
+        model = self.learning.sensor_model
+        own = model.value_per_draw[:, :, controls][hypotheses.draw]
         gain, offset, wide, scale2 = (
             part[:, None, None]
             for part in (hypotheses.gain, hypotheses.offset, hypotheses.covariance, hypotheses.scale2)
         )
         shown = own * (1.0 + gain) + offset  # (K, S, U', G), normally distributed
         shown_variance = wide[..., 0] + own * (2.0 * wide[..., 1] + own * wide[..., 2])
-        noise2 = np.broadcast_to(scale2 * self._deviation[:, controls] ** 2, shown.shape)
+        noise2 = np.broadcast_to(scale2 * model.total_standard_deviation[:, controls] ** 2, shown.shape)
         beliefs, count = len(weight), shown.shape[-1]
         flat = weight.reshape(beliefs, -1)
         center = shown[0].mean(axis=(0, 1))  # near enough that squares do not cancel
@@ -189,7 +184,7 @@ class LearntExpectation:
             own = means[b, kept] / share[:, None]
             wide = np.sqrt(np.maximum(squares[b, kept] / share[:, None] - own**2, 0.0))
             quantiles[b] = quantiles_of(share / share.sum(), own, wide, _LEVELS)
-        rewards = self._rewards.expectation_of(weight, hypotheses.draw, controls, shown, shown_variance, seen)
+        rewards = self.rewards.expectation_of(weight, hypotheses.draw, controls, shown, shown_variance, seen)
         return Expected(
             mean + center, deviation, quantiles[:, 0] + center, quantiles[:, 1] + center, noise,
             rewards.mean, rewards.standard_deviation,

@@ -99,15 +99,6 @@ class InspectedSensorModel(GaussianSensorModel):
         read = np.where(self.asked_by == control_index, self.reading[state] + noise, np.nan)
         return np.hstack((gauges, read))
 
-    def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
-        """Return log p(o | D, u) for each state (S,), of a row (G + I,) or (G,)."""
-        return np.asarray(self.log_likelihood_sequence(np.asarray(observation)[None], [control_index])[0])
-
-    def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
-        """Return log p(o_t | D_t, u_t) for a sequence of rows: (T, G + I) or (T, G), and (T,) -> (T, S)."""
-        gauges, told = self.apart(observations)
-        return np.asarray(super().log_likelihood_sequence(gauges, control_index) + told)
-
     def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
         """Return the values of the sensors, and log p(readings | D); see `GaussianSensorModel.apart`."""
         rows, count = np.asarray(observation, dtype=np.float64), self.sensor_count

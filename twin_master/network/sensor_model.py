@@ -192,7 +192,8 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             If the shape is another one or a value is infinite; if there is no such control.
         """
-        return np.asarray(self.log_likelihood_sequence(self.checked(observation)[None], [control_index])[0])
+        values, told = self.apart(observation)
+        return np.asarray(self._densities(values[None], [control_index], 1)[0, :, 0] + told)
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).
@@ -202,7 +203,8 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
-        return np.asarray(self._densities(observations, control_index, 1)[..., 0])
+        values, told = self.apart(observations)
+        return np.asarray(self._densities(values, control_index, 1)[..., 0] + told)
 
     def log_density_of_draws(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t, e) of a sequence for each draw e: (T, G) and (T,) -> (T, S, E).

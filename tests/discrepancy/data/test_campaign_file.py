@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from discrepancy import errors
-from discrepancy.campaign.noise import pre_trigger_record, repeated
+from discrepancy.campaign.noise import pre_trigger_record, repeat_record, repeated
 from discrepancy.campaign.protocol import Event, Release
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import (
@@ -368,6 +368,26 @@ def test_a_trial_under_something_else_is_no_repeat(what):
     trial = Trial.plain("a", TrialKind.STATIC, ("w",), np.zeros(3), force=np.arange(3.0))
     assert [group for group, *_ in repeated([trial, trial], "w")] == [[trial, trial]]
     assert not [*repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")]
+
+
+def test_a_reading_that_is_left_out_is_in_no_repeat():
+    channel = Channel("w", Quantity.DISPLACEMENT, "x")
+    rows, used = np.random.default_rng(1).standard_normal((3, 6)), np.ones((3, 6), dtype=bool)
+    used[1, 2] = False
+
+    def deviation(rows, used):
+        trials = [
+            Trial.plain(
+                "t", TrialKind.STATIC, ("w",), np.zeros(row.size), force=np.arange(float(row.size)),
+                values=row[:, None], used=mark[:, None],
+            )
+            for row, mark in zip(rows, used, strict=True)
+        ]  # fmt: skip
+        found = repeat_record(channel, trials)
+        return found.standard_deviation, found.degrees_of_freedom
+
+    kept = np.delete(rows, 2, axis=1)
+    assert deviation(np.where(used, rows, 1e9), used) == pytest.approx(deviation(kept, kept < np.inf))
 
 
 # ---------------------------------------------------------------- what is wrong

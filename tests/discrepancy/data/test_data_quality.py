@@ -316,13 +316,13 @@ def test_friction_impacts_and_steps_are_no_outliers(noise):
 
 
 def test_rows_of_static_trials():
-    def levels(count, spoilt=None, name="t", curve=0.0, shift=0.0):
+    def levels(count, spoilt=None, name="t", curve=0.0, shift=0.0, by=1e-3):
         load = np.arange(count, dtype=float)
         values = (
             1e-3 * load + curve * load**2 + 5e-6 * np.random.default_rng(count).normal(size=count) + shift
         )
         if spoilt is not None:
-            values[spoilt] += 1e-3
+            values[spoilt] += by
         zeros, column = np.zeros(count), values[:, None]
         return Trial.plain(name, TrialKind.STATIC, ("x",), zeros, values=column, force=load, run="A")
 
@@ -330,6 +330,7 @@ def test_rows_of_static_trials():
     for trials, noise, left_out in (
         ((levels(10, 4),), 5e-6, [[4]]),
         ((levels(10),), 5e-6, [[]]),
+        ((levels(10, 9, by=9e-5),), 5e-6, [[9]]),  # at the end, where a parabola follows it
         ((levels(10, curve=1e-4),), 5e-6, [[]]),
         ((levels(10, 4),), None, [[]]),
         ((levels(6, 3),), 5e-6, [[]]),  # six rows alone cannot tell

@@ -105,6 +105,23 @@ def test_a_linear_model_has_the_posterior_of_the_closed_form(tmp_path):
     assert result_bytes(again) == result_bytes(found)
 
 
+def test_of_two_parameters_the_range_of_one_tells_the_other():
+    values = noisy(line, 1.1, 0.7, seed=3)
+    model = choice_of(line, (1.0, 0.2, -3.0, 1.098), PRIORS[1])
+    found = calibrate_parameters(campaign_of(values), model, samples=20_000)
+    assert found.procedure == "quadrature"
+    grid = np.stack(np.meshgrid(np.linspace(1.02, 1.098, 400), np.linspace(0.4, 1.1, 700), indexing="ij"))
+    residual = values - line(FORCE, grid[..., None])
+    log = -0.5 * np.sum((residual / NOISE) ** 2, axis=-1)
+    log -= 0.5 * (((grid[0] - 1.0) / 0.2) ** 2 + ((grid[1] - 0.5) / 0.3) ** 2)
+    mass = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+    for place, axis in enumerate(grid):
+        mean = float(np.sum(mass * axis))
+        deviation = float(np.sqrt(np.sum(mass * (axis - mean) ** 2)))
+        assert found.samples[:, place].mean() == pytest.approx(mean, abs=0.03 * deviation)
+        assert found.samples[:, place].std() == pytest.approx(deviation, rel=0.03)
+
+
 def test_one_parameter_is_integrated_as_densely_as_one_likes():
     """Two readings with much noise, a prior that is cut off, noise known from few degrees of freedom."""
     values = spring(FORCE, [0.7]) + 60.0 * NOISE * np.sin(FORCE)

@@ -123,7 +123,8 @@ def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, signals)
 
 @pytest.mark.parametrize("damage", ["half a block", "half a file"])
 def test_what_is_damaged_is_sampled_again(files, tmp_path, monkeypatch, damage):
-    whole = sample_library(grid(files), tmp_path / "whole.nc", workers=1)
+    some = grid(files, draws=tuple(np.linspace(0.8, 1.2, 30)))  # in blocks of three points
+    whole = sample_library(some, tmp_path / "whole.nc", workers=1)
 
     def full_disk(*_: object) -> None:
         raise KeyboardInterrupt
@@ -132,13 +133,13 @@ def test_what_is_damaged_is_sampled_again(files, tmp_path, monkeypatch, damage):
     with monkeypatch.context() as patch:
         patch.setattr("twin_master.library.sampling.write_observation_library", full_disk)
         with pytest.raises(KeyboardInterrupt):
-            sample_library(grid(files), out, workers=1)
+            sample_library(some, out, workers=1)
     kept = blocks_folder(out) / "observations.npy"
     if damage == "half a block":
         np.load(kept, mmap_mode="r+")[3] = np.nan
     else:
         kept.write_bytes(kept.read_bytes()[:-8])
-    outcome = sample_library(grid(files), out, workers=1, resume=True)
+    outcome = sample_library(some, out, workers=1, resume=True)
     assert outcome.block_count - outcome.kept_blocks == (
         1 if damage == "half a block" else outcome.block_count
     )
