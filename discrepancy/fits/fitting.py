@@ -191,9 +191,11 @@ def _compared(
     """Return -ln posterior, residuals of each trial, and their sums of squares by channel."""
     residuals = tuple(problem.residual(number, point, one) for number, one in enumerate(responses))
     sums = problem.group_sums(residuals)
-    prior = float(problem.shared.precision @ point.shared**2 + point.effect @ point.effect)
-    prior += sum(float(d.unknowns.precision @ u**2) for d, u in zip(problem.trials, point.local, strict=True))
-    value = problem.misfit(sums) + 0.5 * prior
+    prior = 0.5 * float(problem.shared.precision @ point.shared**2)
+    prior += 0.5 * float(point.effect @ point.effect)
+    for data, u in zip(problem.trials, point.local, strict=True):
+        prior += 0.5 * float(data.unknowns.precision @ u**2)
+    value = problem.misfit(sums) + prior
     return value if np.isfinite(value) else np.inf, residuals, sums
 
 
