@@ -90,7 +90,8 @@ def test_standard_errors_are_those_of_the_linearised_signal(seconds, ratio):
     """By differences; in the short record decay rate and frequency of the first mode are correlated."""
     time, noise, step = np.arange(0.0, seconds, 1.0 / 500.0), 1e-4, 1e-5
     generator = np.random.default_rng(3)
-    fit = fitted(time, ring_down(time, ratio=ratio) + noise * generator.standard_normal(time.size))
+    signal = ring_down(time, ratio=ratio) + noise * generator.standard_normal(time.size)
+    fit = fitted(time, signal)
     waves = [
         (mode.frequency, mode.damping_ratio, mode.amplitude, cmath.phase(mode.wave)) for mode in fit.modes
     ]
@@ -103,6 +104,8 @@ def test_standard_errors_are_those_of_the_linearised_signal(seconds, ratio):
     slopes = np.column_stack([*columns, np.ones(time.size), time])  # with offset and drift
     expected = fit.residual_deviation * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))[:4]
     assert fit.residual_deviation == pytest.approx(noise, rel=0.1)
+    rest = np.linalg.norm(signal - fit.fitted)
+    assert fit.residual_deviation == pytest.approx(rest / math.sqrt(time.size - 10), rel=1e-9)
     found = [mode.standard_error[name] for name in ("frequency", "damping_ratio") for mode in fit.modes]
     assert found == pytest.approx(expected, rel=1e-4)
 

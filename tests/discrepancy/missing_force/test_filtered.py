@@ -123,7 +123,13 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     covariance = (covariance + noise + flat.T @ flat)[np.ix_(at, at)]
     readings = residual.ravel()[at]
     assert evidence(filtered) == pytest.approx(gaussian(covariance, readings), abs=0.05 if rough else 0.02)
-    if unknown:
+    if unknown:  # trials of one system and grid are filtered together, and tell what each tells
+        rows = np.concatenate((residual[None] * used, local))
+        both, *each = (
+            regression([filtered] * len(of), of) for of in ([rows, 2.0 * rows], [rows], [2.0 * rows])
+        )
+        np.testing.assert_allclose(both.products, each[0].products + each[1].products, rtol=1e-9)
+        assert both.log_determinant == pytest.approx(sum(one.log_determinant for one in each), rel=1e-9)
         return
     _, (force,), (deviation, _) = filtered.smoothed(trial.residual)
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
