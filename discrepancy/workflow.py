@@ -256,10 +256,10 @@ def without_wrong_ends(problem: Problem) -> Problem:
 
     The model as it is need not fit: see `outliers.wrong_ends`.
     """
-    none = fit_to(problem, Candidate(), problem.start(Candidate()), evidence=False)
+    none = fit_to(problem, Candidate(), problem.start(Candidate()))
     fits = [(problem, none)]
     if problem.campaign.held_out:
-        fits.append(held_out_fit(problem, none, evidence=False))
+        fits.append(held_out_fit(problem, none))
     trials = {trial.name: trial for trial in problem.campaign.trials}
     remarks = list(problem.campaign.remarks)
     for part, fitted in fits:
@@ -344,8 +344,5 @@ def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRA
         size = fit.candidate.size
         root = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
         draws = fit.point.effect + generator.standard_normal((count, size)) @ root.T
-    parts = [fit.candidate.parts(draw) for draw in draws]
-    return [
-        [term.patch(problem.setting, part[number]) for part in parts]
-        for number, term in enumerate(fit.candidate.terms)
-    ]
+    drawn = [fit.candidate.patches(problem.setting, draw) for draw in draws]
+    return [list(of_effect) for of_effect in zip(*drawn, strict=True)]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import exp, log
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, Strict
 from scipy.special import ndtr, ndtri
@@ -121,6 +121,9 @@ class ShapeParameter:
     description: str
     canonical: Number
     prior: Prior
+    unit: ClassVar[str] = "1"
+    magnitude: ClassVar[bool] = False
+    levels: ClassVar[int] = 0
 
 
 @dataclass(frozen=True)

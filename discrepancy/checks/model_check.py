@@ -46,13 +46,13 @@ def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
     parameters follow within their priors (what they can do as well is projected out).
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    known, weights = len(problem.shared.parameter_mean), np.ones(len(problem.channel_names))
-    found = fit(problem, Candidate(), begun(problem), iterations=0, evidence=False)
+    known, weights = problem.shared.count, np.ones(len(problem.channel_names))
+    found = fit(problem, Candidate(), begun(problem), iterations=0)
     matrix = normal_equations(problem, found, Candidate(), weights).matrix
     left = np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True))[:known])
     return {
         item.name: float(value)
-        for item, value, scale in zip(model.parameters, left, problem.shared.parameter_scale, strict=True)
+        for item, value, scale in zip(model.parameters, left, problem.shared.scale[:known], strict=True)
         if scale > 0.0
     }
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 
@@ -52,6 +53,19 @@ class Term:
         """Return the patch at standard normal variables, one for each parameter."""
         return self.effect.patch(setting, self.values(normal), self.place)
 
+    def sized(
+        self, normal: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
+    ) -> FloatArray:
+        """Return standard normal variables with the magnitudes so many times as large, between ends."""
+        found = normal.copy()
+        for number, item in enumerate(self.parameters):
+            if item.magnitude:
+                value = factor * item.prior.value(float(normal[number]))
+                if item.prior.shape == "log_normal":  # it cannot change its sign
+                    value = max(value, item.prior.value(lowest))
+                found[number] = np.clip(item.prior.normal(value), lowest, highest)
+        return found
+
     def start(self) -> FloatArray:
         """Return the standard normal variables at prior medians and canonical shapes."""
         return np.array(
@@ -89,9 +103,14 @@ class Candidate:
         return any(term.free_shape for term in self.terms)
 
     @property
+    def parameters(self) -> list[EffectParameter | ShapeParameter]:
+        """Fitted parameters, in order."""
+        return [item for term in self.terms for item in term.parameters]
+
+    @property
     def size(self) -> int:
         """Number of fitted parameters."""
-        return sum(len(term.parameters) for term in self.terms)
+        return len(self.parameters)
 
     @property
     def acts_on(self) -> frozenset[TrialKind]:
@@ -103,17 +122,18 @@ class Candidate:
         owners = [term for term in self.terms for _ in term.parameters]
         return owners[index].effect.acts_on
 
-    def parts(self, normal: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the standard normal variables of each term."""
+    def parts(self, normal: FloatArray) -> list[tuple[Term, FloatArray]]:
+        """Return each term with its own of the standard normal variables (size,)."""
         ends = np.cumsum([len(term.parameters) for term in self.terms])
-        return tuple(np.split(normal, ends[:-1])) if self.terms else ()
+        return list(zip(self.terms, np.split(normal, ends[:-1]), strict=True)) if self.terms else []
+
+    def patches(self, setting: Setting, normal: FloatArray) -> list[ModelPatch]:
+        """Return the patch of each term at standard normal variables (size,)."""
+        return [term.patch(setting, part) for term, part in self.parts(normal)]
 
     def patch(self, setting: Setting, normal: FloatArray) -> ModelPatch:
         """Return the patch at standard normal variables (size,)."""
-        patch = ModelPatch()
-        for term, part in zip(self.terms, self.parts(normal), strict=True):
-            patch = patch + term.patch(setting, part)
-        return patch
+        return sum(self.patches(setting, normal), ModelPatch())
 
     def start(self) -> FloatArray:
         """Return the standard normal variables at which a fit may begin."""
@@ -125,8 +145,9 @@ class Candidate:
 
     def some(self, kept: Iterable[int], normal: FloatArray) -> tuple["Candidate", FloatArray]:
         """Return some of the effects with their standard normal variables, of those of all (size,)."""
-        chosen, parts = tuple(kept), self.parts(normal)
-        return Candidate(tuple(self.terms[k] for k in chosen)), np.concatenate([parts[k] for k in chosen])
+        parts = self.parts(normal)
+        terms, values = zip(*(parts[number] for number in kept), strict=True)
+        return Candidate(terms), np.concatenate(values)
 
 
 PARAMETER_STEP = 1e-2

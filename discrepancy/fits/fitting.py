@@ -4,6 +4,7 @@ The derivatives by what all hypotheses share change little with an effect: a fit
 fit that it extends.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
+from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 
 from .candidate import Candidate, Linearisation, Point, Remainder, State
@@ -93,7 +95,6 @@ def fit(
     *,
     known: tuple[Linearisation, ...] | None = None,
     iterations: int = 60,
-    evidence: bool = True,
     local_only: bool = False,
     give_up: float | None = None,
 ) -> CandidateFit:
@@ -111,8 +112,6 @@ def fit(
         Derivatives by shared and local unknowns that are near enough to begin with.
     iterations : int
         Largest number of steps.
-    evidence : bool
-        Whether covariance, evidence and spent degrees of freedom are wanted.
     local_only : bool
         Shared unknowns and effects stay: only the trials' own nuisances are fitted (held-out trials).
     give_up : float, optional
@@ -123,10 +122,9 @@ def fit(
     FitError
         If the model gives numbers that are not finite at the start, or none of which a curvature can be made.
     """
-    # without evidence the step needs a direction only: one side is half the work
-    descent = _Descent(problem, candidate, local_only, central=evidence)
+    descent = _Descent(problem, candidate, local_only)
     damping = 1e-3
-    state = descent.state(_bounded(start), known=known)
+    state = descent.state(_bounded(start), known)
     if not np.isfinite(state.objective):
         names = candidate.identifiers or "no effect"
         raise FitError(said("models.not_finite", names=names))
@@ -138,13 +136,7 @@ def fit(
             state, fresh = descent.state(state.point), True
             step, promised = descent.step(state, damping)
         before = promised
-        if promised < CONVERGED and fresh:
-            converged = damping < LARGEST_DAMPING  # else only short steps are left to promise little
-            break
-        if promised < CONVERGED:
-            state, fresh = descent.state(state.point), True
-            continue
-        following = descent.following(state, step, damping)
+        following = None if promised < CONVERGED else descent.following(state, step, damping)
         if following is not None:
             gain = state.objective - following.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
@@ -159,13 +151,16 @@ def fit(
                 break
         elif not fresh:
             state, fresh = descent.state(state.point), True
+        elif promised < CONVERGED:
+            converged = damping < LARGEST_DAMPING  # else only short steps are left to promise little
+            break
         else:
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e6:
                 break
-    if not fresh and evidence:
+    if not fresh:
         state = descent.state(state.point)
-    return _finished(problem, candidate, state, converged, evidence)
+    return _finished(problem, candidate, state, converged)
 
 
 def attempt(problem: Problem, candidate: Candidate, start: Point, **options: Any) -> CandidateFit | None:
@@ -185,7 +180,23 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
     ModelError
         If the structure cannot carry the effects.
     """
-    return _Descent(problem, candidate, False).state(_bounded(point), derivatives=False).objective
+    point = _bounded(point)
+    responses = [problem.answer(number, point, candidate) for number in range(len(problem.trials))]
+    return _compared(problem, point, responses)[0]
+
+
+def _compared(
+    problem: Problem, point: Point, responses: Sequence[FloatArray]
+) -> tuple[float, tuple[FloatArray, ...], FloatArray]:
+    """Return -ln posterior, residuals of each trial, and their sums of squares by channel."""
+    residuals = tuple(problem.residual(number, point, one) for number, one in enumerate(responses))
+    sums = problem.group_sums(residuals)
+    prior = 0.5 * float(problem.shared.precision @ point.shared**2)
+    prior += 0.5 * float(point.effect @ point.effect)
+    for data, u in zip(problem.trials, point.local, strict=True):
+        prior += 0.5 * float(data.unknowns.precision @ u**2)
+    value = problem.misfit(sums) + prior
+    return value if np.isfinite(value) else np.inf, residuals, sums
 
 
 @dataclass
@@ -195,32 +206,16 @@ class _Descent:
     problem: Problem
     candidate: Candidate
     local_only: bool
-    central: bool = True
     deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
 
-    def state(
-        self, point: Point, *, derivatives: bool = True, known: tuple[Linearisation, ...] | None = None
-    ) -> State:
+    def state(self, point: Point, known: tuple[Linearisation, ...] | None = None) -> State:
         """Return objective and derivatives at a point; `known` are derivatives by nuisances, near enough."""
-        problem = self.problem
-        parts: list[Linearisation] = []
-        residuals = []
-        for number in range(len(problem.trials)):
-            part = problem.linearise(
-                number, point, self.candidate, derivatives=derivatives,
-                known=None if known is None else known[number], effect_steps=self.deviation,
-                central=self.central,
-            )  # fmt: skip
-            parts.append(part)
-            residuals.append(problem.residual(number, point, part.response))
-        sums = problem.group_sums(residuals)
-        prior = 0.5 * float(problem.shared.precision @ point.shared**2)
-        prior += 0.5 * float(point.effect @ point.effect)
-        for data, u in zip(problem.trials, point.local, strict=True):
-            prior += 0.5 * float(data.unknowns.precision @ u**2)
-        objective = problem.misfit(sums) + prior
-        objective = objective if np.isfinite(objective) else np.inf
-        return State(point, objective, tuple(residuals), sums, tuple(parts))
+        parts = tuple(
+            self.problem.linearise(number, point, self.candidate, known=near, effect_steps=self.deviation)
+            for number, near in enumerate(known or [None] * len(self.problem.trials))
+        )
+        compared = _compared(self.problem, point, [part.response for part in parts])
+        return State(point, *compared, parts)
 
     def step(self, state: State, damping: float) -> tuple[Point, float]:
         """Return the step and the decrease it promises [nat], and keep the deviations of the effects."""
@@ -248,46 +243,39 @@ class _Descent:
         for share in STEP_SHARES:
             try:
                 ahead = _ahead(self.candidate, state.point, step, share)
-                proposal = self.state(ahead, derivatives=False)
-                bent = not proposal.objective < state.objective and np.isfinite(proposal.objective)
-                if bent and share == 1.0:
-                    correction, _ = self.step(self.state(ahead, known=state.linearisations), damping)
+                there = objective(self.problem, self.candidate, ahead)
+                if share == 1.0 and state.objective <= there < np.inf:
+                    correction, _ = self.step(self.state(ahead, state.linearisations), damping)
                     ahead = _ahead(self.candidate, ahead, correction)
-                    proposal = self.state(ahead, derivatives=False)
-                if proposal.objective < state.objective:
-                    return self.state(ahead, known=state.linearisations)
+                    there = objective(self.problem, self.candidate, ahead)
+                if there < state.objective:
+                    return self.state(ahead, state.linearisations)
             except DiscrepancyError:  # outside what the structure can carry: a shorter step
                 continue
         return None
 
 
-def _finished(
-    problem: Problem, candidate: Candidate, state: State, converged: bool, evidence: bool
-) -> CandidateFit:
+def _finished(problem: Problem, candidate: Candidate, state: State, converged: bool) -> CandidateFit:
     size = problem.shared.size + candidate.size
-    covariance, log_evidence = np.zeros((size, size)), -state.objective
-    spent = np.zeros(len(problem.channel_names))
-    if evidence:
-        equations = normal_equations(problem, state, candidate, problem.precisions(state.sums))
-        factor = upper_factor(equations.matrix)
-        whole = solved(factor, np.eye(len(factor)))
-        covariance = whole[:size, :size]
-        log_evidence -= float(np.log(np.diag(factor)).sum())
-        for data, (item, place) in zip(problem.trials, equations.trials, strict=True):
-            leverage = ((whole[np.ix_(place, place)] @ item.rows) * item.rows).sum(axis=0)
-            np.add.at(spent, data.groups, leverage.reshape(data.weight.shape).sum(axis=0))
+    equations = normal_equations(problem, state, candidate, problem.precisions(state.sums))
+    factor = upper_factor(equations.matrix)
+    whole, spent = solved(factor, np.eye(len(factor))), np.zeros(len(problem.channel_names))
+    for data, (item, place) in zip(problem.trials, equations.trials, strict=True):
+        leverage = ((whole[np.ix_(place, place)] @ item.rows) * item.rows).sum(axis=0)
+        np.add.at(spent, data.groups, leverage.reshape(data.weight.shape).sum(axis=0))
     return CandidateFit(
-        **vars(state), candidate=candidate, log_evidence=log_evidence, covariance=covariance, spent=spent,
-        converged=converged,
+        **vars(state), candidate=candidate, covariance=whole[:size, :size], spent=spent, converged=converged,
+        log_evidence=-state.objective - float(np.log(np.diag(factor)).sum()),
     )  # fmt: skip
 
 
 def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
     """Return the point a share of a step ahead."""
-    parameters = [item for term in candidate.terms for item in term.parameters]
     effect = [
-        item.prior.stepped(u, du) if getattr(item, "magnitude", False) else u + du
-        for item, u, du in zip(parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True)
+        item.prior.stepped(u, du) if item.magnitude else u + du
+        for item, u, du in zip(
+            candidate.parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True
+        )
     ]
     return _bounded(
         replace(
@@ -301,3 +289,71 @@ def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) 
 
 def _bounded(point: Point) -> Point:
     return replace(point, effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))
+
+
+def free_shape(
+    problem: Problem, named: CandidateFit, number: int, give_up: float | None = None
+) -> CandidateFit | None:
+    """Fit the family of one effect of a fit: its shape free, from the canonical one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the fit.
+    named : CandidateFit
+        With canonical shapes.
+    number : int
+        Of the effect among its terms.
+    give_up : float, optional
+        See `fit`.
+
+    Returns
+    -------
+    CandidateFit or None
+        None where no shape is to free, or the structure cannot follow.
+    """
+    parts = named.candidate.parts(named.effect)
+    term, values = parts[number]
+    if not term.effect.shape:
+        return None
+    canonical = [item.prior.normal(item.canonical) for item in term.effect.shape]
+    parts[number] = replace(term, free_shape=True), np.append(values, canonical)
+    terms, begin = zip(*parts, strict=True)
+    start = replace(named.point, effect=np.concatenate(begin))
+    return attempt(problem, Candidate(terms), start, give_up=give_up)
+
+
+def is_box(candidate: Candidate) -> bool:
+    """Whether an effect has more than one parameter that is no mere size, as a place and a length.
+
+    Its edges pass sensors and lines of the mesh, and optima on either side may fit within the noise.
+    """
+    return any(sum(not item.magnitude for item in term.parameters) > 1 for term in candidate.terms)
+
+
+def around(problem: Problem, found: CandidateFit) -> CandidateFit:
+    """Return the best fit of the same candidate beside an optimum, or the fit itself.
+
+    Hysteresis of several elements has many local optima along the direction that the data tell least of, and
+    a place has them at each sensor that it passes.
+    """
+    options, size = {"iterations": SEARCH.neighbour_iterations}, found.candidate.size
+    free = [number for number, item in enumerate(found.candidate.parameters) if not item.magnitude]
+    for _ in range(SEARCH.rounds):
+        moves = [step * axis for axis in np.eye(size)[free] for step in SEARCH.place_steps]
+        if size > 1:
+            _, directions = np.linalg.eigh(found.effect_covariance)
+            moves += [step * directions[:, -1] for step in SEARCH.ridge_steps]
+        better = found
+        for move in moves:
+            start = replace(found.point, effect=found.effect + move)
+            again = attempt(problem, found.candidate, start, give_up=better.objective, **options)
+            if again is None or again.log_evidence <= better.log_evidence + SEARCH.neighbour_gain:
+                continue
+            if not again.converged:  # along a bent valley one far better may have run out of steps
+                again = attempt(problem, again.candidate, again.point, **options) or again
+            better = again
+        if better is found:
+            break
+        found = better
+    return found

@@ -6,9 +6,7 @@ from scipy.stats import chi2
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.verdict import Gate
-from fe.runtime.patch import ModelPatch
 
-from .candidate import Candidate
 from .fitting import CandidateFit
 from .problem import Problem
 
@@ -83,19 +81,17 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
     slips at nothing is a soft one. An effect's size may be what it will. Conservative: estimates scatter less
     than the prior.
     """
-    count = len(problem.shared.parameter_mean)
-    proper = problem.shared.gain_precision > 0.0
+    count = problem.shared.count
+    proper = problem.shared.precision[count:] > 0.0
     groups = {
         "calibrated parameters beside their priors": fit.point.shared[:count],
         "gains beside their priors": fit.point.shared[count:][proper],
     }
     tests = [(name, float(chi2.sf(u @ u, u.size))) for name, u in groups.items() if u.size]
-    for term, part in zip(fit.candidate.terms, fit.candidate.parts(fit.point.effect), strict=True):
-        count = len(term.effect.parameters)
-        forms = zip(term.effect.parameters, part[:count].tolist(), strict=True)
+    for term, part in fit.candidate.parts(fit.effect):
         tests += [
             (f"{item.name} of {term.effect.identifier} beside its prior", float(chi2.sf(u**2, 1)))
-            for item, u in forms
+            for item, u in zip(term.effect.parameters, part.tolist(), strict=False)
             if not item.magnitude and item.prior.shape != "uniform"  # whose ends are no less likely
         ]
     return tests
@@ -140,9 +136,7 @@ def solver_share(problem: Problem, fit: CandidateFit) -> float:
     for number, data in enumerate(problem.trials):
         if not data.trial.is_dynamic:
             continue
-        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
-        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
-        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, finer=2)
+        finer = problem.answer(number, fit.point, fit.candidate, finer=2)
         change = (finer - fit.responses[number]) / data.deviation
         largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
     return largest

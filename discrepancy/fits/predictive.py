@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -37,7 +36,7 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     fitted = _predicted(problem, found, found, sensitivities=sensitivities)
     if problem.campaign.held_out:
         there, adapted = held_out_fit(problem, found)
-        fitted += _predicted(there, found, adapted, held_out=True)
+        fitted += _predicted(there, found, adapted)
     trials = {item.trial.name: item for item in fitted}
     return ResidualSet(
         problem.campaign.channels,
@@ -45,20 +44,15 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     )
 
 
-def held_out_fit(problem: Problem, found: CandidateFit, **options: Any) -> tuple[Problem, CandidateFit]:
+def held_out_fit(problem: Problem, found: CandidateFit) -> tuple[Problem, CandidateFit]:
     """Return the trials that are held out, and a fit with their own nuisances; what is shared stays."""
     there = problem.with_trials(problem.campaign.held_out)
     start = replace(there.start(found.candidate), shared=found.point.shared, effect=found.point.effect)
-    return there, fit(there, found.candidate, start, local_only=True, **options)
+    return there, fit(there, found.candidate, start, local_only=True)
 
 
 def _predicted(
-    problem: Problem,
-    found: CandidateFit,
-    adapted: CandidateFit,
-    *,
-    sensitivities: bool = False,
-    held_out: bool = False,
+    problem: Problem, found: CandidateFit, adapted: CandidateFit, *, sensitivities: bool = False
 ) -> list[FittedTrial]:
     """Return trials beside their predictions, by what was found and its nuisances as adapted to them."""
     root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
@@ -74,7 +68,7 @@ def _predicted(
         follow = (shared - along.T @ local).T @ root[item.index]
         taken, carried = np.einsum("kn,kn->n", own, own), np.einsum("nk,nk->n", follow, follow)
         shape = adapted.residuals[number].shape
-        if held_out:
+        if adapted is not found:
             leverage = np.maximum(counted * carried - taken, -1.0 + 1e-9)
             variance = 1.0 + np.maximum(carried - taken, -1.0 + 1e-9).reshape(shape)
         else:

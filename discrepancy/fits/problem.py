@@ -24,15 +24,12 @@ from fe.runtime.patch import ModelPatch
 from reporting.memory import Memory
 
 from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, moved
-from .trial_data import GlobalUnknowns, TrialData, global_unknowns, stand_in
+from .trial_data import TrialData, global_unknowns, stand_in
 
 KEPT = 2000
 """Responses that a problem keeps."""
 QUIETEST = 1e-12
 """Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
-
-
-_NOTHING = np.empty((0, 0, 0))
 
 
 def misfits(freedom: FloatArray, counts: FloatArray, sums: FloatArray) -> FloatArray:
@@ -60,47 +57,36 @@ class Problem:
         The model as it is.
     setting : Setting
         Scales for the catalogue.
-    trials : tuple of Trial, optional
-        Those to compare; the fitted ones if left out.
-    like : Problem, optional
-        Noise models and global unknowns are taken from it (for held-out trials).
+
+    Raises
+    ------
+    CampaignDataError
+        If all trials are held out.
     """
 
-    def __init__(
-        self,
-        campaign: Campaign,
-        model: Model,
-        setting: Setting,
-        trials: tuple[Trial, ...] | None = None,
-        like: "Problem | None" = None,
-    ) -> None:
-        self.campaign, self.setting = campaign, setting
-        self.model = model.remembering()
-        chosen = campaign.fitted if trials is None else trials
-        if not chosen:
+    def __init__(self, campaign: Campaign, model: Model, setting: Setting) -> None:
+        if not campaign.fitted:
             raise CampaignDataError(said("campaign.all_held_out", campaign=campaign))
+        self.campaign, self.setting, self.model = campaign, setting, model.remembering()
         self.channel_names = tuple(campaign.channels)
-        self.refinement: int = 1 if like is None else like.refinement
+        self.refinement = 1
         self.noise: dict[str, NoiseModel] = {
-            name: noise_model(channel, stand_in(campaign, name)) if like is None else like.noise[name]
+            name: noise_model(channel, stand_in(campaign, name))
             for name, channel in campaign.channels.items()
         }
-        self.trials = tuple(TrialData.of(campaign, trial, self.noise, model) for trial in chosen)
-        counts = np.zeros(len(self.channel_names))
+        self.freedom = np.array([item.degrees_of_freedom for item in self.noise.values()])
+        self.refusals: dict[str, str] = {}
+        self._take(campaign.fitted)
+        self.shared = global_unknowns(campaign, model, campaign.fitted, {})
+        self.shared = global_unknowns(campaign, model, campaign.fitted, self._unit_responses())
+
+    def _take(self, trials: Sequence[Trial]) -> None:
+        """Make trials ready to be compared."""
+        self.trials = tuple(TrialData.of(self.campaign, trial, self.noise, self.model) for trial in trials)
+        self.counts = np.zeros(len(self.channel_names))
         for data in self.trials:
-            np.add.at(counts, data.groups, data.weight.sum(axis=0))
-        self.counts = counts
-        self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
+            np.add.at(self.counts, data.groups, data.weight.sum(axis=0))
         self._responses = Memory(KEPT)
-        self.refusals: dict[str, str] = {} if like is None else like.refusals
-        self.shared: GlobalUnknowns
-        if like is not None:
-            self.shared = like.shared
-        else:
-            self.shared = global_unknowns(campaign, model, chosen, {})
-            ratios = self._unit_responses()
-            if ratios:
-                self.shared = global_unknowns(campaign, model, chosen, ratios)
 
     def refused(self, candidate: Candidate, cause: DiscrepancyError) -> None:
         """Keep why an effect could not be evaluated or fitted alone; of several, any may be to blame."""
@@ -154,6 +140,12 @@ class Problem:
 
         return self._responses.get((number, patch.primitives, conditions.key), answer)
 
+    def answer(self, number: int, point: Point, candidate: Candidate, finer: int = 1) -> FloatArray:
+        """Return the response (N, C) of a trial beside the effects of a candidate, as `response` does."""
+        acts = self.trials[number].trial.kind in candidate.acts_on
+        patch = candidate.patch(self.setting, point.effect) if acts else ModelPatch()
+        return self.response(number, point.shared, point.local[number], patch, finer)[0]
+
     def prediction(self, number: int, point: Point, response: FloatArray) -> FloatArray:
         """Return the prediction (N, C) with gains and zeros."""
         data = self.trials[number]
@@ -174,10 +166,8 @@ class Problem:
         point: Point,
         candidate: Candidate,
         *,
-        derivatives: bool = True,
         known: Linearisation | None = None,
         effect_steps: FloatArray | None = None,
-        central: bool = True,
     ) -> Linearisation:
         """Return response and derivatives of a trial.
 
@@ -189,16 +179,12 @@ class Problem:
             Where.
         candidate : Candidate
             Effects that act.
-        derivatives : bool
-            False: the response only.
         known : Linearisation, optional
             Derivatives by shared and local unknowns that are near enough.
         effect_steps : (E,) ndarray, optional
             Deviations of the effect parameters. Differences over one of them, at most a hundredth of the
             prior's, average over the kinks of friction and hysteresis and do not reach beyond where the
             parameters may lie.
-        central : bool
-            Whether derivatives by effect parameters are central differences.
 
         Notes
         -----
@@ -206,37 +192,28 @@ class Problem:
         ten-thousandth where the effect moves frequencies. The curvature in a one-sided difference is more
         than that, and would count as information.
         """
-        data = self.trials[number]
-        kind = data.trial.kind
-        patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
-        shared, local = point.shared, point.local[number]
-        response, _ = self.response(number, shared, local, patch)
+        kind, response = self.trials[number].trial.kind, self.answer(number, point, candidate)
         if known is not None:
             parameters, by_local = known.parameters, known.local
-        elif derivatives:
-            parameters, by_local = self._by_nuisances(number, shared, local, patch)
-        if not derivatives:
-            return Linearisation(response, _NOTHING, _NOTHING, _NOTHING)
+        else:
+            parameters, by_local = self._by_nuisances(number, point, candidate)
         effect = np.zeros((candidate.size, *response.shape))
         steps = np.full(candidate.size, PARAMETER_STEP)
         if effect_steps is not None:
             steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
-        for k in range(candidate.size):
+        for k, step in enumerate(steps.tolist()):
             if kind in candidate.acting(k):
-                ends = []
-                for side in (1.0, -1.0) if central else (1.0,):
-                    patched = candidate.patch(self.setting, moved(point.effect, k, side * steps[k]))
-                    ends.append(self.response(number, shared, local, patched)[0])
-                other, width = (ends[1], 2.0) if central else (response, 1.0)
-                effect[k] = (ends[0] - other) / (width * steps[k])
+                ends = [replace(point, effect=moved(point.effect, k, side * step)) for side in (1.0, -1.0)]
+                above, below = (self.answer(number, end, candidate) for end in ends)
+                effect[k] = (above - below) / (2.0 * step)
         return Linearisation(response, parameters, by_local, effect)
 
-    def _by_nuisances(
-        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch
-    ) -> tuple[FloatArray, FloatArray]:
+    def _by_nuisances(self, number: int, point: Point, candidate: Candidate) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives by the calibrated parameters and by the trial's own unknowns but zeros."""
+        data, shared, local = self.trials[number], point.shared, point.local[number]
+        acts = data.trial.kind in candidate.acts_on
+        patch = candidate.patch(self.setting, point.effect) if acts else ModelPatch()
         response, rates = self.response(number, shared, local, patch)
-        data = self.trials[number]
         unknowns = data.unknowns
         first, _, last, at = unknowns.ends
 
@@ -244,8 +221,7 @@ class Problem:
             return (self.response(number, by_shared, by_local, patch)[0] - response) / step
 
         parameters = [
-            slope(moved(shared, k, SHARED_STEP), local, SHARED_STEP)
-            for k in range(len(self.shared.parameter_mean))
+            slope(moved(shared, k, SHARED_STEP), local, SHARED_STEP) for k in range(self.shared.count)
         ]
         columns = [slope(shared, moved(local, k)) for k in range(first, last)]
         if unknowns.has_time_zero:
@@ -294,10 +270,11 @@ class Problem:
         shape = parts.response.shape
         zeros, of_gains = np.zeros((unknowns.zeros, *shape)), np.zeros((len(known), *shape))
         zeros[np.arange(len(zeros)), :, unknowns.zero_columns] = unknowns.scale[: len(zeros), np.newaxis]
-        of_gains[np.arange(len(known)), :, column] = (parts.response[:, column] * shared.gain_scale[known]).T
+        of_gains[np.arange(len(known)), :, column] = (
+            parts.response[:, column] * shared.scale[shared.count + known]
+        ).T
         found = (zeros, parts.local * gains, parts.parameters * gains, of_gains, parts.effect[acting] * gains)
-        count = len(parts.parameters)
-        index = np.concatenate((np.arange(count), count + known, shared.size + acting))
+        index = np.concatenate((np.arange(shared.count), shared.count + known, shared.size + acting))
         return np.concatenate(found), index
 
     # -------------------------------------------------------------------------- likelihood
@@ -321,9 +298,13 @@ class Problem:
             weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + left))
         return np.where(n > 0, weights, 1.0)
 
-    def with_trials(self, trials: tuple[Trial, ...]) -> "Problem":
-        """Return the same problem on other trials, with the same noise and global unknowns."""
-        return Problem(self.campaign, self.model, self.setting, trials, like=self)
+    def with_trials(self, trials: Sequence[Trial], model: Model | None = None) -> "Problem":
+        """Return the problem of other trials and another model, with the same noise and global unknowns."""
+        other = copy(self)
+        if model is not None:
+            other.model = model.remembering()
+        other._take(trials)
+        return other
 
     def widened(self, factors: FloatArray) -> "Problem":
         """Return the problem with noise so many times (channels,) as wide in trials in motion, and known.

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from math import sqrt
-from typing import TypeGuard
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -62,15 +61,18 @@ class Change:
     @property
     def gain(self) -> float:
         """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
-        if self.fits < 0.0 and not self.may_turn:
-            return 0.0
-        return 0.5 * self.fits * self.scale
+        return 0.5 * self.fits * self.scale if self.fits > 0.0 or self.may_turn else 0.0
 
     @property
     def may_turn(self) -> bool:
         """Whether its scale may be negative."""
-        sizes = [item.prior.shape for item in self.term.parameters if is_magnitude(item)]
+        sizes = [item.prior.shape for item in self.term.parameters if item.magnitude]
         return not sizes or any(shape != "log_normal" for shape in sizes)
+
+    @property
+    def best(self) -> FloatArray:
+        """The scaled parameters (E,) at which the magnitude is that of the best scale."""
+        return self.term.sized(self.start, self.scale, -0.7 * LARGEST_EFFECT, SEARCH.largest_start)
 
 
 class Screen:
@@ -163,11 +165,7 @@ class Screen:
         factor = sqrt(SEARCH.first_order / whole) if whole > 0.0 else 1.0
         if factor >= 1.0:
             return change, 1.0
-        start = change.start.copy()
-        for number, item in enumerate(change.term.parameters):
-            if is_magnitude(item):
-                start[number] = item.prior.normal(factor * item.prior.value(float(start[number])))
-        return self.change(change.term, start), factor
+        return self.change(change.term, change.term.sized(change.start, factor)), factor
 
     def _peaks(self, term: Term) -> tuple[float, ...]:
         """Return peaks of the residuals' mean spectrum at a term's channel, over the first frequency."""
@@ -227,10 +225,10 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
     """
     axes: list[tuple[float, ...]] = []
     scaled = False
-    count = sum(1 for item in term.parameters if not is_magnitude(item))
+    count = sum(not item.magnitude for item in term.parameters)
     levels = SEARCH.levels[count] if count < len(SEARCH.levels) else SEARCH.levels_of_many
     for item in term.parameters:
-        if is_magnitude(item):
+        if item.magnitude:
             signed = item.prior.value(0.0) == 0.0
             if item.levels and not scaled:
                 axes.append(_spread_levels(item))
@@ -242,7 +240,7 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
                 scaled = True
         elif item.name == term.effect.spectral and peaks:
             axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
-        elif isinstance(item, EffectParameter) and item.levels:
+        elif item.levels:
             axes.append(_spread_levels(item))
         elif item in term.effect.shape:
             axes.append((item.prior.normal(item.canonical),))
@@ -252,26 +250,6 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
         yield np.array(values)
 
 
-def _spread_levels(item: EffectParameter) -> tuple[float, ...]:
+def _spread_levels(item: EffectParameter | ShapeParameter) -> tuple[float, ...]:
     """Return the scaled values of a parameter that asks for so many, evenly over its prior."""
     return tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels))
-
-
-def is_magnitude(item: EffectParameter | ShapeParameter) -> TypeGuard[EffectParameter]:
-    """Whether an effect vanishes with a parameter."""
-    return isinstance(item, EffectParameter) and item.magnitude
-
-
-def rescaled(change: Change) -> FloatArray:
-    """Return the scaled parameters at which the magnitude is that of the best scale."""
-    start = change.start.copy()
-    factor = change.scale
-    for number, item in enumerate(change.term.parameters):
-        if not is_magnitude(item):
-            continue
-        prior = item.prior
-        value = prior.value(float(start[number])) * factor
-        if prior.shape == "log_normal":  # it cannot change its sign
-            value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
-        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, SEARCH.largest_start)
-    return start

@@ -28,50 +28,47 @@ a flight is, would stop fits: half of the readings of a healthy wing pull below 
 
 @dataclass(frozen=True)
 class GlobalUnknowns:
-    """Layout of the global unknowns.
+    """Layout of the global unknowns: calibrated parameters, then gains of channels.
 
     Attributes
     ----------
-    parameter_mean, parameter_scale, parameter_low, parameter_high : (P,) ndarray
-        Of the calibrated parameters.
+    centre, scale, precision : (Q,) ndarray
+        Prior means (of gains their errors), deviations, and precisions of the scaled variables: 1, or 0 for a
+        flat prior.
+    low, high : (P,) ndarray
+        Ranges of the calibrated parameters.
     gain_channels : tuple of str
         Channels whose gain is unknown.
-    gain_centre, gain_scale, gain_precision : (G,) ndarray
-        Their gain errors; precision 1, or 0 for a flat prior.
     fixed_gain : dict of str to float
         Gain errors of signals that define the scale of the release amplitudes, which are not fitted.
     """
 
-    parameter_mean: FloatArray
-    parameter_scale: FloatArray
-    parameter_low: FloatArray
-    parameter_high: FloatArray
+    centre: FloatArray
+    scale: FloatArray
+    precision: FloatArray
+    low: FloatArray
+    high: FloatArray
     gain_channels: tuple[str, ...]
-    gain_centre: FloatArray
-    gain_scale: FloatArray
-    gain_precision: FloatArray
     fixed_gain: dict[str, float]
 
     @property
     def size(self) -> int:
         """Number of global unknowns."""
-        return len(self.parameter_mean) + len(self.gain_channels)
+        return len(self.scale)
 
     @property
-    def precision(self) -> FloatArray:
-        """Prior precision of each scaled variable."""
-        return np.concatenate((np.ones_like(self.parameter_mean), self.gain_precision))
+    def count(self) -> int:
+        """Number P of calibrated parameters."""
+        return len(self.low)
 
     def parameters(self, u: FloatArray) -> FloatArray:
         """Return the calibrated parameters, kept within the range of the model."""
-        values = self.parameter_mean + self.parameter_scale * u[: len(self.parameter_mean)]
-        return np.clip(values, self.parameter_low, self.parameter_high)
+        return np.clip((self.centre + self.scale * u)[: self.count], self.low, self.high)
 
     def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
         """Return the gain errors (C,) of channels."""
-        found = dict(self.fixed_gain)
-        values = self.gain_centre + self.gain_scale * u[len(self.parameter_mean) :]
-        found.update(zip(self.gain_channels, values, strict=True))
+        values = (self.centre + self.scale * u)[self.count :]
+        found = self.fixed_gain | dict(zip(self.gain_channels, values, strict=True))
         return np.array([found.get(name, 0.0) for name in channels])
 
 
@@ -159,26 +156,25 @@ def global_unknowns(
         For signals of unknown scale: data over model, as a first estimate of 1 + gain.
     """
     prior = [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in model.parameters]
+    rows = [(mean, deviation, 1.0) for mean, deviation in prior]  # centre, scale, precision
     used = {name for trial in trials for name in trial.channels}
-    gains: list[tuple[str, float, float, float]] = []  # channel, centre, scale, precision
+    names: list[str] = []
     fixed: dict[str, float] = {}
     for name, channel in campaign.channels.items():
-        if name not in used:
+        estimate = unit_responses.get(name, 1.0) - 1.0
+        free = isinf(channel.gain_deviation)
+        if name not in used or channel.gain_deviation == 0.0:
             continue
-        if isinf(channel.gain_deviation):
-            estimate = unit_responses.get(name, 1.0) - 1.0
-            if channel.quantity is Quantity.SIGNAL and not fixed:
-                fixed[name] = estimate  # it defines the scale of the release amplitudes
-                continue
-            gains.append((name, estimate, max(abs(1.0 + estimate), 1e-12), 0.0))
-        elif channel.gain_deviation > 0.0:
-            gains.append((name, 0.0, channel.gain_deviation, 1.0))
-    means, deviations = np.array(prior, dtype=np.float64).reshape(-1, 2).T
+        if free and channel.quantity is Quantity.SIGNAL and not fixed:
+            fixed[name] = estimate  # it defines the scale of the release amplitudes
+            continue
+        names.append(name)
+        flat = (estimate, max(abs(1.0 + estimate), 1e-12), 0.0)
+        rows.append(flat if free else (0.0, channel.gain_deviation, 1.0))
+    centre, scale, precision = np.array(rows, dtype=np.float64).reshape(-1, 3).T
     ranges = np.array([(item.low, item.high) for item in model.parameters], dtype=np.float64)
-    centre, scale, precision = np.array([item[1:] for item in gains], dtype=np.float64).reshape(-1, 3).T
-    names = tuple(name for name, *_ in gains)
     low, high = ranges.reshape(-1, 2).T
-    return GlobalUnknowns(means, deviations, low, high, names, centre, scale, precision, fixed)
+    return GlobalUnknowns(centre, scale, precision, low, high, tuple(names), fixed)
 
 
 def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, model: Model) -> LocalUnknowns:

@@ -5,6 +5,7 @@ A gain of half a thousandth is a nuisance of instruments, not a cause.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import isnan, nan
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
-from fe.runtime.patch import Clock, LoadGain, Primitive, SensorGain
+from fe.runtime.patch import Clock, LoadGain, ModelPatch, SensorGain
 from reporting.words import listing
 
 Hypothetic = CandidateFit | Explained
@@ -45,25 +46,28 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What every verdict on a search says alike."""
+    """What every verdict on a search says alike: hypotheses with their probabilities, as they are told."""
 
     found: Search
     log_bayes_factor: float
-    hypotheses: tuple[Hypothesis, ...]
-    inclusion: dict[str, float]
+    rows: Sequence[tuple[Hypothetic, float]]
 
     @classmethod
     def of(
         cls, found: Search, best: CandidateFit, probabilities: Mapping[tuple[str, ...], float]
     ) -> "Conclusion":
-        """Return what is said of the hypotheses of a search, the best of them given."""
-        problem = found.problem
-        places = sum(np.log(len(term.effect.places(problem.setting))) for term in best.candidate.terms)
+        """Return what is said of the sets of effects of a search, the best of them given."""
+        setting = found.problem.setting
+        places = sum(np.log(len(term.effect.places(setting))) for term in best.candidate.terms)
         rows = [(found.best_of(names), probability) for names, probability in probabilities.items()]
-        told = tuple(hypothesis(problem, item, p) for item, p in rows)
-        names = [effect.identifier for effect in found.effects]
-        factor = best.log_evidence - places - found.nothing.log_evidence
-        return cls(found, float(factor), told, inclusion(rows, names))
+        return cls(found, float(best.log_evidence - places - found.nothing.log_evidence), rows)
+
+    @cached_property
+    def inclusion(self) -> dict[str, float]:
+        """The probability that each effect takes part."""
+        held = [(set(plain_names(item.candidate.identifiers)), p) for item, p in self.rows]
+        names = (effect.identifier for effect in self.found.effects)
+        return {name: sum(probability for own, probability in held if name in own) for name in names}
 
     def outcome(
         self,
@@ -74,8 +78,16 @@ class Conclusion:
         **more: Any,
     ) -> Outcome:
         """Return a verdict with the fit that stands for it: that without effect if none is given."""
-        alike = {"hypotheses": self.hypotheses, "inclusion": self.inclusion}
-        verdict = Verdict(kind, sentence, probability, self.log_bayes_factor, **alike, **more)  # type: ignore[arg-type]
+        told = tuple(hypothesis(self.found.problem, item, p) for item, p in self.rows)
+        verdict = Verdict(
+            kind,
+            sentence,
+            probability,
+            self.log_bayes_factor,
+            hypotheses=told,
+            inclusion=self.inclusion,
+            **more,
+        )
         return Outcome(verdict, self.found, self.found.none if fit is None else fit)
 
     def named(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...], **more: Any) -> Outcome:
@@ -102,12 +114,6 @@ def plain_names(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name.removesuffix(FREE_SHAPE) for name in names)
 
 
-def inclusion(rows: Sequence[tuple[Hypothetic, float]], names: Iterable[str]) -> dict[str, float]:
-    """Return the probability that each effect takes part, from hypotheses with theirs."""
-    held = [(set(plain_names(item.candidate.identifiers)), probability) for item, probability in rows]
-    return {name: sum(probability for own, probability in held if name in own) for name in names}
-
-
 def hypothesis(problem: Problem, item: Hypothetic, probability: float) -> Hypothesis:
     """Return the record of a hypothesis; along the missing force no readings are compared."""
     effects, parameters = named_effects(problem, item), calibrated_parameters(problem, item)
@@ -131,7 +137,7 @@ def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...
         low, high = np.minimum(ends[0], found.effect), np.maximum(ends[1], found.effect)
     bounds = iter(zip(low, high, strict=True))
     named = []
-    for term, part in zip(found.candidate.terms, found.candidate.parts(found.effect), strict=True):
+    for term, part in found.candidate.parts(found.effect):
         rows = [_estimate(item, u, *next(bounds)) for item, u in zip(term.parameters, part, strict=True)]
         effect, count = term.effect, len(term.effect.parameters)
         patch = term.patch(problem.setting, part)
@@ -143,14 +149,15 @@ def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...
 def _estimate(item: EffectParameter | ShapeParameter, *scaled: float) -> Estimate:
     """Return an estimate at a scaled value and the ends of its interval."""
     value, *ends = (item.prior.value(float(u)) for u in scaled)
-    return Estimate(item.name, value, min(ends), max(ends), getattr(item, "unit", "1"), item.description)
+    return Estimate(item.name, value, min(ends), max(ends), item.unit, item.description)
 
 
 def calibrated_parameters(problem: Problem, found: Hypothetic) -> tuple[CalibratedParameter, ...]:
     """Return the calibrated parameters of the model as a hypothesis has them, within the model's range."""
     layout = problem.shared
     values = layout.parameters(found.shared)
-    spread = layout.parameter_scale * np.sqrt(np.maximum(np.diag(found.covariance)[: len(values)], 0.0))
+    variance = np.diag(found.covariance)[: layout.count]
+    spread = layout.scale[: layout.count] * np.sqrt(np.maximum(variance, 0.0))
     return tuple(
         CalibratedParameter(item.name, float(value), float(deviation), item.unit)
         for item, value, deviation in zip(problem.model.parameters, values, spread, strict=True)
@@ -196,38 +203,24 @@ def is_one_driven_channel(problem: Problem) -> bool:
     return driven and len(problem.channel_names) == 1
 
 
-def small_terms(
-    problem: Problem, found: CandidateFit, *, unstated: float = LEAST_SIZE
-) -> tuple[float | None, ...]:
-    """Return for each effect of a fit its size over what it acts on where that is too small, else None.
+def is_small(problem: Problem, patch: ModelPatch, *, unstated: float = LEAST_SIZE) -> bool:
+    """Whether a patch is errors of instruments only, too small over what they act on to be a name.
 
     `unstated`: the least size of a gain of a channel of which no deviation is stated.
     """
-    sizes: list[float | None] = []
-    for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
-        patch = term.patch(problem.setting, part)
-        known = [_size(problem, item) for item in patch]
-        largest = max((size for size in known if size is not None), default=None)
-        least = max((_least(problem, item, unstated) for item in patch), default=LEAST_SIZE)
-        small = largest is not None and None not in known and largest < least
-        sizes.append(largest if small else None)
-    return tuple(sizes)
-
-
-def _least(problem: Problem, item: Primitive, unstated: float) -> float:
-    """Return the size from which an error of an instrument may be a name."""
-    if not isinstance(item, SensorGain) or item.channel not in problem.campaign.channels:
-        return LEAST_SIZE
-    return unstated if problem.campaign.channels[item.channel].gain_deviation == 0.0 else LEAST_SIZE
-
-
-def _size(problem: Problem, item: Primitive) -> float | None:
-    """Return the size of an error of an instrument over what it acts on, None of anything else."""
-    scales = problem.setting.scales
-    if isinstance(item, LoadGain):
-        return max(abs(item.gain), abs(item.tare) / scales.force if scales.force > 0.0 else 0.0)
-    if isinstance(item, SensorGain):
-        return abs(item.gain)
-    if isinstance(item, Clock):
-        return max(abs(item.rate), abs(item.zero) * scales.angular_frequency)
-    return None
+    channels, scales = problem.campaign.channels, problem.setting.scales
+    sizes = []
+    for item in patch:
+        least = LEAST_SIZE
+        if isinstance(item, LoadGain):
+            size = max(abs(item.gain), abs(item.tare) / scales.force if scales.force > 0.0 else 0.0)
+        elif isinstance(item, SensorGain):
+            size = abs(item.gain)
+            if item.channel in channels and channels[item.channel].gain_deviation == 0.0:
+                least = unstated
+        elif isinstance(item, Clock):
+            size = max(abs(item.rate), abs(item.zero) * scales.angular_frequency)
+        else:
+            return False
+        sizes.append(size / least)
+    return max(sizes, default=1.0) < 1.0

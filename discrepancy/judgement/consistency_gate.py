@@ -13,7 +13,7 @@ Q = sum (u_t - mean)^2 h_t is chi^2 with one degree of freedom less than trials 
 (Controlled Clinical Trials 7, 177-188).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isinf
 
@@ -25,7 +25,7 @@ from discrepancy.fits.candidate import Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.normal_equations import trial_rows
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Screen, is_magnitude
+from discrepancy.fits.screening import Screen
 from discrepancy.fits.trial_data import TrialData
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
@@ -118,47 +118,35 @@ def score_tests(
     list of ScoreTest
         Of the groups of which a direction is left and whose channels have enough readings.
     """
-    directions = [item for group in groups.values() for item in group.values()]
-    if not directions:
-        return []
     # effect parameters that the data determine follow without their prior: that they are unlikely says
     # nothing of what they leave
     determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
     screen = Screen(problem, fit, record_noise=False, effect_precision=np.where(determined, 0.0, 1.0))
-    standardised = [
-        {number: problem.trials[number].standardised(column) for number, column in item.items()}
-        for item in directions
-    ]
-    changes, fits, _ = zip(*(screen.projected(item) for item in standardised), strict=True)
-    rows_of, sign = np.array(changes), screen.sign
-    gradient, information = np.array(fits), (rows_of * sign) @ rows_of.T
-    whole = (rows_of[:, sign > 0.0] ** 2).sum(axis=1)
-    tests = []
-    at = 0
+    sign, tests = screen.sign, []
     for name, group in groups.items():
-        rows = np.arange(at, at + len(group))
-        at += len(group)
-        rows = rows[whole[rows] > 0.0]
-        if not len(rows):
+        labels, vectors, slopes = [], [], []
+        for label, direction in group.items():
+            changes = {number: problem.trials[number].standardised(c) for number, c in direction.items()}
+            vector, slope, _ = screen.projected(changes)
+            size = float(np.linalg.norm(vector[sign > 0.0]))
+            if size > 0.0:
+                labels.append(label)
+                vectors.append(vector / size)
+                slopes.append(slope / size)
+        if not labels:
             continue
-        size = np.sqrt(whole[rows])
-        values, vectors = np.linalg.eigh(information[np.ix_(rows, rows)] / np.outer(size, size))
+        gradient, information = np.array(slopes), (np.array(vectors) * sign) @ np.array(vectors).T
+        values, modes = np.linalg.eigh(information)
         kept = values > SEPARATE
-        along = vectors.T @ (gradient[rows] / size)
-        statistic, count = float(np.sum(along[kept] ** 2 / values[kept])), int(kept.sum())
-        freedom, share = _freedom(problem, fit, list(group.values()))
+        count, statistic = int(kept.sum()), float(np.sum((modes.T @ gradient)[kept] ** 2 / values[kept]))
+        freedom, share = _freedom(problem, fit, group.values())
         if not count or freedom - count < LEAST_FREEDOM:
             continue
-        own = np.diag(information)[rows]
-        alone = np.abs(gradient[rows]) / np.sqrt(np.where(own > SEPARATE * size**2, own, np.inf))
-        labels = list(group)
+        own = np.diag(information)
+        alone = np.abs(gradient) / np.sqrt(np.where(own > SEPARATE, own, np.inf))
         most = int(np.argmax(alone))
-        tests.append(
-            ScoreTest(
-                name, statistic, count, _p_value(statistic, count, freedom, share),
-                f"{labels[rows[most] - (at - len(group))]} ({alone[most]:.1f} deviations)",
-            )
-        )  # fmt: skip
+        strongest = f"{labels[most]} ({alone[most]:.1f} deviations)"
+        tests.append(ScoreTest(name, statistic, count, _p_value(statistic, count, freedom, share), strongest))
     return tests
 
 
@@ -172,15 +160,13 @@ def _p_value(statistic: float, count: int, freedom: float, share: float) -> floa
     return float(f.sf((scaled / count) / ((freedom - scaled) / (freedom - count)), count, freedom - count))
 
 
-def _freedom(problem: Problem, fit: CandidateFit, directions: list[Direction]) -> tuple[float, float]:
+def _freedom(problem: Problem, fit: CandidateFit, directions: Iterable[Direction]) -> tuple[float, float]:
     """Return degrees of freedom of the noise of the channels concerned, and their share not spent."""
     channels: set[int] = set()
     for direction in directions:
         for number, column in direction.items():
             channels.update(problem.trials[number].groups[np.any(column != 0.0, axis=0)].tolist())
     rows = sorted(channels)
-    if not rows:
-        return 0.0, 1.0
     known = problem.freedom[rows] + problem.counts[rows]
     if np.any(np.isinf(known)):
         return np.inf, 1.0
@@ -188,7 +174,7 @@ def _freedom(problem: Problem, fit: CandidateFit, directions: list[Direction]) -
     return left, left / float(known.sum())
 
 
-def directions(problem: Problem, fit: CandidateFit) -> dict[str, dict[str, Direction]]:
+def directions(problem: Problem, fit: CandidateFit) -> Mapping[str, Mapping[str, Direction]]:
     """Return the directions of each test by name.
 
     Loads at rest and in flight: size, zero (at rest only) and slope over the span of the response, by load
@@ -196,14 +182,13 @@ def directions(problem: Problem, fit: CandidateFit) -> dict[str, dict[str, Direc
     response by kind of trial and load place, and its drift.
     """
     own = [channel for term in fit.candidate.terms if (channel := _own_channel(problem, term))]
-    names = ("static loads", "loads of flight", "zeros of the static runs", *(f"channel {c}" for c in own))
-    found: dict[str, dict[str, dict[int, FloatArray]]] = {name: {} for name in names}
+    found: dict[str, dict[str, dict[int, FloatArray]]] = {}
     last = max(abs(data.trial.start) for data in problem.trials) or 1.0
     for number, data in enumerate(problem.trials):
         trial, kind = data.trial, data.trial.kind
 
         def add(group: str, label: str, column: FloatArray, number: int = number) -> None:
-            found[group].setdefault(label, {})[number] = column
+            found.setdefault(group, {}).setdefault(label, {})[number] = column
 
         response = _response(problem, fit, number)
         static = kind is TrialKind.STATIC
@@ -230,7 +215,7 @@ def directions(problem: Problem, fit: CandidateFit) -> dict[str, dict[str, Direc
                 where = place if static else f"in the trials {kind.value}"
                 add(f"channel {channel}", f"the size {where}", response * column)
                 add(f"channel {channel}", "the zero over time", drift * np.ones(response.shape) * column)
-    return {name: dict(group) for name, group in found.items()}
+    return found
 
 
 def _response(problem: Problem, fit: CandidateFit, number: int) -> FloatArray:
@@ -296,9 +281,7 @@ def sizes_by_trial(problem: Problem, found: CandidateFit) -> dict[str, dict[str,
     """
     precision = problem.precisions(found.sums)
     parameters = [(term, item) for term in found.candidate.terms for item in term.parameters]
-    sizes = {
-        term.effect.name: k for k, (term, item) in reversed([*enumerate(parameters)]) if is_magnitude(item)
-    }
+    sizes = {term.effect.name: k for k, (term, item) in reversed([*enumerate(parameters)]) if item.magnitude}
     rows: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in sizes}
     for number, data in enumerate(problem.trials):
         item = trial_rows(problem, number, found, found.candidate, precision)

@@ -17,12 +17,10 @@ from scipy.stats import chi2
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Key, Point, Term
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate
-from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
-from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share, missing_force
 from discrepancy.search.honest_evidence import noise_levels, refitted
@@ -45,8 +43,6 @@ class Court:
 
     Parameters
     ----------
-    problem : Problem
-        Campaign and model.
     found : Search
         Whose hypotheses they are.
 
@@ -64,10 +60,10 @@ class Court:
 
     least_end = SEARCH.least_share
 
-    def __init__(self, problem: Problem, found: Search) -> None:
-        self.problem, self.found = problem, found
-        self.has_held_out = bool(problem.campaign.held_out)
-        self.residuals = cache(partial(residual_set, problem, sensitivities=False))
+    def __init__(self, found: Search) -> None:
+        self.problem, self.found = found.problem, found
+        self.has_held_out = bool(self.problem.campaign.held_out)
+        self.residuals = cache(partial(residual_set, self.problem, sensitivities=False))
         self.share = cache(self.share_of)
         self._followed: dict[Key, Any] = {}
         self._free: dict[Key, CandidateFit] = {}
@@ -175,11 +171,8 @@ class Court:
 
     def told(self, item: Any) -> Share:
         """Return the share that counts: in trials not fitted, if there are any that can test it."""
-        if self.has_held_out:
-            outside = self.share(item, held_out=True)
-            if outside.tested:
-                return outside
-        return self.share(item, held_out=False)
+        outside = self.share(item, held_out=True) if self.has_held_out else None
+        return outside if outside is not None and outside.tested else self.share(item, held_out=False)
 
     def against(self, item: Any) -> str:
         """Return why a hypothesis is no name; empty where nothing speaks against it."""
@@ -192,7 +185,7 @@ class Court:
             return said("against.where_fitted", part=part(inside))
         if self.has_held_out and not self._survives(item, self.least_end):
             return said("against.not_fitted", part=part(self.share(item, held_out=True)))
-        count = len(item.shared) - len(self.problem.shared.gain_channels)
+        count = self.problem.shared.count
         proper = self.problem.shared.precision > 0.0
         for what, own in (("calibrated parameters", slice(count)), ("gains", slice(count, None))):
             u = item.shared[own][proper[own]]
@@ -275,17 +268,15 @@ class Court:
 
     def rivals(self, best: Any) -> list[Any]:
         """Return other names that neither evidence nor trials tell from the best one."""
-        own, share = families(best), self.told(best)
-        found: list[Any] = []
+        share, least = self.told(best), self.score(best) - SEARCH.force_rival
+        others: dict[frozenset[tuple[str, str]], Any] = {}
         for item in self.contenders:
-            same = names(item) == names(best) or (families(item) == own and item.candidate.is_family)
-            if same or names(item) > names(best) or len(item.candidate.terms) > len(best.candidate.terms):
-                continue
-            close = self.score(item) > self.score(best) - SEARCH.force_rival
-            known = any(names(item) == names(other) for other in found)
-            if close and not known and not share.told_from(self.told(item)):
-                found.append(item)
-        return found
+            same = item.candidate.is_family and families(item) == families(best)
+            longer = len(item.candidate.terms) > len(best.candidate.terms)
+            if not same and not longer and self.score(item) > least and not share.told_from(self.told(item)):
+                others.setdefault(names(item), item)
+        others.pop(names(best), None)
+        return list(others.values())
 
 
 def _is_little(share: Share, least: float) -> bool:
@@ -298,9 +289,9 @@ def families(item: Hypothetic) -> set[tuple[str, str]]:
     return {(term.effect.family, term.place) for term in item.candidate.terms}
 
 
-def names(item: Hypothetic) -> set[tuple[str, str]]:
+def names(item: Hypothetic) -> frozenset[tuple[str, str]]:
     """Return effects and places of a hypothesis."""
-    return {(term.effect.identifier, term.place) for term in item.candidate.terms}
+    return frozenset((term.effect.identifier, term.place) for term in item.candidate.terms)
 
 
 def _freedom(item: Hypothetic) -> tuple[int, int]:
@@ -323,8 +314,8 @@ class ByForce(Court):
 
     least_end = SEARCH.least_end
 
-    def __init__(self, problem: Problem, found: Search, force: ForceSearch) -> None:
-        super().__init__(problem, found)
+    def __init__(self, found: Search, force: ForceSearch) -> None:
+        super().__init__(found)
         self.force, self._of_force = force, ForceShares(force)
         self.has_held_out = self._of_force.has_held_out
 

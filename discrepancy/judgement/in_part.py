@@ -30,13 +30,11 @@ from .conclusion import (
     Outcome,
     below_limit,
     effects_text,
-    hypothesis,
-    inclusion,
     is_one_driven_channel,
+    is_small,
     named_effects,
     plain_names,
     probability_text,
-    small_terms,
 )
 from .consistency_gate import consistency_gate
 from .court import ByForce, Court, families, names, part, percent
@@ -44,17 +42,13 @@ from .proof import held_out_gate
 
 LEAST_SHOWN = 0.1
 """Share of what is missing from which a hypothesis is shown as the best one where none is named."""
-MOST_TOLD = 12
-"""Hypotheses that are listed."""
 
 
-def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
+def judged_in_part(found: Search, first: Verdict) -> Outcome:
     """Return the verdict where what the best simulation leaves is not the recorded noise.
 
     Parameters
     ----------
-    problem : Problem
-        Campaign and model.
     found : Search
         All candidates as fitted to recorded noise, and hypotheses along the missing force if it is seen.
     first : Verdict
@@ -66,9 +60,9 @@ def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
         As `naming.name` returns it; the fit is that of the best hypothesis for an unexplained gap too.
     """
     if found.force is not None and found.forces:
-        return _verdict_of(ByForce(problem, found, found.force), first)
+        return _verdict_of(ByForce(found, found.force), first)
     weigh_with_remainders(found)
-    court = Court(problem, found)
+    court = Court(found)
     coloured = _beside_coloured_noise(court)
     if coloured is not None:
         return coloured
@@ -76,7 +70,7 @@ def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
     return _verdict_of(court, first)
 
 
-def without_sliver(problem: Problem, found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
+def without_sliver(found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
     """Return the verdict on a set that was named, one of whose effects may explain next to nothing.
 
     Where what is left is nearly noise, such an effect stands for what is left as well as wider noise does. It
@@ -84,17 +78,17 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
 
     Parameters
     ----------
-    problem, found, first
+    found, first
         As of `judged_in_part`.
     fit : CandidateFit
         Of the set that was named.
     """
-    court = Court(problem, found)
-    small = small_terms(problem, fit, unstated=UNSTATED_GAIN)
-    terms, one_channel = fit.candidate.terms, is_one_driven_channel(problem)
+    court, problem = Court(found), found.problem
+    one_channel = is_one_driven_channel(problem)
+    patches = fit.candidate.patches(problem.setting, fit.effect)
     kept = {
-        (term.label, term.place) for term, size in zip(terms, small, strict=True)
-        if size is None and (court.acts(term) or not one_channel)
+        (term.label, term.place) for term, patch in zip(fit.candidate.terms, patches, strict=True)
+        if not is_small(problem, patch, unstated=UNSTATED_GAIN) and (court.acts(term) or not one_channel)
     }  # fmt: skip
     whole_key, share = set(fit.candidate.key), court.told(fit).value
     less = [item for key, item in found.exact.items() if key and set(key) < whole_key]
@@ -109,7 +103,7 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
         if own == kept or found.score(item) > found.score(whole) - SEARCH.sliver_gain:
             probability = court.probability(item)
             if court.against(item) or probability < SEARCH.sure:
-                return _unexplained(court, first, item, probability)
+                return _unexplained(court, first, item)
             return _in_part(court, item, probability)
     found.judged = {}
     return Outcome(first, found, fit)
@@ -151,13 +145,13 @@ def _verdict_of(court: Court, first: Verdict) -> Outcome:
         return _unexplained(court, first)
     best = court.slimmed(court.contenders[0])
     members = [best, *court.rivals(best)]
-    probability = sum(court.probability(item) for item in members)
-    if 1 < len(members) <= SEARCH.largest_group:
-        return _group(court, members, probability)
     if len(members) > SEARCH.largest_group:
-        return _unexplained(court, first, best, court.probability(best), len(members) - 1)
+        return _unexplained(court, first, best, said("against.rivals", rivals=len(members) - 1))
+    probability = sum(court.probability(item) for item in members)
+    if len(members) > 1:
+        return _group(court, members, probability)
     if probability < SEARCH.sure or best.log_evidence - court.nothing.log_evidence < SEARCH.bayes_factor:
-        return _unexplained(court, first, best, probability)
+        return _unexplained(court, first, best)
     return _in_part(court, best, probability)
 
 
@@ -183,7 +177,7 @@ def _group(court: Court, members: Sequence[Hypothetic], probability: float) -> O
     rows = zip(members, effects, strict=True)
     words = [f"{effects_text(own)} ({percent(court.told(item))})" for item, own in rows]
     sentence = said("verdict.this_share", members=listing(words, "or"), share=share, where=_where(share))
-    common = set.intersection(*(names(item) for item in members))
+    common = frozenset.intersection(*map(names, members))
     both = [effect for effect in effects[0] if (effect.identifier, effect.place) in common]
     if both:
         sentence = f"{capital(effects_text(both))} is missing. {sentence}"
@@ -195,12 +189,10 @@ def _group(court: Court, members: Sequence[Hypothetic], probability: float) -> O
     return _outcome(court, VerdictKind.GROUP, sentence, min(probability, 1.0), members[0], members, **more)
 
 
-def _unexplained(
-    court: Court, first: Verdict, close: Hypothetic | None = None, probability: float = 0.0, rivals: int = 0
-) -> Outcome:
+def _unexplained(court: Court, first: Verdict, close: Hypothetic | None = None, why: str = "") -> Outcome:
     """Return the verdict that a force is missing which has no name: how large, and what orders it.
 
-    `close`: what has a probability that is too small for a name, or more rivals than tell anything.
+    `close`: what has a probability that is too small for a name, unless something else speaks against it.
     """
     failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
     gap = f"{said('verdict.no_effect_fits', reason=failed).strip()} {court.gap()}".strip()
@@ -209,11 +201,9 @@ def _unexplained(
     if shown is None or court.told(shown).value < LEAST_SHOWN:
         shown, sentence = None, said("verdict.no_tenth", gap=gap)
     else:
-        share, why = court.told(shown), court.against(shown)
-        if rivals:
-            why = said("against.rivals", rivals=rivals)
-        elif close is not None and not why:
-            why = said("against.probability", probability=probability, sure=SEARCH.sure)
+        share, why = court.told(shown), why or court.against(shown)
+        if close is not None and not why:
+            why = said("against.probability", probability=court.probability(close), sure=SEARCH.sure)
         told = {"what": effects_text(named_effects(court.problem, shown)), "where": _where(share)}
         why = f"; it is no name, as {why}" if why else ""
         sentence = said("verdict.best_is", gap=gap, part=part(share), why=why, **told)
@@ -228,22 +218,16 @@ def _outcome(
     first: Sequence[Hypothetic], **more: Any,
 ) -> Outcome:  # fmt: skip
     """Return a verdict with all hypotheses, some of them `first`, and the one that stands for it."""
-    problem, ranked = court.problem, list(court.ranked)
-    ranked += [item for item in first if not any(item is one for one in ranked)]
+    ranked = [*first, *(item for item in court.ranked if not any(item is one for one in first))]
     scores = np.array([court.score(item) for item in ranked])
     weights = np.exp(scores - logsumexp(scores)).tolist()
-    rows = sorted(
-        zip(ranked, weights, strict=True),
-        key=lambda row: (not any(row[0] is item for item in first), -row[1]),
-    )
-    identifiers = dict.fromkeys(name for item, _ in rows for name in plain_names(item.candidate.identifiers))
-    told = tuple(hypothesis(problem, item, p) for item, p in rows[:MOST_TOLD])
+    rows = [*zip(ranked, weights, strict=True)]
+    rows = rows[: len(first)] + sorted(rows[len(first) :], key=lambda row: -row[1])
     fit = court.found.none if stands is None else court.fitted(stands)
     gain = (stands or ranked[0]).log_evidence - court.nothing.log_evidence
     more["explained"] = None if stands is None else explained_share(court.told(stands))
-    more["remainders"] = remainder_estimates(problem, fit)
-    conclusion = Conclusion(court.found, gain, told, inclusion(rows, identifiers))
-    return conclusion.outcome(kind, sentence, probability, fit, **more)
+    more["remainders"] = remainder_estimates(court.problem, fit)
+    return Conclusion(court.found, gain, rows).outcome(kind, sentence, probability, fit, **more)
 
 
 def _shape(court: Court, best: Hypothetic) -> str:

@@ -1,6 +1,6 @@
 """From fitted candidates to a verdict: the first rule that holds decides, and what overrules it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -9,9 +9,8 @@ import numpy as np
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
-from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.search.starts import Tell, acts_within, in_silence
@@ -28,9 +27,9 @@ from .conclusion import (
     Outcome,
     below_limit,
     is_one_driven_channel,
+    is_small,
     named_effects,
     plain_names,
-    small_terms,
 )
 from .consistency_gate import consistency_gate
 from .in_part import judged_in_part, without_sliver
@@ -44,8 +43,6 @@ class Case:
 
     Parameters
     ----------
-    problem : Problem
-        Campaign and model.
     found : Search
         All candidates.
     probabilities : mapping of tuple of str to float
@@ -54,16 +51,14 @@ class Case:
         The set that may be named; the most probable one if left out.
     """
 
-    def __init__(
-        self, problem: Problem, found: Search, probabilities: Mapping[Names, float], top: Names | None = None
-    ) -> None:
-        self.problem, self.found, self.probabilities = problem, found, probabilities
+    def __init__(self, found: Search, probabilities: Mapping[Names, float], top: Names | None = None) -> None:
+        self.problem, self.found, self.probabilities = found.problem, found, probabilities
         self.top = next(iter(probabilities)) if top is None else top
         self.best = found.exactly(found.best_of(self.top)) if self.top else found.best()
         self.told = Conclusion.of(found, self.best, probabilities)
         self.p_none = probabilities.get((), 0.0)
         self.has_evidence = self.told.log_bayes_factor >= SEARCH.bayes_factor
-        self.none_gate = absolute_gate(problem, found.none)
+        self.none_gate = absolute_gate(self.problem, found.none)
 
     # ---------------------------------------------------------------- how probable
 
@@ -118,30 +113,19 @@ class Case:
     @property
     def passes(self) -> bool:
         """Whether no gate that could be applied fails."""
-        return all(gate.passed is not False for gate in self.all_gates)
-
-    @property
-    def needs_shape(self) -> bool:
-        """Whether the set would need a shape of its own."""
-        return not self.best.candidate.is_family and self.shape[1] is not None and not self.shape[0].passed
-
-    @property
-    def may_be_free(self) -> bool:
-        """Whether the set may be stated with one law of free shape.
-
-        A free shape counts as one more effect, and beside a second law it would imitate nearly anything.
-        """
-        candidate, setting = self.best.candidate, self.problem.setting
-        parts = zip(candidate.terms, candidate.parts(self.best.effect), strict=True)
-        patches = [term.patch(setting, part) for term, part in parts]
-        laws = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
-        return laws < 2 and len(candidate.terms) < SEARCH.largest_set
+        return not _any_fails(self.all_gates)
 
     @cached_property
     def freed(self) -> tuple[CandidateFit, Gate, Gate] | None:
-        """The set with its shape free, and its gates, where it may be stated so."""
-        family = self.shape[1] if self.needs_shape and self.may_be_free else None
-        if family is None:
+        """The set with one law of free shape, and its gates, where it may be stated so.
+
+        A free shape counts as one more effect, and beside a second law it would imitate nearly anything.
+        """
+        candidate = self.best.candidate
+        family = None if candidate.is_family else self.shape[1]
+        patches = candidate.patches(self.problem.setting, self.best.effect)
+        laws = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
+        if family is None or laws > 1 or len(patches) == SEARCH.largest_set:
             return None
         return family, absolute_gate(self.problem, family), consistency_gate(self.problem, family)
 
@@ -165,10 +149,10 @@ class Case:
         """
         common = set.intersection(*(set(plain_names(names)) for names in self.members))
         alone = next((names for names in self.members if set(names) == common), None)
-        case = Case(self.problem, self.found, self.probabilities, alone) if alone else None
+        case = Case(self.found, self.probabilities, alone) if alone else None
         if case is None or not case.is_sure:
             return None
-        outcome = decided(case, SURE)
+        outcome = decided(case)
         return outcome if outcome.verdict.kind is VerdictKind.NAMED else None
 
     def open(self) -> Outcome:
@@ -209,20 +193,19 @@ class Case:
 
     def family(self) -> Outcome:
         """Return the family of the set, or of the set with its shape free."""
-        if self.freed is None:
-            return self.told.family(self.best, self.probability, self.gates)
-        fit, absolute, consistent = self.freed
-        return self.told.family(fit, self.probability, (absolute, self.shape[0], consistent))
+        fit, absolute, consistent = self.freed or (self.best, *self.gates)
+        gates = (absolute, consistent) if self.freed is None else (absolute, self.shape[0], consistent)
+        return self.told.family(fit, self.probability, gates)
 
     def unfit(self) -> Outcome:
         """Return that the set, or its family, fails a gate."""
-        absolute, consistent = self.gates if self.freed is None else self.freed[1:]
+        _, absolute, consistent = self.freed or (self.best, *self.gates)
         fails = absolute.passed is not False and consistent.passed is False
         reason = (consistent if fails else absolute).reason
         if self.best.candidate.is_family:
             sentence = said("verdict.no_effect_fits", reason=reason)
             return self._unexplained(sentence, self.probability, (absolute, consistent))
-        if self.needs_shape and self.freed is None:
+        if self.shape[1] is not None and self.freed is None:
             reason = said("verdict.needs_shape")
         nearest, reason = " with ".join(self.best.candidate.identifiers), f"{reason[0].lower()}{reason[1:]}"
         sentence = said("verdict.nearest", nearest=nearest, reason=reason)
@@ -234,36 +217,26 @@ class Case:
         return self.told.outcome(kind, sentence, probability, gates=gates, resembles=resembles)
 
 
-Rules = tuple[tuple[Callable[[Case], bool], Callable[[Case], Outcome | None]], ...]
-"""When each holds, and the verdict that it makes; None: the next decides. In words: `[[rule]]` of
-`sentences.toml`."""
-UNSURE: Rules = (
-    (lambda case: not case.leads and case.none_gate.passed is False, Case.gap),
-    (lambda case: not case.leads and bool(case.top) and case.p_none < SEARCH.unsure, Case.open),
-    (lambda case: not case.leads, Case.nothing),
-    (lambda case: not case.is_sure, Case.shared),
-    (lambda case: not case.is_sure, Case.open),
-)
-"""Rules where no set of effects has the probability and evidence of a name."""
-SURE: Rules = (
-    (lambda case: case.best.candidate.is_family and case.passes, Case.family),
-    (lambda case: case.passes, Case.named),
-    (
-        lambda case: case.freed is not None and all(gate.passed is not False for gate in case.freed[1:]),
-        Case.family,
-    ),
-    (lambda case: True, Case.unfit),
-)  # fmt: skip
-"""Rules where one has."""
+def decided(case: Case) -> Outcome:
+    """Return the verdict of the first rule that holds; in words: `[[rule]]` of `sentences.toml`."""
+    if not case.leads:
+        if case.none_gate.passed is False:
+            return case.gap()
+        return case.open() if case.top and case.p_none < SEARCH.unsure else case.nothing()
+    if not case.is_sure:
+        return case.shared() or case.open()
+    if case.passes:
+        return case.family() if case.best.candidate.is_family else case.named()
+    free = case.freed
+    return case.unfit() if free is None or _any_fails(free[1:]) else case.family()
 
 
-def decided(case: Case, rules: Rules = (*UNSURE, *SURE)) -> Outcome:
-    """Return the verdict of the first rule that holds."""
-    made = (makes(case) for holds, makes in rules if holds(case))
-    return next(outcome for outcome in made if outcome is not None)
+def _any_fails(gates: Iterable[Gate]) -> bool:
+    """Whether a gate that could be applied fails."""
+    return any(gate.passed is False for gate in gates)
 
 
-def as_recorded(problem: Problem, found: Search) -> Outcome:
+def as_recorded(found: Search) -> Outcome:
     """Return the verdict if what a right model leaves is noise as the records say, and no more."""
     probabilities = found.set_probabilities()
     for _ in range(SEARCH.largest_group):  # those that matter fitted exactly: few steps give rough evidence
@@ -273,7 +246,7 @@ def as_recorded(problem: Problem, found: Search) -> Outcome:
             break
         found.exactly(found.best_of(rough[0]))
         probabilities = found.set_probabilities()
-    return decided(Case(problem, found, probabilities))
+    return decided(Case(found, probabilities))
 
 
 def members_of(probabilities: Mapping[Names, float]) -> list[Names]:
@@ -313,7 +286,7 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
         what is too small to tell; else the one without effect.
     """
     found = search(problem, effects, tell)
-    first = _named(problem, found)
+    first = _named(found)
     if not found.forces or first.verdict.kind is not VerdictKind.UNEXPLAINED:
         return first
     tell("nothing follows the missing force: comparing whole simulations")
@@ -321,7 +294,7 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
     second = Search(problem, found.effects, again or found.none, tell=tell)
     second.force = found.force
     second.run()
-    other = _named(problem, second)
+    other = _named(second)
     second.forces = found.forces
     named = other.verdict.kind is VerdictKind.NAMED_IN_PART and any(_acts(problem, other.fit))
     # held-out trials alone give no name: most of the gap is to be closed where it was fitted
@@ -336,66 +309,57 @@ def _acts(problem: Problem, fit: CandidateFit) -> list[bool]:
     return [acts_within(term.effect, problem.setting) for term in fit.candidate.terms]
 
 
-def _named(problem: Problem, found: Search) -> Outcome:
+def _named(found: Search) -> Outcome:
     """Return the verdict on a search, by its simulations or else by the missing force."""
-    verdict, _, fit = as_recorded(problem, found)
+    verdict, _, fit = as_recorded(found)
     stands = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
     if stands or verdict.kind is VerdictKind.GROUP:
-        gate = held_out_gate(residual_set(problem, fit, sensitivities=False))
+        gate = held_out_gate(residual_set(found.problem, fit, sensitivities=False))
         sentence = f"{verdict.sentence} {gate.reason}" if gate.passed is False else verdict.sentence
         verdict = replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
         stands = stands and gate.passed is not False
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP):
-        overruled = _nuisance(problem, found, verdict, fit) or _strained(problem, found, verdict)
+        overruled = _overruled(found, verdict)
         if overruled is not None:
             return Outcome(overruled, found, found.none)
     if stands and len(verdict.effects) > 1:
-        alone = _without_readings(problem, found, verdict, fit)
-        return without_sliver(problem, found, verdict, fit) if alone is None else alone
+        alone = _without_readings(found, verdict, fit)
+        return without_sliver(found, verdict, fit) if alone is None else alone
     failed = {gate.name for gate in verdict.gates if gate.passed is False}
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
     open_group = verdict.kind is VerdictKind.GROUP and bool(found.forces)
     misfits = bool(failed & {"absolute fit", "held-out trials"})
     if open_group or (not stands and (misfits or verdict.kind in open_kinds)):
-        return judged_in_part(problem, found, verdict)
+        return judged_in_part(found, verdict)
     return Outcome(verdict, found, fit)
 
 
-def _without_readings(problem: Problem, found: Search, verdict: Verdict, fit: CandidateFit) -> Outcome | None:
+def _without_readings(found: Search, verdict: Verdict, fit: CandidateFit) -> Outcome | None:
     """Return the verdict that names laws in part, without an error of readings that was named beside them.
 
     Where laws are nearly all of the missing force, such an error takes up what is left, whatever it is.
     """
-    acts = _acts(problem, fit)
+    acts = _acts(found.problem, fit)
     if not found.forces or all(acts) or not any(acts):
         return None
-    other = judged_in_part(problem, found, verdict)
+    other = judged_in_part(found, verdict)
     in_part, share = other.verdict.kind is VerdictKind.NAMED_IN_PART, other.verdict.explained
     return other if in_part and share is not None and share.value > SEARCH.nearly_all else None
 
 
-def _nuisance(problem: Problem, found: Search, verdict: Verdict, fit: CandidateFit) -> Verdict | None:
-    """Return the verdict where all that is named is below what counts as a cause; None where it is not."""
-    fits = [fit]
-    if verdict.kind is VerdictKind.GROUP:
-        held = [(" + ".join(plain_names(i.candidate.identifiers)), i) for i in found.exact.values()]
-        fits = [item for label, item in held if label in verdict.group]
-    if not fits or any(None in small_terms(problem, item) for item in fits):
-        return None
-    sentence = said("verdict.nuisance", what=_either(verdict), least=100.0 * LEAST_SIZE)
-    return replace(verdict, kind=VerdictKind.NOTHING_MISSING, sentence=sentence, effects=(), group=())
+def _overruled(found: Search, verdict: Verdict) -> Verdict | None:
+    """Return the verdict where errors of instruments that are named are no cause; None where they may be.
 
-
-def _either(verdict: Verdict) -> str:
-    return " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
-
-
-def _strained(problem: Problem, found: Search, verdict: Verdict) -> Verdict | None:
-    """Return the verdict where errors of instruments only keep calibrated parameters within their priors.
-
-    With one channel under a recorded drive a gain does what all parameters of a linear model do together.
-    Where the model as it is leaves no gap on held-out trials either, nothing but these priors speaks for it.
+    They are none below a size that any instrument has. Nor where they only keep calibrated parameters within
+    their priors: with one channel under a recorded drive a gain does what all parameters of a linear model do
+    together. Where the model as it is leaves no gap on held-out trials either, nothing but these priors
+    speaks for it.
     """
+    problem, no_name = found.problem, replace(verdict, effects=(), group=())
+    what = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
+    if all(is_small(problem, effect.patch) for effect in verdict.effects):
+        sentence = said("verdict.nuisance", what=what, least=100.0 * LEAST_SIZE)
+        return replace(no_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
     parts = [part for effect in verdict.effects for part in effect.patch]
     gains = any(isinstance(part, LoadGain | SensorGain) for part in parts)
     instruments = gains and all(isinstance(part, INSTRUMENTS) for part in parts)
@@ -406,8 +370,6 @@ def _strained(problem: Problem, found: Search, verdict: Verdict) -> Verdict | No
     moved = zip(problem.model.parameters, found.none.point.shared, strict=False)
     far = [f"{item.name!r} {abs(u):.1f}" for item, u in moved if abs(u) > SEARCH.stand_in_range]
     told = f" ({', '.join(far)} stated deviations off)" if far else ""
-    sentence = said("verdict.parameters_or_instruments", far=told, what=_either(verdict))
+    sentence = said("verdict.parameters_or_instruments", far=told, what=what)
     resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
-    return replace(
-        verdict, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles, effects=(), group=()
-    )
+    return replace(no_name, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles)

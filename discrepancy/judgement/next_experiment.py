@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Point
 from discrepancy.fits.fitting import CandidateFit
@@ -74,7 +74,7 @@ def next_experiments(
     weights /= weights.sum()
     found = []
     swings = oscillates(problem, open_fits[0][0]) if open_fits else True
-    for proposal in proposals(problem.campaign, problem, swings=swings):
+    for proposal in proposals(problem, swings=swings):
         try:
             information = mutual_information(problem, proposal, [item for item, _ in open_fits], weights)
         except DiscrepancyError:  # not feasible with this model
@@ -101,7 +101,7 @@ def mutual_information(
         Their probabilities, of sum one.
     """
     model = problem.model.patched(proposal.added) if len(proposal.added) else problem.model
-    there = Problem(problem.campaign, model, problem.setting, (proposal.trial,), like=problem)
+    there = problem.with_trials((proposal.trial,), model)
     data = there.trials[0]
     # without a record, what the most probable hypothesis left stands for the noise
     rest = np.sqrt(problem.precisions(fits[0].sums))
@@ -158,20 +158,22 @@ def oscillates(problem: Problem, found: CandidateFit) -> bool:
     return False
 
 
-def proposals(campaign: Campaign, problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
+def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
     """Yield feasible trials: variations of what was done, within its ranges doubled.
 
     Parameters
     ----------
-    campaign : Campaign
-        What was done.
     problem : Problem
-        For the model's scales.
+        Campaign with what was done, and model.
     swings : bool
         Whether a release oscillates: a longer record of one that does not shows rest.
     """
     for row in SENTENCES["proposal"]:
-        done = [trial for trial in campaign.trials if trial.kind.value == row["kind"] and _size(trial) >= 0.0]
+        done = [
+            trial
+            for trial in problem.campaign.trials
+            if trial.kind.value == row["kind"] and _size(trial) >= 0.0
+        ]
         if not done or (row["change"] == "length" and not swings):
             continue
         largest = (min if row.get("of") == "smallest" else max)(done, key=_size)

@@ -19,7 +19,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen, is_magnitude
+from discrepancy.fits.screening import Change, Screen
 from discrepancy.fits.trial_data import stand_in
 from discrepancy.models.interface import Model
 from discrepancy.sentences import said
@@ -100,9 +100,7 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     trials: list[Trial] = []
     predicted = {}
     for number, data in enumerate(problem.trials):
-        response, _ = problem.response(
-            number, point.shared, point.local[number], Candidate().patch(setting, point.effect)
-        )
+        response = problem.answer(number, point, Candidate())
         predicted[data.trial.name] = problem.prediction(number, point, response)
     for trial in campaign.trials:
         values = predicted.get(trial.name)
@@ -131,7 +129,7 @@ def begun(problem: Problem) -> Point:
     if not any(unknown):
         return start
     # parameters follow: beside a frequency that is off, what begins would fade out of the record
-    found = fit(problem, Candidate(), start, evidence=False).point.local
+    found = fit(problem, Candidate(), start).point.local
     chosen = zip(unknown, found, start.local, strict=True)
     return replace(start, local=tuple(own if free else kept for free, own, kept in chosen))
 
@@ -200,7 +198,7 @@ def _references(screen: Screen, effect: Effect, places: Sequence[str]) -> list[C
     for term in (Term(effect, place) for place in places):
         start = term.start()
         for number, item in enumerate(term.parameters):
-            if is_magnitude(item) and item.prior.value(0.0) == 0.0:
+            if item.magnitude and item.prior.value(0.0) == 0.0:
                 start[number] = 1.0
         with suppress(DiscrepancyError):
             found.append(screen.change(term, start))
@@ -212,13 +210,13 @@ def _at_reference(change: Change) -> bool:
     return all(
         abs(u) in (0.0, 1.0)
         for item, u in zip(change.term.parameters, change.start, strict=True)
-        if is_magnitude(item)
+        if item.magnitude
     )
 
 
 def _detectability(effect: Effect, change: Change, distance: float) -> Detectability:
     for number, item in enumerate(change.term.parameters):
-        if is_magnitude(item):
+        if item.magnitude:
             typical = abs(item.prior.value(float(change.start[number])))
             detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
             return Detectability(

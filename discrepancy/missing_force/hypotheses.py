@@ -66,7 +66,7 @@ def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
 
 def variants(term: Term) -> list[FloatArray]:
     """Return standard normal values (E,) of a term's parameters at which it is tried."""
-    free = [number for number, item in enumerate(term.parameters) if not getattr(item, "magnitude", False)]
+    free = [number for number, item in enumerate(term.parameters) if not item.magnitude]
     levels = [LEVELS if len(free) < 2 else LEVELS[::3]] * len(free)
     found = []
     for chosen in list(product(*levels))[:MOST_VARIANTS]:
@@ -81,19 +81,9 @@ def both_signs(term: Term) -> bool:
     return any(item.prior.low < 0.0 for item in term.effect.parameters if item.magnitude)
 
 
-def sized(term: Term, values: FloatArray, factor: float) -> FloatArray:
-    """Return values of a term's unknowns (E,) with its magnitudes taken `factor` times."""
-    found = values.copy()
-    for number, item in enumerate(term.effect.parameters):
-        if item.magnitude and (factor > 0.0 or item.prior.low < 0.0):
-            value = factor * item.prior.value(float(values[number]))
-            found[number] = np.clip(item.prior.normal(value), -LARGEST, LARGEST)
-    return found
-
-
 def stepped(candidate: Candidate, effect: FloatArray, step: FloatArray) -> FloatArray:
     """Return the unknowns of a candidate (E,) after a step, taken along the values' tangents."""
-    priors = [item.prior for term in candidate.terms for item in term.parameters]
+    priors = [item.prior for item in candidate.parameters]
     moved = [prior.stepped(float(u), float(s)) for prior, u, s in zip(priors, effect, step, strict=True)]
     return np.clip(moved, -LARGEST, LARGEST)
 
@@ -185,7 +175,7 @@ class Columns:
     ) -> Column | None:
         """Return what a candidate does at standard normal values (E,) of its unknowns; None: it cannot be."""
         found = []
-        for term, part in zip(candidate.terms, candidate.parts(values), strict=True):
+        for term, part in candidate.parts(values):
             try:
                 patch = term.patch(self.problem.setting, part)
             except DiscrepancyError:

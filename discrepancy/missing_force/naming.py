@@ -19,7 +19,7 @@ from discrepancy.fits.candidate import Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
 from .filtered import Process, Solution
-from .hypotheses import Columns, both_signs, log_prior, scaled, sized, stepped, variants
+from .hypotheses import LARGEST, Columns, both_signs, log_prior, scaled, stepped, variants
 from .view import Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
@@ -154,7 +154,7 @@ class ForceSearch:
     def __init__(self, problem: Problem, about: Point | None = None) -> None:
         linear, self.laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
-        self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
+        self.problem = problem.with_trials(trials, linear)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear.ports)
         self.at: dict[str, Explained] = {}
@@ -296,7 +296,7 @@ class ForceSearch:
             term, values = tried[number]
             key = (term.label, term.place)
             if key not in best or best[key][0] < value:
-                best[key] = (value, term, sized(term, values, size))
+                best[key] = (value, term, term.sized(values, size, -LARGEST, LARGEST))
         return sorted(best.values(), key=lambda item: -item[0])
 
     def _weighed(

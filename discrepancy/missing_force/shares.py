@@ -110,9 +110,7 @@ class ForceShares:
         self._outside: tuple[Columns, View] | None = None
         self._bare: dict[bool, tuple[View, list[Motion]]] = {}
         if held:
-            problem = Problem(
-                campaign, search.problem.model, search.problem.setting, held, like=search.problem
-            )
+            problem = search.problem.with_trials(held)
             numbers = range(len(problem.trials))
             point = Point(search.point.shared, problem.start(search.whole.candidate).local, np.zeros(0))
             columns = Columns(problem, numbers, point, search.laws)

@@ -247,8 +247,8 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     gain_unknowns = []
     for row, name in enumerate(shared.gain_channels):
         if name in trial.channels:
-            column, scale = trial.channels.index(name), float(shared.gain_scale[row])
-            gain_unknowns.append((len(shared.parameter_mean) + row, column, scale / float(gains[column])))
+            column, scale = trial.channels.index(name), float(shared.scale[shared.count + row])
+            gain_unknowns.append((shared.count + row, column, scale / float(gains[column])))
     columns, index = problem.columns(number, point, parts, Candidate())
     by_local, by_shared = columns[: unknowns.size], np.zeros((shared.size, *parts.response.shape))
     by_shared[index] = columns[unknowns.size :]
@@ -277,7 +277,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
 
     local = point.local[number]
     here = moving(point.shared, local)
-    ways = {k: (moved(point.shared, k), local) for k in range(len(shared.parameter_mean))}
+    ways = {k: (moved(point.shared, k), local) for k in range(shared.count)}
     ways |= {shared.size + k: (point.shared, moved(local, k)) for k in range(unknowns.zeros, unknowns.size)}
     by_unknowns = {k: (moving(*there) - here) / PARAMETER_STEP for k, there in ways.items()}
     residual, by_shared, by_local = (item / deviation * used for item in (residual, by_shared, by_local))
@@ -311,5 +311,5 @@ def _ported(
         }
         return replace(above, **found) if any(np.any(item) for item in found.values()) else None
 
-    of_parameters = [slope(k) for k in range(len(unknowns.parameter_mean))]
+    of_parameters = [slope(k) for k in range(unknowns.count)]
     return system(shared), of_parameters + [None] * (unknowns.size - len(of_parameters))

@@ -50,17 +50,17 @@ class Marginal:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         shared = problem.shared
-        self.free = np.flatnonzero(shared.parameter_scale > 0.0)
-        mean, scale = shared.parameter_mean[self.free], shared.parameter_scale[self.free]
-        self.low = (shared.parameter_low[self.free] - mean) / scale
-        self.high = (shared.parameter_high[self.free] - mean) / scale
+        self.free = np.flatnonzero(shared.scale[: shared.count] > 0.0)
+        mean, scale = shared.centre[self.free], shared.scale[self.free]
+        self.low = (shared.low[self.free] - mean) / scale
+        self.high = (shared.high[self.free] - mean) / scale
         self._near = problem.start(NOTHING)
         self.refused: list[tuple[FloatArray, str]] = []
 
     def values(self, u: FloatArray) -> FloatArray:
         """Return parameters (..., P) of scaled ones [units]."""
         shared = self._problem.shared
-        return shared.parameter_mean[self.free] + shared.parameter_scale[self.free] * u
+        return shared.centre[self.free] + shared.scale[self.free] * u
 
     def inside(self, u: FloatArray) -> NDArray[np.bool_]:
         """Return which scaled parameters (..., P) lie within the model's range."""
@@ -96,11 +96,10 @@ class Marginal:
         shared = problem.shared
         fixed = np.ones(len(self.free), dtype=bool) if fixed is None else fixed
         held = self.free[fixed]
-        names = ("mean", "low", "high", "scale")
-        moments = {f"parameter_{name}": getattr(shared, f"parameter_{name}").copy() for name in names}
+        moments = {name: getattr(shared, name).copy() for name in ("centre", "low", "high", "scale")}
         for values in moments.values():
             values[held] = self.values(u)[fixed]
-        moments["parameter_scale"][held] = 0.0
+        moments["scale"][held] = 0.0
         problem.shared = replace(shared, **moments)
         start = near or (self._near if trials is None else problem.start(NOTHING))
         at = start.shared.copy()

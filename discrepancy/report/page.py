@@ -57,7 +57,7 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
     layout = problem.shared
     fits = [search.none] + ([fit] if fit.candidate.terms else [])
     rows = []
-    stated = zip(layout.parameter_mean.tolist(), layout.parameter_scale.tolist(), strict=True)
+    stated = [*zip(layout.centre.tolist(), layout.scale.tolist(), strict=True)][: layout.count]
     for prior, *found in zip(stated, *(calibrated_parameters(problem, one) for one in fits), strict=True):
         cells = [_beside(*prior), *(_beside(item.mean, item.deviation) for item in found)]
         rows.append((found[0].name.replace("_", " "), words.unit_text(found[0].unit), *cells))

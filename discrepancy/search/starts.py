@@ -3,8 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import product
-from math import inf
+from itertools import combinations, product
 from typing import TypeVar
 
 import numpy as np
@@ -16,7 +15,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.fits.screening import Change, Screen
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
 
@@ -76,34 +75,26 @@ def are_related(one: Effect, other: Effect) -> bool:
 
 def _worth(change: Change) -> float:
     """Order of changes: misfit gained, less what the scale costs in the prior."""
-    scaled = rescaled(change)
+    scaled = change.best
     return -change.gain + 0.5 * float(scaled @ scaled)
 
 
-def pairs(changes: dict[str, list[Change]], sign: FloatArray) -> Iterator[tuple[float, Change, Change]]:
-    """Yield misfit and changes, scaled together, of all pairs of effects."""
-    names = list(changes)
-    for i, one in enumerate(names):
-        for other in names[i + 1 :]:
-            best: tuple[float, Change, Change] | None = None
-            for first in changes[one]:
-                for second in changes[other]:
-                    overlap = float(first.vector * sign @ second.vector)
-                    gram = np.array([[first.size, overlap], [overlap, second.size]])
-                    fits = np.array([first.fits, second.fits])
-                    if np.linalg.cond(gram) > 1e8:
-                        continue
-                    scale = np.linalg.solve(gram, fits)
-                    if any(
-                        size < 0.0 and not change.may_turn
-                        for size, change in zip(scale, (first, second), strict=True)
-                    ):
-                        continue  # a size that cannot be negative: the other one alone
-                    misfit = -0.5 * float(fits @ scale)
-                    if best is None or misfit < best[0]:
-                        best = (misfit, _scaled(first, scale[0]), _scaled(second, scale[1]))
-            if best is not None and best[0] > -inf:
-                yield best
+def pairs(changes: Sequence[Change], sign: FloatArray) -> list[tuple[float, Change, Change]]:
+    """Return misfit and changes, scaled together, of all pairs of effects, the best first."""
+    best: dict[tuple[str, str], tuple[float, Change, Change]] = {}
+    for one, other in combinations(changes, 2):
+        key = (one.term.effect.identifier, other.term.effect.identifier)
+        overlap = float(one.vector * sign @ other.vector)
+        gram, fits = np.array([[one.size, overlap], [overlap, other.size]]), np.array([one.fits, other.fits])
+        if key[0] == key[1] or np.linalg.cond(gram) > 1e8:
+            continue
+        scale = np.linalg.solve(gram, fits)
+        # a size that cannot be negative: the other one alone
+        able = [size >= 0.0 or item.may_turn for size, item in zip(scale, (one, other), strict=True)]
+        misfit = -0.5 * float(fits @ scale)
+        if all(able) and (key not in best or misfit < best[key][0]):
+            best[key] = (misfit, _scaled(one, scale[0]), _scaled(other, scale[1]))
+    return sorted(best.values(), key=lambda row: row[0])
 
 
 def _scaled(change: Change, scale: float) -> Change:

@@ -1,4 +1,4 @@
-"""The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
+"""The search for the set of effects that explains a campaign: screen, fit, add."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,11 +12,10 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, attempt, fit
+from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
-from discrepancy.fits.other_optima import around, free_shape, is_box
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.fits.screening import Screen
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
@@ -126,17 +125,6 @@ class Search:
             self.tell(f"the missing force cannot be seen: {cause}")
             return None
 
-    def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
-        """Return for each effect its most promising changes, best first, at different places or values."""
-        screen, found = Screen(self.problem, base), {}
-        for effect in each(self.tell, tuple(effects), lambda one: f"screening {one.identifier}"):
-            found[effect.identifier] = starts(screen, effect)
-        if not base.candidate.terms:
-            self.promised |= {
-                name: max((change.gain for change in changes), default=0.0) for name, changes in found.items()
-            }
-        return found
-
     def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
         """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
 
@@ -170,16 +158,18 @@ class Search:
         """Whether much is left by a fit."""
         return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
 
-    def _scan_near(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
-        """Fit effects from where a screen at a base leads."""
+    def _scan_near(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
+        """Fit effects from where a screen at a base leads, the most promising first."""
         least = SEARCH.worth_adding if base.candidate.terms else SEARCH.worth_fitting
-        ranked = [
-            chosen for changes in self.screened(base, effects).values()
-            if (chosen := [change for change in changes if change.gain >= least])
-        ]  # fmt: skip
-        ranked.sort(key=lambda changes: -max(change.gain for change in changes))
-        starts = [[beside(base, change.term, rescaled(change)) for change in row] for row in ranked]
-        return self._best_of(starts, base, least if base.candidate.terms else 0.0)
+        screen, rows = Screen(self.problem, base), []
+        for effect in each(self.tell, effects, lambda one: f"screening {one.identifier}"):
+            changes = starts(screen, effect)
+            if not base.candidate.terms:
+                self.promised[effect.identifier] = max((change.gain for change in changes), default=0.0)
+            rows.append([change for change in changes if change.gain >= least])
+        rows.sort(key=lambda row: -max((change.gain for change in row), default=0.0))
+        begun = [[beside(base, change.term, change.best) for change in row] for row in rows if row]
+        return self._best_of(begun, base, least if base.candidate.terms else 0.0)
 
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
         """Return a base with its nuisances where they are beside a missing force."""
@@ -237,24 +227,23 @@ class Search:
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, one law of free shape, more effects, any two. The best candidate is computed finely
-        before what rests on its evidence: finely divided, a joint may have the shape of the name in place of
-        one that is free.
+        One effect, the best of them beside their optimum too, one law of free shape, more effects, any
+        two. The best candidate is computed finely before what rests on its evidence.
         """
-        self.singles()
+        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
+        for rank, item in enumerate(ranked[: SEARCH.ridges]):
+            misses = absolute_gate(self.problem, item).passed is False
+            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
+                self.keep(around(self.problem, item), exact=True)
         self.settle()
         self.families()
         self.settle()
-        if self._open:
+        # beside a law whose shape is free further effects would be anything
+        if not self.best().candidate.is_family:
             self.longer()
-        if self._open and len(self.effects) > 1 and self.unexplained():
+        if not self.best().candidate.is_family and self.unexplained():
             self.fit_pairs()
         self.settle()
-
-    @property
-    def _open(self) -> bool:
-        """Whether further effects are looked for: beside a law whose shape is free they would be anything."""
-        return not self.best().candidate.is_family
 
     @property
     def _moves(self) -> bool:
@@ -267,13 +256,14 @@ class Search:
         if force is None:
             return False
         self.forces = force.name(self.effects)
-        # beside another law a shape of its own would imitate nearly anything
-        able = [one for one in self.forces if len(one.candidate.terms) == 1 or not one.candidate.is_family]
-        able = [one for one in able if one.candidate.terms]
-        scores = [force.score(one, len(self.effects)) for one in able]
-        near = zip(able, scores, strict=True)
-        close = [one for one, score in near if score > max(scores) - SEARCH.followed][: SEARCH.far_fits]
-        for item in each(self.tell, close, lambda one: f"fitting {one.candidate.words} to the end"):
+        able = [
+            one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
+            if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
+        ]  # fmt: skip
+        close = [one for one in able if self.score(one) > self.score(able[0]) - SEARCH.followed]
+        for item in each(
+            self.tell, close[: SEARCH.far_fits], lambda one: f"fitting {one.candidate.words} to the end"
+        ):
             found = attempt(self.problem, item.candidate, force.whole_point(item))
             if found is not None:
                 self.keep(found, exact=True)
@@ -285,25 +275,43 @@ class Search:
         return not absolute_gate(self.problem, self.best()).passed
 
     def settle(self) -> None:
-        """Compute the best candidate finely enough that its evidence is its own, not that of the steps."""
-        self._settle_joints()
-        self._settle_steps()
+        """Compute the best candidate finely: joints that slip by more elements, motions by smaller steps."""
+        setting = self.problem.setting
+        if setting.joint_elements < SEARCH.fine_joint and slips(self.problem, self.best()):
+            ranked = self._ranked()
+            self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
+            self._fit_again([item for item in ranked if slips(self.problem, item)])
+            if slips(self.problem, self.best()):
+                self.keep(around(self.problem, self.best()), exact=True)
+        while (
+            self.problem.refinement < SEARCH.finest
+            and solver_share(self.problem, self.best()) > SEARCH.solver_share
+        ):
+            self.problem.refinement *= 2
+            self._fit_again(self._ranked())
 
-    def singles(self) -> None:
-        """Fit each effect alone, and the best of them beside their optimum too."""
-        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
-        for rank, item in enumerate(ranked[: SEARCH.ridges]):
-            misses = absolute_gate(self.problem, item).passed is False
-            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
-                self.keep(around(self.problem, item), exact=True)
+    def _ranked(self) -> list[CandidateFit]:
+        return sorted(self.exact.values(), key=lambda item: -self.score(item))
+
+    def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
+        """Replace the best exact fits by those of the finer model from where they stand."""
+        for item in rough[: SEARCH.refitted]:
+            again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
+            if again is not None:  # else the rough one stands
+                self.exact[item.candidate.key] = again
 
     def longer(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
-        current: CandidateFit | None = self.best()
-        while current is not None and current.candidate.terms:
+        current = self.best()
+        while 0 < len(current.candidate.terms) < SEARCH.largest_set:
             if len(current.candidate.terms) > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do
-            current = self._extended(current)
+            before, there = self.score(current), {term.effect.identifier for term in current.candidate.terms}
+            others = [effect for effect in self.effects if effect.identifier not in there]
+            fitted = self.refine(self.scan(current, others), before - SEARCH.hopeless_longer)
+            if not fitted or self.score(fitted[0]) <= before:
+                break
+            current = fitted[0]
 
     def families(self) -> None:
         """Fit the free-shape families of single effects that come close, and keep those that fit.
@@ -335,55 +343,16 @@ class Search:
         for family in kept.values():
             self.keep(family, exact=True)
 
-    def _settle_steps(self) -> None:
-        """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
-        while (
-            self.problem.refinement < SEARCH.finest
-            and solver_share(self.problem, self.best()) > SEARCH.solver_share
-        ):
-            self.problem.refinement *= 2
-            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[: SEARCH.refitted]
-            self._fit_again([item for item in ranked if item.candidate.terms])
-
-    def _settle_joints(self) -> None:
-        """Divide a joint that slips more finely where the best candidate has one; fit the best ones again."""
-        setting = self.problem.setting
-        if setting.joint_elements >= SEARCH.fine_joint or not slips(self.problem, self.best()):
-            return
-        ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
-        self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
-        self._fit_again([item for item in ranked if slips(self.problem, item)][: SEARCH.refitted])
-        if slips(self.problem, self.best()):
-            self.keep(around(self.problem, self.best()), exact=True)
-
-    def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
-        """Replace exact fits by those of the finer model from where they stand."""
-        for item in rough:
-            again = attempt(self.problem, item.candidate, item.point)
-            if again is not None:  # else the rough one stands
-                self.exact[item.candidate.key] = again
-
-    def _extended(self, current: CandidateFit) -> CandidateFit | None:
-        """Return a better set with one more effect, or None."""
-        if len(current.candidate.terms) >= SEARCH.largest_set:
-            return None
-        before = self.score(current)
-        there = {term.effect.identifier for term in current.candidate.terms}
-        others = [effect for effect in self.effects if effect.identifier not in there]
-        fitted = self.refine(self.scan(current, others), before - SEARCH.hopeless_longer)
-        return fitted[0] if fitted and self.score(fitted[0]) > before else None
-
     def fit_pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
         screen = Screen(self.problem, self.none)
-        changes = {effect.identifier: starts(screen, effect) for effect in self.effects}
-        ranked = sorted(pairs(changes, screen.sign), key=lambda item: item[0])[: SEARCH.pairs_fitted]
+        changes = [change for effect in self.effects for change in starts(screen, effect)]
         begun = []
-        for _, first, second in ranked:
+        for _, first, second in pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
             candidate = Candidate((first.term, second.term))
-            effect = np.concatenate((rescaled(first), rescaled(second)))
             if candidate.key not in self.exact:
-                begun.append([(candidate, replace(self.none.point, effect=effect))])
+                start = replace(self.none.point, effect=np.concatenate((first.best, second.best)))
+                begun.append([(candidate, start)])
         rough = self._best_of(begun, self.none, 0.0)
         for item in rough:
             self.keep(item, exact=False)

@@ -52,7 +52,7 @@ class Simulator:
         self.problem = problem.with_trials(campaign.trials)
         zeros = tuple(np.zeros(data.unknowns.size) for data in self.problem.trials)
         start = replace(self.fitted.point, local=zeros)
-        self.found = fit(self.problem, Candidate(), start, local_only=True, evidence=False).point
+        self.found = fit(self.problem, Candidate(), start, local_only=True).point
 
     def screen(self) -> Screen:
         """Return what measures d^2 of an effect under this campaign, on the predicted data."""

@@ -153,9 +153,7 @@ class Linear:
         """Return all residuals, those that do not count left out."""
         point, parts = self.point(x), []
         for number, data in enumerate(self.problem.trials):
-            acts = data.trial.kind in self.candidate.acts_on
-            patch = self.candidate.patch(self.problem.setting, point.effect) if acts else ModelPatch()
-            response, _ = self.problem.response(number, point.shared, point.local[number], patch)
+            response = self.problem.answer(number, point, self.candidate)
             parts.append(self.problem.residual(number, point, response)[data.weight > 0.0])
         return np.concatenate(parts)
 

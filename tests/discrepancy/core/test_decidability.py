@@ -226,8 +226,7 @@ def test_another_amplitude_decides_between_amplitude_and_time():
     stiffening, drift = kit.chosen("cubic_stiffness", "stiffness_drift")
     fits = [kit.fitted(problem, term) for term in (Term(stiffening, "end"), Term(drift))]
     information = {
-        item.trial.name: mutual_information(problem, item, fits, HALF)
-        for item in proposals(problem.campaign, problem)
+        item.trial.name: mutual_information(problem, item, fits, HALF) for item in proposals(problem)
     }
     assert all(0.0 <= value <= log(2.0) + 1e-9 for value in information.values())
     same = Proposal(problem.campaign.trials[0], "", "", 1.0)
@@ -245,7 +244,7 @@ def test_another_amplitude_decides_between_amplitude_and_time():
 def test_proposals_are_trials_of_the_kinds_that_were_done():
     """A longer record is one of what swings."""
     problem = kit.BENCH.problem(1)
-    found = list(proposals(problem.campaign, problem))
+    found = list(proposals(problem))
     assert {item.trial.kind for item in found} == {TrialKind.STATIC, TrialKind.RINGDOWN}
     assert len({item.description for item in found}) == len(found)
     for item in found:
@@ -263,7 +262,7 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
         for data, part in zip(problem.trials, none.linearisations, strict=True)
     )
     assert not oscillates(problem, replace(none, linearisations=decay))
-    names = [item.trial.name for item in proposals(problem.campaign, problem, swings=False)]
+    names = [item.trial.name for item in proposals(problem, swings=False)]
     assert names
     assert "longer record" not in names
 

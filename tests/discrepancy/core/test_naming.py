@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.judgement.consistency_gate import LARGE_SCATTER, follows_trial, scatter_of, sizes_by_trial
+from discrepancy.judgement.court import Court
 from discrepancy.judgement.in_part import explained_share
-from discrepancy.judgement.naming import SURE, UNSURE, Case, name
+from discrepancy.judgement.naming import Case, name
 from discrepancy.judgement.when import look_alike_remark, with_untested
 from discrepancy.missing_force.shares import OF_READINGS, Share
 from discrepancy.search_settings import SEARCH
@@ -199,9 +201,7 @@ def test_members_that_do_not_fit_are_no_part_of_a_group(searched):
     wrong = kit.fitted(problem, Term(kit.chosen("load_cell")[0]))
     found.keep(wrong, exact=True)
     right = ("coulomb_friction",)
-    verdict, _, nearest = Case(
-        problem, found, {wrong.candidate.identifiers: 0.6, right: 0.38, (): 0.02}
-    ).open()
+    verdict, _, nearest = Case(found, {wrong.candidate.identifiers: 0.6, right: 0.38, (): 0.02}).open()
     assert verdict.kind is VerdictKind.GROUP
     assert verdict.group == nearest.candidate.identifiers == right
     assert "cannot tell which" not in verdict.sentence
@@ -217,18 +217,17 @@ def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched):
     for terms in ((cell,), (friction, gain), (cell, gain)):
         found.keep(kit.fitted(problem, *terms), exact=True)
     right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
-    outcome = Case(problem, found, {more: 0.7, right: 0.3}).shared()
+    outcome = Case(found, {more: 0.7, right: 0.3}).shared()
     assert outcome[0].kind is VerdictKind.NAMED
     assert [item.identifier for item in outcome[0].effects] == list(right)
     assert outcome[0].probability == pytest.approx(1.0)
     for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
-        assert Case(problem, found, shares).shared() is None
+        assert Case(found, shares).shared() is None
 
 
 def test_the_rules_stand_in_the_page_in_their_order():
     page = (Path(__file__).parents[3] / "docs" / "discrepancy.md").read_text(encoding="utf-8")
     rules = SENTENCES["rule"]
-    assert len(rules) == len((*UNSURE, *SURE))
     table = "".join(f"| {rule['verdict']} | {rule['when']} |\n" for rule in rules)
     assert f"| verdict | where |\n| --- | --- |\n{table}\n" in page
 
@@ -327,6 +326,34 @@ def test_shares_and_their_interval():
     assert not half.told_from(better)
     closed = explained_share(shares(0.9 * noise))
     assert (closed.value, closed.left, closed.remainder) == (1.0, 0.0, 0.0)
+
+
+def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_of_the_gap():
+    """The best name, a law with a shape of its own and a longer set are no rivals, nor what is far off."""
+    friction, drag, cubic = (
+        Term(*one)
+        for one in zip(kit.chosen(FRICTION[0], "quadratic_damping", "cubic_stiffness"), "aab", strict=True)
+    )
+
+    def held(score, share, *terms):
+        closed = 10.0 + (1.0 - share) * np.linspace(90.0, 110.0, 40)
+        told = Share(
+            np.full(40, 110.0), closed, np.full(40, 10.0), True, 4, 1.0, 2.0, OF_READINGS, tested=True
+        )
+        return SimpleNamespace(candidate=Candidate(terms), score=score, told=told)
+
+    best = held(0.0, 0.9, friction)
+    second, freed = held(-1.0, 0.9, cubic), held(-2.0, 0.9, replace(cubic, free_shape=True))
+    others = (
+        held(-1.0, 0.9, replace(friction, free_shape=True)), held(-1.0, 0.9, replace(drag, free_shape=True)),
+        held(-1.0, 0.9, drag, cubic), held(-1.0 - SEARCH.force_rival, 0.9, drag), held(-1.0, 0.5, drag),
+    )  # fmt: skip
+    court = object.__new__(Court)
+    court.score, court.told = (lambda item: item.score), (lambda item: item.told)
+    court.contenders = [best, second, freed, *others]
+    assert court.rivals(best) == [second]
+    court.contenders = [best, held(-1.0, 0.9, drag), second]
+    assert [item.candidate.terms for item in court.rivals(best)] == [(drag,), (cubic,)]
 
 
 # ---------------------------------------------------------------- what a name does not exclude

@@ -12,7 +12,7 @@ from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
 from discrepancy.fits.predictive import ensemble, residual_set, with_draws
-from discrepancy.fits.screening import Screen, grid, rescaled
+from discrepancy.fits.screening import Screen, grid
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.search.starts import pairs
 from discrepancy.search_settings import SEARCH
@@ -63,13 +63,13 @@ def test_change_is_the_projected_one(screened):
 
 def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
     problem, none, screen, terms, changes = screened
-    options = {change.term.effect.identifier: [change] for change in changes}
-    ((misfit, first, second),) = list(pairs(options, screen.sign))
+    ((misfit, first, second),) = pairs(changes, screen.sign)
     found = kit.fitted(problem, *terms)
     assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
-    start = np.concatenate((rescaled(first), rescaled(second)))
+    start = np.concatenate((first.best, second.best))
     np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
-    assert not list(pairs({"one": [changes[0]], "other": [changes[0]]}, screen.sign))
+    same = replace(changes[0], term=terms[1])
+    assert pairs([changes[0], changes[0]], screen.sign) == pairs([changes[0], same], screen.sign) == []
 
 
 def test_gain_is_what_a_fit_achieves(screened):
@@ -79,7 +79,7 @@ def test_gain_is_what_a_fit_achieves(screened):
         found = kit.fitted(problem, term)
         prior = 0.5 * float(found.point.effect @ found.point.effect)
         assert none.objective - found.objective + prior == pytest.approx(change.gain, rel=0.02, abs=0.03)
-        assert rescaled(change)[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
+        assert change.best[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
 
 
 def test_noise_unknown_to_the_record_counts_by_what_is_left():
