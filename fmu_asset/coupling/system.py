@@ -109,7 +109,13 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
 def wiring_hash(wiring: Wiring, binding: Binding, *algorithm: str | float) -> str:
     """Return the SHA-256 of all that the meaning of a state depends on; places of files do not count."""
     components = [
-        (c.name, wiring.declared[c.name].sha256, wiring.settings[c.name], c.substeps, c.interface)
+        (
+            c.name,
+            wiring.declared[c.name].sha256,
+            sorted(wiring.settings[c.name].items()),  # files sort them
+            c.substeps,
+            c.interface,
+        )
         for c in wiring.structure.components
     ]
     bound = binding.model_dump(mode="json", exclude={"limits"})

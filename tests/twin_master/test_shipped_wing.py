@@ -12,6 +12,7 @@ from benchmarks.seeds import fly_seeds
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
 from tests.twin_master.runs import check_same, cut_off_after, of_wing
+from twin_master.assets.resolution import Overrides
 from twin_master.scenario.reading import parse_scenario
 from twin_master.store.writing import open_run
 from uav_twin import fly, load_scenario, resume
@@ -52,7 +53,7 @@ def test_the_whole_chain_and_its_resumption(wing, tmp_path):
 
 
 @pytest.mark.long
-def test_the_mission_is_the_same_with_the_compiled_wing(tmp_path):
+def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(tmp_path):
     loaded, groups = (
         load_scenario("paper_level_turns"),
         ("observed", "filtered", "smoothed", "predicted", "truth"),
@@ -62,13 +63,15 @@ def test_the_mission_is_the_same_with_the_compiled_wing(tmp_path):
     except FmuBuildError as error:
         pytest.skip(f"no C compiler: {error}")
     trees = []
-    for packed in ("python", "compiled"):
+    for name, packed in (("worker", "python"), ("inside", "python"), ("compiled", "compiled")):
         table = loaded.scenario.to_dict()
         table["asset"]["packed"] = packed
         scenario = replace(loaded, scenario=parse_scenario(table, "level_turns"))
-        trees.append(open_run(fly(scenario, tmp_path / packed).folder))
+        overrides = Overrides(in_process=name == "inside")
+        trees.append(open_run(fly(scenario, tmp_path / name, overrides).folder))
     with zipfile.ZipFile(tmp_path / "compiled" / "asset" / "asset.fmu") as archive:
         assert not any(name.endswith(".py") for name in archive.namelist())
     for group in groups:
-        plain, compiled = (tree[group].to_dataset() for tree in trees)
+        plain, inside, compiled = (tree[group].to_dataset() for tree in trees)
+        xr.testing.assert_equal(inside, plain)
         xr.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-12)

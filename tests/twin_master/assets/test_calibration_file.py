@@ -1,6 +1,7 @@
 """A calibration file in a scenario: what the twin draws from it, what the run keeps, what is refused."""
 
 import json
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from calibration.errors import CalibrationRecordError
 from calibration.result.file import description, plain_record, result_bytes, run_record, save_calibration
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
+from reporting.progress import SilentProgress
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.fmu_source import FmuSource
@@ -161,3 +163,19 @@ def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario
     with pytest.raises(MissionInputError, match=words):
         fly(load_scenario(scenario), tmp_path / "run", given, report=False)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.long
+def test_the_wing_among_several_fmus_is_tailored_too(file, tmp_path):
+    scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
+    assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
+    source = asset_source(scenario)
+    source.check()
+    (tmp_path / "run").mkdir()
+    hashes = source.prepare(tmp_path / "run", SilentProgress())
+    assert hashes["design"] == load_calibration(file).design_hash
+    with zipfile.ZipFile(tmp_path / "run" / "asset" / "components" / "wing.fmu") as archive:
+        record = json.loads(archive.read("resources/calibration.json"))
+    assert record["asset"] == "Wing 7 (é)"
+    moved = scenario.portable().moved(tmp_path / "run")
+    assert moved.asset.component[1].design == "calibration"

@@ -268,3 +268,15 @@ def test_rewards_are_those_of_the_sensors_that_have_a_limit(run, shown):
         else:
             error = np.nanmean(-np.abs(seen - values) / NOISE, axis=2).mean(axis=1)
             assert reward[2] == pytest.approx(probability @ error, rel=1e-7)
+
+
+@pytest.mark.long
+def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path):
+    library = Overrides(library=sampled(tmp_path))
+    fly(small_pump(), tmp_path / "asked")
+    fly(small_pump(), tmp_path / "sampled", library)
+    names = [f"csv/{file.name}" for file in (tmp_path / "asked" / "csv").iterdir()]
+    check_same(tmp_path / "sampled", tmp_path / "asked", *names)
+    # With another seed the draws are others, inside the sampled range only for some.
+    with pytest.raises(InvalidObservationLibraryError, match="scenario and seed"):
+        fly(small_pump(), tmp_path / "other", Overrides(library=library.library, seed=3))

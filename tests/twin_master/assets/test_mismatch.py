@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from benchmarks.misfit import find_misfit
 from benchmarks.seeds import fly_seeds
+from calibration.result.file import load_calibration, save_calibration
 from fe.runtime.patch import ModelPatch, SensorGain
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.packing.patch_file import SCHEMA
@@ -27,7 +28,12 @@ from twin_master.assets.asset_source import AssetReading, PairedSource, Stateles
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.errors import MissingObservationModelError, ScenarioError, TwinMasterError
+from twin_master.errors import (
+    MissingObservationModelError,
+    MissionInputError,
+    ScenarioError,
+    TwinMasterError,
+)
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
@@ -327,3 +333,22 @@ class TestOnTheWing:
         assert doubtful.early.value <= certain.early.value
         assert doubtful.evidence.value > certain.evidence.value
         assert certain.rms[1].value < 0.2
+
+
+@pytest.mark.long
+def test_the_twin_may_believe_a_calibrated_wing(library_file, tmp_path, make_calibration):
+    file = save_calibration(make_calibration(), tmp_path / "wing.nc")
+    overrides = Overrides(strain_library=library_file, calibration=file)
+    scenario = resolve_scenario(load_scenario("model_mismatch"), overrides)
+    source = asset_source(scenario)
+    source.check()
+    assert source.origin.differ
+    assert sorted(source.files()) == ["asset/UAVconfig.json", "asset/calibration.nc"]
+    (tmp_path / "run" / "asset").mkdir(parents=True)
+    hashes = source.prepare(tmp_path / "run", SilentProgress())
+    assert {"strain_library", "calibration", "design"} <= {*hashes}
+    assert hashes["design"] == load_calibration(file).design_hash
+    found = source.draws(3)
+    assert found.mean == load_calibration(file).mean("young_modulus_factor")
+    with pytest.raises(MissionInputError, match="brings its own samples"):
+        resolve_scenario(load_scenario("level_turns"), overrides)

@@ -109,7 +109,7 @@ def test_damage_is_found_from_frequencies_alone(tmp_path):
     def seen(count: int, deviation: Any) -> LoadedScenario:
         observation = {"role": "frequency", "count": count, "titles": [f"f{n}" for n in range(count)]}
         observation |= {"unit": "Hz", "standard_deviation": deviation, "standard_deviation_microstrain": ""}
-        truth = {"noise": {"standard_deviation": deviation}}
+        truth = {"noise": {"standard_deviation": deviation, "standard_deviation_microstrain": ""}}
         return short(observation=observation, rewards=rewards, truth=truth)
 
     tree, structure = fly(seen(3, [0.2, 0.4, 1.2]), tmp_path / "run"), load_and_assemble(FILE)
@@ -209,6 +209,15 @@ def test_ambient_records_tell_the_same_mode(file, tmp_path):
     true, seen, errors = features(fly(mission(file, **changes), tmp_path / "run"), TITLES[:3])
     assert np.all(np.abs(seen - true) < 4.0 * errors)
     assert errors[0, 0] < 0.01 * true[0, 0]
+
+
+@pytest.mark.long
+def test_a_resumed_flight_goes_on_with_its_records(file, tmp_path):
+    whole = new_run(mission(file), tmp_path / "whole", report=False).folder
+    with cut_off_after(3):
+        new_run(mission(file), tmp_path / "part", report=False)
+    resume(tmp_path / "part", report=False)
+    check_same(tmp_path / "part", whole, "csv/observed.csv", "csv/estimated.csv")
 
 
 @pytest.mark.parametrize(("changes", "sentence"), INPUTS.refused("modes"))

@@ -14,26 +14,28 @@ class HeatExchanger(Fmi2Slave):
         self.fouling = 0.0
         self.wall_temperature = 80.0
         self.conductance = 6000.0
+        self.specific_heat = 4186.0
         self.misbehaviour = 0.0
         self.outlet = 20.0
         self.middle = 20.0
         self.heat = 0.0
         for name in ("mass_flow", "fouling", "wall_temperature", "misbehaviour"):
             self.register_variable(Real(name, causality=Fmi2Causality.input))
-        self.register_variable(
-            Real("conductance", causality=Fmi2Causality.parameter, variability=Fmi2Variability.tunable)
-        )
+        for name in ("conductance", "specific_heat"):
+            self.register_variable(
+                Real(name, causality=Fmi2Causality.parameter, variability=Fmi2Variability.tunable)
+            )
         for name in ("outlet", "middle", "heat"):
             self.register_variable(Real(name, causality=Fmi2Causality.output))
 
     def do_step(self, current_time, step_size):
         """Set the outputs for the inputs of the step."""
         clean = self.conductance / (1.0 + self.fouling * self.conductance)
-        exponent = clean / (4186.0 * self.mass_flow)
+        exponent = clean / (self.specific_heat * self.mass_flow)
         rise = self.wall_temperature - 20.0
         self.middle = 20.0 + rise * (1.0 - math.exp(-0.5 * exponent))
         self.outlet = 20.0 + rise * (1.0 - math.exp(-exponent))
-        self.heat = 4186.0 * self.mass_flow * (self.outlet - 20.0)
+        self.heat = self.specific_heat * self.mass_flow * (self.outlet - 20.0)
         if self.misbehaviour and self.fouling > 1.5e-4:
             self.outlet = math.nan
         return True
