@@ -20,7 +20,7 @@ import xarray as xr
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
-from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.folders import lock_folder
 from reporting.json_file import parse_json
 from reporting.progress import Progress, Stage, reporter
@@ -235,15 +235,16 @@ def _difference(kept: bytes, record: dict[str, Any]) -> str:
 
 def _kept_rows(folder: Path, shape: tuple[int, int]) -> Float:
     """Return the observations (N, G) on disk, NaN where there is none yet; whoever fills them keeps them."""
-    path = folder / ROWS_NAME
+    path, sound = folder / ROWS_NAME, False
     with suppress(OSError, ValueError):  # there are none, or they are damaged
-        if np.load(path, mmap_mode="r").shape == shape:  # a file that is too short would grow to be written
-            rows: Float = np.load(path, mmap_mode="r+")
-            return rows
-    content = io.BytesIO()
-    np.save(content, np.full(shape, np.nan))
-    atomic_write_bytes(path, content.getvalue())
-    return _kept_rows(folder, shape)
+        sound = np.load(path, mmap_mode="r").shape == shape  # a short file would grow
+    if not sound:
+        content = io.BytesIO()
+        np.save(content, np.full(shape, np.nan))
+        atomic_write_bytes(path, content.getvalue())
+    with written(path):
+        rows: Float = np.load(path, mmap_mode="r+")
+    return rows
 
 
 def sampled_dataset(
