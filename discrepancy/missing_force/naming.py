@@ -20,7 +20,7 @@ from discrepancy.fits.problem import Problem
 
 from .filtered import Process, Solution
 from .hypotheses import LARGEST, Columns, both_signs, log_prior, scaled, stepped, variants
-from .view import Column, Motion, Processes, View, combined
+from .view import MOST_STEPS, Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 WIDE = 3.0
@@ -147,8 +147,6 @@ class ForceSearch:
     at : dict of str to Explained
         The missing force at each port: first along the model's own motion, for the initial states; then along
         the motion that was, with the parameters about where they are and the laws that the model has itself.
-    whole : Explained
-        Missing forces at all ports at once, or at those that matter most if they are many.
     """
 
     def __init__(self, problem: Problem, about: Point | None = None) -> None:
@@ -169,12 +167,12 @@ class ForceSearch:
                 self.at[name] = seen(view, first, self.at[name].processes if turn else first)
             if not turn and about is None:
                 self.point = self._point(self.best())
-        self.whole = self._together()
 
     # ---------------------------------------------------------------- where
 
-    def _together(self) -> Explained:
-        """Return missing forces at all ports at once, or at those that matter most if they are many."""
+    @cached_property
+    def whole(self) -> Explained:
+        """Missing forces at all ports at once, or at those that matter most if they are many."""
         best = self.best()
         ranked = sorted(self.at.values(), key=lambda item: -item.log_evidence)[:MOST_PORTS]
         if len(ranked) == 1:
@@ -340,21 +338,17 @@ class ForceSearch:
 
     def followed(self, base: Explained, candidate: Candidate, effect: FloatArray) -> Explained | None:
         """Return a hypothesis at its most probable values, begun beside another; None: it cannot be."""
-        processes, motions, share, settled = dict(base.processes), base.motions, 1.0, False
+        processes, motions, share, settled = base.processes, base.motions, 1.0, False
         best: Explained | None = None
         before = np.zeros(len(effect))
         for turn in range(ROUNDS):
             view = self.linear(base.view, motions, candidate, effect)
             if view is None:
                 break
-            if turn == 0 or settled or turn == ROUNDS - 1:
-                near = turn > 0
-                found = seen(view, self.about(processes), processes, candidate, effect, near=near)
-                processes = dict(found.processes)
-            else:
-                evidence = view.evidence(self.about(processes), processes)
-                smoothed = view.smoothed(processes)
-                found = Explained(candidate, effect, processes, evidence, view, *smoothed)
+            most = MOST_STEPS if settled or turn == ROUNDS - 1 else 0
+            about = self.about(processes)
+            found = seen(view, about, processes, candidate, effect, near=turn > 0, most=most)
+            processes = found.processes
             step = found.solution.mean[len(view.shared_precision) :] - effect
             far = np.where(np.abs(step) > SETTLED, step, 0.0)
             if far.any():  # a value that it cannot reach is not its own
@@ -401,7 +395,8 @@ def seen(
     effect: FloatArray = NO_VALUES,
     *,
     near: bool = False,
+    most: int = MOST_STEPS,
 ) -> Explained:
     """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begin, near=near)
+    processes, evidence = view.most_probable(about, begin, near=near, most=most)
     return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))

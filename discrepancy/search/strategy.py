@@ -227,8 +227,9 @@ class Search:
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, the best of them beside their optimum too, one law of free shape, more effects, any
-        two. The best candidate is computed finely before what rests on its evidence.
+        One effect, the best of them beside their optimum too; where it leaves more than noise in trials that
+        are all in motion, sets that follow the missing force; else `sets`. The best candidate is computed
+        finely before what rests on its evidence.
         """
         ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
         for rank, item in enumerate(ranked[: SEARCH.ridges]):
@@ -236,6 +237,13 @@ class Search:
             if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
                 self.keep(around(self.problem, item), exact=True)
         self.settle()
+        if self._moves and self.unexplained() and self.force is not None:
+            self.by_force(self.force)
+        else:
+            self.sets()
+
+    def sets(self) -> None:
+        """Search beyond one effect: a law of free shape, more effects, any two."""
         self.families()
         self.settle()
         # beside a law whose shape is free further effects would be anything
@@ -250,11 +258,8 @@ class Search:
         """Whether all trials are in motion."""
         return all(data.trial.is_dynamic for data in self.problem.trials)
 
-    def by_force(self) -> bool:
-        """Fit the sets of effects that follow the missing force best; False where that is not seen."""
-        force = self.force if self._moves else None
-        if force is None:
-            return False
+    def by_force(self, force: ForceSearch) -> None:
+        """Fit the sets of effects that follow the missing force best."""
         self.forces = force.name(self.effects)
         able = [
             one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
@@ -268,7 +273,6 @@ class Search:
             if found is not None:
                 self.keep(found, exact=True)
         self.settle()
-        return True
 
     def unexplained(self) -> bool:
         """Whether the best candidate cannot be shown to explain the data."""
@@ -388,6 +392,5 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
         if again is not None and again.objective < none.objective - SEARCH.worth_fitting:
             found = Search(problem, usable, again, tell=tell)
-    if not found.by_force():
-        found.run()
+    found.run()
     return found

@@ -203,7 +203,7 @@ def test_an_fmu_whose_system_is_not_known_shows_no_force(foreign_fmu, tmp_path):
     fmu = FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2"), unknown))
     try:
         problem = problem_of(released(ModelPatch((STIFF,))), fmu)
-        assert not Search(problem, (), fit(problem, Candidate(), problem.start(Candidate()))).by_force()
+        assert Search(problem, (), fit(problem, Candidate(), problem.start(Candidate()))).force is None
     finally:
         fmu.close()
 
