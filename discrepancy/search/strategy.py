@@ -12,7 +12,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
@@ -20,7 +20,7 @@ from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
-from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, slips, starts, tried
+from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, starts, tried
 
 
 @dataclass
@@ -227,15 +227,10 @@ class Search:
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, the best of them beside their optimum too; where it leaves more than noise in trials that
-        are all in motion, sets that follow the missing force; else `sets`. The best candidate is computed
-        finely before what rests on its evidence.
+        One effect; where it leaves more than noise in trials that are all in motion, sets that follow the
+        missing force; else `sets`. The best candidate is computed finely before what rests on its evidence.
         """
-        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
-        for rank, item in enumerate(ranked[: SEARCH.ridges]):
-            misses = absolute_gate(self.problem, item).passed is False
-            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
-                self.keep(around(self.problem, item), exact=True)
+        self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
         self.settle()
         if self._moves and self.unexplained() and self.force is not None:
             self.by_force(self.force)
@@ -279,30 +274,17 @@ class Search:
         return not absolute_gate(self.problem, self.best()).passed
 
     def settle(self) -> None:
-        """Compute the best candidate finely: joints that slip by more elements, motions by smaller steps."""
-        setting = self.problem.setting
-        if setting.joint_elements < SEARCH.fine_joint and slips(self.problem, self.best()):
-            ranked = self._ranked()
-            self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
-            self._fit_again([item for item in ranked if slips(self.problem, item)])
-            if slips(self.problem, self.best()):
-                self.keep(around(self.problem, self.best()), exact=True)
+        """Compute the best candidate finely: halve the time steps while they cost it too much."""
         while (
             self.problem.refinement < SEARCH.finest
             and solver_share(self.problem, self.best()) > SEARCH.solver_share
         ):
             self.problem.refinement *= 2
-            self._fit_again(self._ranked())
-
-    def _ranked(self) -> list[CandidateFit]:
-        return sorted(self.exact.values(), key=lambda item: -self.score(item))
-
-    def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
-        """Replace the best exact fits by those of the finer model from where they stand."""
-        for item in rough[: SEARCH.refitted]:
-            again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
-            if again is not None:  # else the rough one stands
-                self.exact[item.candidate.key] = again
+            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
+            for item in ranked[: SEARCH.refitted]:
+                again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
+                if again is not None:  # else the rough one stands
+                    self.exact[item.candidate.key] = again
 
     def longer(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
@@ -332,11 +314,9 @@ class Search:
             singles = [item for item in fitting if self.score(item) > close]
             if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
                 return
-        # a rival that fits is followed to its end; one that does not has to promise more than the best
-        give_up = None if fitting else self.best().objective
         kept: dict[tuple[str, str], CandidateFit] = {}
         for named in singles:
-            family = free_shape(self.problem, named, 0, give_up=give_up)
+            family = free_shape(self.problem, named, 0)
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
