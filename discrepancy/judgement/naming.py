@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.fitting import CandidateFit, free_shape
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
@@ -289,8 +290,10 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
     if not found.forces or first.verdict.kind is not VerdictKind.UNEXPLAINED:
         return first
     tell("nothing follows the missing force: comparing whole simulations")
-    second = replace(found, exact=dict(found.exact), rough=dict(found.rough), judged={}, wide=None)
+    again = attempt(problem, Candidate(), found.none.point)  # time steps may be finer by now
+    second = Search(problem, found.effects, again or found.none, tell=tell)
     second.force = found.force
+    second.singles()
     second.sets()
     other = _named(second)
     second.forces = found.forces

@@ -43,8 +43,15 @@ def starts(screen: Screen, effect: Effect, count: int = SEARCH.starts) -> list[C
     found: list[Change] = []
     places = effect.places(screen.problem.setting)
     for place in places:
+        best: list[Change] = []
         few = len(places) <= SEARCH.few_places
-        found += [change for change in screen.changes(Term(effect, place), fine=few) if change.size > 0.0]
+        for change in screen.changes(Term(effect, place), fine=few):
+            tried = [change]
+            if few and change.size > SEARCH.first_order and acts_within(effect, screen.problem.setting):
+                with suppress(DiscrepancyError):
+                    tried.append(screen.shrunk(change)[0])
+            best = sorted([*best, *(item for item in tried if item.size > 0.0)], key=_worth)[:count]
+        found.extend(best)
     return sorted(found, key=_worth)[:count]
 
 

@@ -12,7 +12,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
+from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
@@ -174,7 +174,7 @@ class Search:
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
         """Return a base with its nuisances where they are beside a missing force."""
         point = self.problem.start(base.candidate)
-        if self._moves and self.force is not None:
+        if self.moves and self.force is not None:
             along = self.force.whole
             if base.candidate.terms:
                 along = self.force.followed(along, base.candidate, base.effect) or along
@@ -224,18 +224,17 @@ class Search:
 
     # ---------------------------------------------------------------- the strategy
 
-    def run(self) -> None:
-        """Search: simple causes before others.
+    def singles(self) -> None:
+        """Search among single effects, and beside the optimum of the best of them.
 
-        One effect; where it leaves more than noise in trials that are all in motion, sets that follow the
-        missing force; else `sets`. The best candidate is computed finely before what rests on its evidence.
+        The best is computed finely before what rests on its evidence.
         """
-        self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
+        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
+        for rank, item in enumerate(ranked[: SEARCH.ridges]):
+            misses = absolute_gate(self.problem, item).passed is False
+            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
+                self.keep(around(self.problem, item), exact=True)
         self.settle()
-        if self._moves and self.unexplained() and self.force is not None:
-            self.by_force(self.force)
-        else:
-            self.sets()
 
     def sets(self) -> None:
         """Search beyond one effect: a law of free shape, more effects, any two."""
@@ -249,13 +248,13 @@ class Search:
         self.settle()
 
     @property
-    def _moves(self) -> bool:
+    def moves(self) -> bool:
         """Whether all trials are in motion."""
         return all(data.trial.is_dynamic for data in self.problem.trials)
 
     def by_force(self, force: ForceSearch) -> None:
-        """Fit the sets of effects that follow the missing force best."""
-        self.forces = force.name(self.effects)
+        """Compare the sets of effects that follow the missing force best, in place of what was fitted."""
+        self.exact, self.rough, self.forces = {(): self.none}, {}, force.name(self.effects)
         able = [
             one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
             if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
@@ -372,5 +371,11 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
         if again is not None and again.objective < none.objective - SEARCH.worth_fitting:
             found = Search(problem, usable, again, tell=tell)
-    found.run()
+    force = found.force if found.moves else None
+    if force is None or len(force.ports) > 1:  # forces at several ports take up nearly any law at one
+        found.singles()
+        if force is None or not found.unexplained():
+            found.sets()
+            return found
+    found.by_force(force)
     return found
