@@ -195,7 +195,7 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
     now, last = course.default_now(run) if now is None else now, run.steps - 1
-    if not 0 <= now <= last:
+    if now not in range(run.steps):
         raise RunFolderError(f"The present turn of the report must lie in 0..{last}, and {now} came.")
     units = ", ".join(
         dict.fromkeys("percent" if factor.unit == "%" else factor.unit for factor in run.factors)
