@@ -247,9 +247,7 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     assert np.isfinite(rows[:, 0, 24:]).all()
     worsening = Worsening.of(known.scenario)
     scaled, common = scaled_likelihood(known.sensor_model, rows.astype(float), control)
-    found = (
-        transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
-    )
+    found = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
     np.testing.assert_allclose(found, stored["log_evidence"].values.sum(axis=1), rtol=1e-5)
 
 
