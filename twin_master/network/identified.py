@@ -38,7 +38,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
         InvalidObservationError
             The length is another one, a value is infinite, or the covariance is none.
         """
-        return np.asarray(self.log_likelihood_sequence([observation], [control_index])[0])
+        return np.asarray(self.log_likelihood_sequence(np.asarray(observation)[None], [control_index])[0])
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence of such rows: (T, S)."""
