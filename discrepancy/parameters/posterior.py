@@ -197,7 +197,7 @@ class CutGaussian:
         root = np.linalg.inv(factor)
         at_ends = lsq_linear(root, root @ self.mean, (self.low, self.high), method="bvls").x
         normal = root @ (at_ends - self.mean)
-        return factor, normal - np.diag(factor) * (root.T @ normal)
+        return np.asarray(factor), np.asarray(normal - np.diag(factor) * (root.T @ normal))
 
     def weighed(self, means: FloatArray, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return draws (..., P) about means (..., P), and the logs of their weights (...).
@@ -246,14 +246,14 @@ class CutGaussian:
     @property
     def log_evidence(self) -> float:
         """Logarithm of its integral within the range, up to a constant [nat]."""
-        return self.whole + float(logsumexp(self.even[1])) - np.log(EVEN)
+        return float(self.whole + logsumexp(self.even[1]) - np.log(EVEN))
 
     def draws(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return a draw about each of the means (N, P), which stand in place of its own."""
         shape = (TRIED, *means.shape)
         points, weight = self.weighed(np.broadcast_to(means, shape), generator.random(shape))
         chosen = np.argmax(weight + generator.gumbel(size=weight.shape), axis=0)
-        return points[chosen, np.arange(len(means))]
+        return np.asarray(points[chosen, np.arange(len(means))])
 
 
 # ---------------------------------------------------------------- the posterior
@@ -383,7 +383,7 @@ def _along(
     values = np.interp(stratified(generator, count), mass, fine)
     nodes = np.array(sorted(others))
     means = np.array([others[node].mean for node in nodes.tolist()])
-    draws = np.insert(
+    draws: FloatArray = np.insert(
         Akima1DInterpolator(nodes, means)(np.clip(values, nodes[0], nodes[-1])), index, values, axis=1
     )
     nearest = np.abs(values[:, None] - nodes).argmin(axis=1)
