@@ -105,21 +105,50 @@ def test_a_linear_model_has_the_posterior_of_the_closed_form(tmp_path):
     assert result_bytes(again) == result_bytes(found)
 
 
-def test_of_two_parameters_the_range_of_one_tells_the_other():
-    values = noisy(line, 1.1, 0.7, seed=3)
-    model = choice_of(line, (1.0, 0.2, -3.0, 1.098), PRIORS[1])
-    found = calibrate_parameters(campaign_of(values), model, samples=20_000)
-    assert found.procedure == "quadrature"
-    grid = np.stack(np.meshgrid(np.linspace(1.02, 1.098, 400), np.linspace(0.4, 1.1, 700), indexing="ij"))
-    residual = values - line(FORCE, grid[..., None])
-    log = -0.5 * np.sum((residual / NOISE) ** 2, axis=-1)
-    log -= 0.5 * (((grid[0] - 1.0) / 0.2) ** 2 + ((grid[1] - 0.5) / 0.3) ** 2)
-    mass = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+def ridge(force, p):
+    return force / 10.0 * p[0] * p[1] + 0.5 * (force / 40.0) ** 2 * p[2]
+
+
+@pytest.mark.parametrize(
+    ("procedure", "law", "truth", "priors"),
+    [
+        ("Gaussian", line, (1.1, 0.7), ((1.0, 0.2, -3.0, 1.098), PRIORS[1])),
+        # both are cut off, the readings being up to ten deviations beyond either end
+        ("Gaussian", line, (1.1, 0.7), ((1.0, 0.2, -3.0, 1.06), (0.5, 0.3, -3.0, 0.6))),
+        ("Gaussian", line, (1.1, 0.7), ((1.2, 0.2, 1.12, 2.0), (0.9, 0.3, 0.72, 2.0))),
+        # one beside a bent valley of two, which ends, too
+        (
+            "quadrature",
+            ridge,
+            (1.0, 1.0, 0.9),
+            ((1.0, 0.3, 0.6, 1.2), (1.0, 0.3, 0.9, 2.0), (0.5, 0.3, -3.0, 0.8)),
+        ),
+    ],
+)
+def test_ranges_cut_off_the_posterior(procedure, law, truth, priors):
+    """Moments of a grid, which ends where less than a billionth is left."""
+    values = noisy(law, *truth, seed=3)
+    found = calibrate_parameters(campaign_of(values), choice_of(law, *priors), samples=20_000)
+    assert found.procedure == procedure
+    mean, deviation, *ends = np.array(priors).T
+    low, high = np.maximum(ends[0], mean - 6.0 * deviation), np.minimum(ends[1], mean + 6.0 * deviation)
+    size = 1_000_000 ** (1.0 / len(priors))
+    for _ in range(3):
+        share = (np.arange(int(size)) + 0.5) / int(size)
+        axes = [a + share * (b - a) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"))
+        log = -0.5 * sum(((v - law(f, grid)) / NOISE) ** 2 for f, v in zip(FORCE, values, strict=True))
+        log -= 0.5 * sum(((u - m) / d) ** 2 for u, m, d in zip(grid, mean, deviation, strict=True))
+        mass = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+        for at, axis in enumerate(axes):
+            left = axis[mass.sum(axis=tuple(np.delete(np.arange(len(axes)), at))) > 1e-9]
+            step = 0.5 * (axis[1] - axis[0])
+            low[at], high[at] = left[0] - step, left[-1] + step
     for place, axis in enumerate(grid):
-        mean = float(np.sum(mass * axis))
-        deviation = float(np.sqrt(np.sum(mass * (axis - mean) ** 2)))
-        assert found.samples[:, place].mean() == pytest.approx(mean, abs=0.03 * deviation)
-        assert found.samples[:, place].std() == pytest.approx(deviation, rel=0.03)
+        middle = float(np.sum(mass * axis))
+        spread = float(np.sqrt(np.sum(mass * (axis - middle) ** 2)))
+        assert found.samples[:, place].mean() == pytest.approx(middle, abs=0.03 * spread)
+        assert found.samples[:, place].std() == pytest.approx(spread, rel=0.03)
 
 
 def test_one_parameter_is_integrated_as_densely_as_one_likes():
