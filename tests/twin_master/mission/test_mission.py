@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.seeds import fly_seeds
 from reporting.errors import DiskFullError
 from tests.twin_master.runs import flight_of, journal, of_library, table_of
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
@@ -107,17 +106,12 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
         flight_of(*paper, asset=StatelessAsset(short))
 
 
-def test_study_on_the_published_library(published_library):
-    """Policy and reliability of the reference twin; the bars are those of 300 missions, widened for 60."""
-    knowledge, source = of_library("paper_level_turns", published_library, 0)
+def test_the_policy_on_the_published_library(published_library):
+    knowledge, _ = of_library("paper_level_turns", published_library, 0)
     z1 = knowledge.model.states.coordinates[:, 0]
     np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
     margin = (knowledge.plan.action_value[:, 1] - knowledge.plan.action_value[:, 0]).reshape(5, 5)
     np.testing.assert_allclose(margin[2:4], np.repeat([[0.007], [-0.059]], 5, axis=1), atol=5e-4)
-    study = fly_seeds(knowledge.scenario, source, range(60))
-    assert study.within.value >= 0.95
-    assert study.early.value <= 0.2
-    assert np.all([study.rms[0].value <= 0.045, study.rms[1].value <= 0.13])
 
 
 def truth_of(scenario: Scenario | str, seed: int = 1) -> Truth:
