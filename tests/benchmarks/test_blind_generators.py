@@ -154,7 +154,7 @@ def test_friction_behind_a_flexibility_sticks_where_a_rigid_one_sticks():
     assert period == pytest.approx(2.0 * np.pi / np.sqrt(2000.0), rel=5e-3)
 
 
-@pytest.mark.parametrize("share", [0.5, 0.97, 1.03, 3.0])
+@pytest.mark.parametrize("share", [0.5, 0.97, 1.01, 5.0])  # the last two have another branch far away
 def test_a_softening_spring_holds_loads_up_to_its_limit(share):
     """k x - c x^3 = F has a state on the way from rest up to F = 2/3 k sqrt(k / (3 c))."""
     cubic = 4e5

@@ -40,7 +40,7 @@ def paper(library_file: Path) -> Known:
     return of_library("paper_level_turns", library_file, 1)
 
 
-@pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges"])
+@pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"])
 def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
     knowledge, source = of_library(name, library_file)
 
@@ -60,8 +60,10 @@ def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
         assert rest.resumed_at == turns
         assert (tmp_path / JOURNAL_NAME).read_bytes() == content
         assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
+        assert rest.notices == whole.notices
         for array in ARRAYS:
             np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
+    assert whole.notices or name != "failing_gauges"
 
 
 def test_timing_of_a_turn(paper):
