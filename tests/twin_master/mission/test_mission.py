@@ -130,23 +130,6 @@ def test_the_papers_history():
     np.testing.assert_array_equal(history, np.array([z1, z2]).T / 100.0)
 
 
-def test_random_growth_follows_the_transitions_of_the_control():
-    scenario = load_scenario("growing_damage").scenario
-    model, worse = build_graphical_model(scenario), np.zeros((2, 2))
-    for seed in range(60):
-        truth = Truth(scenario, model, seed)
-        for control in (0, 1):
-            state = truth.state(0, None, None)
-            for step in range(1, 50):
-                new = truth.state(step, state, control)
-                assert np.all((new == state) | np.isclose(new, state + 0.2))
-                worse[control] += [np.sum((new > state)[state < 0.79]), np.sum(state < 0.79)]
-                state = new
-    rate = worse[:, 0] / worse[:, 1]
-    error = np.sqrt(rate * (1 - rate) / worse[:, 1])
-    assert np.all(np.abs(rate - [0.05, 0.10]) < 4 * error)
-
-
 def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn():
     noise = truth_of("level_turns", 7).noise
     np.testing.assert_array_equal(noise, truth_of("growing_damage", 7).noise)
