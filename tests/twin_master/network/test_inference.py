@@ -99,6 +99,8 @@ def test_extreme_likelihoods_equal_arbitrary_precision(seed, scale, steps, shift
     rng = np.random.default_rng(seed)
     model = random_model(rng, shape=(2, 3), zeros=0.6, product=product)
     assert model.transition.is_product is product
+    value, matrix = rng.normal(size=6), model.transition.matrix[1]
+    np.testing.assert_allclose(model.transition.expected(1, value), matrix @ value, atol=1e-14)
     control = rng.integers(0, 2, steps)
     log_likelihood = rng.normal(size=(steps, 6)) * scale + shift
     filtered, smoothed = infer(model, control, log_likelihood)
