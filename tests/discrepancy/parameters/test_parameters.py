@@ -108,27 +108,54 @@ def test_a_linear_model_has_the_posterior_of_the_closed_form(tmp_path):
     assert result_bytes(again) == result_bytes(found)
 
 
-def on_grid(law, values, priors, *axes):
-    """Return mean and deviation of each of two parameters, summed over all points of a grid."""
-    grid = np.meshgrid(*axes, indexing="ij")
-    log = -0.5 * np.sum(((values - law(FORCE, [axis[..., None] for axis in grid])) / NOISE) ** 2, axis=-1)
-    for axis, (mean, deviation, *_) in zip(grid, priors, strict=True):
-        log -= 0.5 * ((axis - mean) / deviation) ** 2
-    weight = np.exp(log - log.max())
-    means = [np.average(axis, weights=weight) for axis in grid]
-    squares = [np.average((axis - m) ** 2, weights=weight) for axis, m in zip(grid, means, strict=True)]
-    return zip(means, np.sqrt(squares), strict=True)
+def on_grid(law, values, priors):
+    """Yield mean and deviation of each parameter on a grid, which ends where less than a billionth is left."""
+    mean, deviation, *ends = np.array(priors).T
+    low, high = np.maximum(ends[0], mean - 6.0 * deviation), np.minimum(ends[1], mean + 6.0 * deviation)
+    size = 1_000_000 ** (1.0 / len(priors))
+    for _ in range(3):
+        share = (np.arange(int(size)) + 0.5) / int(size)
+        axes = [a + share * (b - a) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"))
+        log = -0.5 * sum(((v - law(f, grid)) / NOISE) ** 2 for f, v in zip(FORCE, values, strict=True))
+        log -= 0.5 * sum(((u - m) / d) ** 2 for u, m, d in zip(grid, mean, deviation, strict=True))
+        mass = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+        for at, axis in enumerate(axes):
+            left = axis[mass.sum(axis=tuple(np.delete(np.arange(len(axes)), at))) > 1e-9]
+            step = 0.5 * (axis[1] - axis[0])
+            low[at], high[at] = left[0] - step, left[-1] + step
+    for axis in grid:
+        middle = float(np.sum(mass * axis))
+        yield middle, float(np.sqrt(np.sum(mass * (axis - middle) ** 2)))
 
 
-def test_of_two_parameters_the_range_of_one_tells_the_other():
-    values = noisy(line, 1.1, 0.7, seed=3)
-    priors = (1.0, 0.2, -3.0, 1.098), PRIORS[1]
-    found = calibrate_parameters(campaign_of(values), choice_of(line, *priors), samples=20_000)
-    assert found.procedure == "quadrature"
-    dense = on_grid(line, values, priors, np.linspace(1.02, 1.098, 400), np.linspace(0.4, 1.1, 700))
-    for name, (mean, deviation) in zip(("p1", "p2"), dense, strict=True):
-        assert found.mean(name) == pytest.approx(mean, abs=0.03 * deviation)
-        assert found.standard_deviation(name) == pytest.approx(deviation, rel=0.03)
+def ridge(force, p):
+    return force / 10.0 * p[0] * p[1] + 0.5 * (force / 40.0) ** 2 * p[2]
+
+
+@pytest.mark.parametrize(
+    ("procedure", "law", "truth", "priors"),
+    [
+        ("Gaussian", line, (1.1, 0.7), ((1.0, 0.2, -3.0, 1.098), PRIORS[1])),
+        # both are cut off, the readings being up to ten deviations beyond either end
+        ("Gaussian", line, (1.1, 0.7), ((1.0, 0.2, -3.0, 1.06), (0.5, 0.3, -3.0, 0.6))),
+        ("Gaussian", line, (1.1, 0.7), ((1.2, 0.2, 1.12, 2.0), (0.9, 0.3, 0.72, 2.0))),
+        # one beside a bent valley of two, which ends, too
+        (
+            "quadrature",
+            ridge,
+            (1.0, 1.0, 0.9),
+            ((1.0, 0.3, 0.6, 1.2), (1.0, 0.3, 0.9, 2.0), (0.5, 0.3, -3.0, 0.8)),
+        ),
+    ],
+)
+def test_ranges_cut_off_the_posterior(procedure, law, truth, priors):
+    values = noisy(law, *truth, seed=3)
+    found = calibrate_parameters(campaign_of(values), choice_of(law, *priors), samples=20_000)
+    assert found.procedure == procedure
+    for place, (middle, spread) in enumerate(on_grid(law, values, priors), start=1):
+        assert found.mean(f"p{place}") == pytest.approx(middle, abs=0.03 * spread)
+        assert found.standard_deviation(f"p{place}") == pytest.approx(spread, rel=0.03)
 
 
 def test_one_parameter_is_integrated_as_densely_as_one_likes():
@@ -199,8 +226,7 @@ def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off():
     values = noisy(weak, 1.02, 2.6, seed=2)
     priors = ((1.0, 0.05, 0.9, 1.1), (2.5, 0.625, 1.25, 3.75))
     found = calibrate_parameters(campaign_of(values), choice_of(weak, *priors), samples=4000)
-    dense = on_grid(weak, values, priors, np.linspace(0.9, 1.1, 801), np.linspace(1.25, 3.75, 801))
-    for name, (mean, deviation) in zip(("p1", "p2"), dense, strict=True):
+    for name, (mean, deviation) in zip(("p1", "p2"), on_grid(weak, values, priors), strict=True):
         assert found.mean(name) == pytest.approx(mean, abs=0.05 * deviation)
         assert found.standard_deviation(name) == pytest.approx(deviation, rel=0.03)
     assert np.sum((found.samples[:, 1] == 1.25) | (found.samples[:, 1] == 3.75)) == 0

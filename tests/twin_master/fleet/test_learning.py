@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.twin_master.network.decision_oracles import enumerate_trajectories
+from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
@@ -227,6 +228,23 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
     found = scenario.observation.standard_deviation
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
+
+
+def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
+    """Readings of inspections, too: without them damage that is found and repaired would not have been."""
+    text = text_of("inspected_wing", ("steps = 120", "steps = 5"), ('policy = "belief"', 'policy = "qmdp"'))
+    path = written(tmp_path, text, ('first_control = "3g"', 'first_control = "inspect"'))
+    fleet = ensemble(str(path), range(3))
+    folder = fly_fleet(fleet, tmp_path / "fleet").folder
+    (stored,) = open_fleet(folder).values()
+    (group,) = fleet.groups
+    known = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
+    rows, control = stored["observed"].values, stored["control_index"].values.astype(int)
+    assert np.isfinite(rows[:, 0, 24:]).all()
+    worsening = Worsening.of(known.scenario)
+    scaled, common = scaled_likelihood(known.sensor_model, rows.astype(float), control)
+    found = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
+    np.testing.assert_allclose(found, stored["log_evidence"].values.sum(axis=1), rtol=1e-5)
 
 
 def test_what_was_learnt_must_fit(grown, tmp_path):
