@@ -109,7 +109,7 @@ def test_a_linear_model_has_the_posterior_of_the_closed_form(tmp_path):
 
 
 def on_grid(law, values, priors):
-    """Yield mean and deviation of each parameter on a grid, which ends where less than a billionth is left."""
+    """Yield mean and deviation of each parameter on a grid that ends where less than a billionth is left."""
     mean, deviation, *ends = np.array(priors).T
     low, high = np.maximum(ends[0], mean - 6.0 * deviation), np.minimum(ends[1], mean + 6.0 * deviation)
     size = 1_000_000 ** (1.0 / len(priors))
