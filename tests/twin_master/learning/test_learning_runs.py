@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from tests.command_line import said
 from tests.refusals import Inputs
 from tests.twin_master.runs import (
     changed_scenario,
-    check_same,
     figures_of,
     flight_of,
     journal,
@@ -27,7 +25,6 @@ from tests.twin_master.runs import (
     written,
 )
 from twin_master.errors import TwinMasterError
-from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import gap_of
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.model import learnt_figure, sensor_rows
@@ -38,7 +35,7 @@ from twin_master.scenario.tables import Noticing
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
-from uav_twin import ExactFilter, load_scenario, prepare_twin, resume
+from uav_twin import ExactFilter, load_scenario, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -349,13 +346,3 @@ def test_the_report_has_the_alarm(noticed):
     assert decided["key"] == "decided_by"
     assert f"what decides its control is: {decided['value']}" in text
     assert "gauge 12 shows 1e+14 microstrain" in text
-
-
-def test_a_run_that_was_cut_off_ends_the_same(noticed):
-    cut = Path(shutil.copytree(noticed, noticed.parent / "cut"))
-    lines = (cut / JOURNAL_NAME).read_text().splitlines(keepends=True)
-    (cut / JOURNAL_NAME).write_text("".join(lines[:6]))
-    for name in ("run.nc", "summary.json"):
-        (cut / name).unlink()
-    resume(cut, report=False)
-    check_same(cut, noticed, "run.nc", "summary.json")
