@@ -68,7 +68,7 @@ class FmuMotion(FmuPace):
             return sampled(values, step, times, orders, orders)
         amounts, still = self._amounts(case, linear=True), self._still(case)
         stamps, back = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
-        even = np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
+        even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
         if not even:  # as many lengths of steps as stamps would take long
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
         loads = [] if case.course is None else [Load(case.lever, case.course)]
