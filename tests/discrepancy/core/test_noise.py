@@ -90,14 +90,14 @@ def test_white_records_stay_white():
     assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
 
 
-@pytest.mark.parametrize("coefficients", [pytest.param((), marks=pytest.mark.long), (0.9,)])
-def test_lines_are_not_found_in_noise(coefficients):
-    """Level 1e-4 a line against a level known from 20 neighbours: (1 + 9.2 / 20)^-20 = 5e-4, three lines."""
+@pytest.mark.parametrize(("coefficients", "count", "records"), [((), 64, 4000), ((0.9,), 500, 700)])
+def test_lines_are_not_found_in_noise(coefficients, count, records):
+    """Level 1e-4 a line, three lines, however few neighbours tell the level of the noise."""
     generator = np.random.default_rng(7)
     found = sum(
-        len(without_lines(coloured(generator, coefficients, 500, 200), INTERVAL)[1]) for _ in range(700)
+        len(without_lines(coloured(generator, coefficients, count, 200), INTERVAL)[1]) for _ in range(records)
     )
-    assert found <= binom.isf(1e-3, 2100, 6e-4)
+    assert found <= binom.isf(1e-2, 3 * records, 1e-4)
 
 
 @pytest.mark.parametrize(
