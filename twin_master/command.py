@@ -222,7 +222,7 @@ def watch(
 
     The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed.
 
-    Everything is kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
+    Everything is kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up.
     """
     from twin_master.store.writing import REPORT_NAME
     from twin_master.watch import opening as from_python

@@ -44,7 +44,6 @@ from uav_twin import load_scenario
 from uav_twin import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
-ROOT = Path(__file__).parents[2]
 SAME = ("run.nc", "config.json", "summary.json", "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
 
 
@@ -382,13 +381,3 @@ def test_overrides(tmp_path, library_file):
     path = written(tmp_path, text_of("level_turns", ('binding = "uav_wing"', 'binding = "mine.toml"')))
     moved = resolve_scenario(load_scenario(path), Overrides())
     assert moved.asset.binding == str(tmp_path / "mine.toml")
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_kill_at_random_moments(library_file):
-    """A few trials; `python -m benchmarks.kill_and_resume --trials 20` makes more."""
-    words = ["-m", "benchmarks.kill_and_resume", "--trials", "1", "--seed", "5", "--", "--no-report"]
-    line = [sys.executable, *words, "--strain-library", str(library_file)]
-    result = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False, timeout=600)
-    assert "1 of 1 trials bit-identical" in result.stdout, result.stdout + result.stderr

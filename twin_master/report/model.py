@@ -294,6 +294,7 @@ def _residual_panel(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck
     axes.set_xlabel(run.step)
     axes.set_ylabel(run.sensors.word)
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
+    run.number_steps(axes.xaxis)
     axes.set_yticks(np.arange(1, count + 1, 4 if count > 8 else 1))
     style.panel_label(axes, "a", "Standardised residuals")
     style.color_bar(figure, image, "standard deviations", ax=axes, pad=0.015, fraction=0.03, extend="both")

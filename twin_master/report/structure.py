@@ -222,7 +222,12 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
     for place, (axes, name) in enumerate(zip(row, factors, strict=True)):
         chosen = policy.decide(centre @ triangle_of(model, place))
         axes.tripcolor(
-            mesh, facecolors=chosen, edgecolors="face", cmap=ListedColormap(colors), vmin=-0.5, vmax=count - 0.5
+            mesh,
+            facecolors=chosen,
+            edgecolors="face",
+            cmap=ListedColormap(colors),
+            vmin=-0.5,
+            vmax=count - 0.5,
         )
         for text, at in (("lowest", (0.0, -0.06)), ("highest", (1.0, -0.06)), ("not known", (0.5, 0.9))):
             axes.text(*at, text, ha="center", va="top" if at[1] < 0.0 else "bottom")

@@ -5,12 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from calibration.dynamics.records import read_records
-from discrepancy.campaign.noise_tests import holm
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import FitError
@@ -18,25 +16,11 @@ from discrepancy.location.backbone import backbones
 from discrepancy.location.dependence import modal_motion
 from discrepancy.location.locate import locate, outlier_remarks
 from discrepancy.location.map import residual_map
-from discrepancy.location.omnibus_tests import serial_tests, variance_test
+from discrepancy.location.omnibus_tests import variance_test
 from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
 from tests.discrepancy.bench import SHAPES, Bench, sensitivity, with_noise
 
 # ---------------------------------------------------------------- calibration of the whole
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("count", "freedom"), [(64, 200.0), (120, 20.0), (200, np.inf)])
-def test_global_false_alarms_are_one_percent(count, freedom):
-    bench = Bench(count=count, noise_freedom=freedom)
-    generator = np.random.default_rng([17, count])
-    alarms, cases = 0, 300
-    for _ in range(cases):
-        fitted = bench.fit(generator)
-        tests = (variance_test(fitted), *serial_tests(fitted, fitted.white(generator)))
-        alarms += any(holm([test.p_value for test in tests], 0.01))
-    # At 1 % more than 9 of 300 have a probability of 0.1 %.
-    assert alarms <= stats.binom.ppf(0.999, cases, 0.01)
 
 
 def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():

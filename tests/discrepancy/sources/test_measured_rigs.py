@@ -1,7 +1,5 @@
 """Rigs that others measured: their files as published become campaigns, and what the search says of them."""
 
-import os
-import re
 from functools import cache
 from math import pi
 from pathlib import Path
@@ -29,8 +27,6 @@ from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import chosen
 from uav_twin.cli import app
 
-PUBLIC = os.environ.get("UAV_TWIN_PUBLIC_RIGS")
-"""Folder of the files of `benchmarks.public_rigs`, as they were published."""
 PUBLISHED = Path(__file__).parents[3].parent / "shared" / "reference" / "measured"
 
 
@@ -176,26 +172,6 @@ def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name, tmp_
         "swinging_gate": (40.4, np.mean(swing)),
     }[name]
     assert (trial.time[0], trial.time[-1], trial.values[0, 0]) == pytest.approx((0.0, last, value), rel=1e-4)
-
-
-@pytest.mark.long
-@pytest.mark.skipif(PUBLIC is None, reason="UAV_TWIN_PUBLIC_RIGS names no folder of the published records")
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("coffee_filter", VerdictKind.UNEXPLAINED),
-        ("cooling_water", VerdictKind.NAMED_IN_PART),
-        ("swinging_gate", VerdictKind.UNEXPLAINED),
-    ],
-)
-def test_public_records_have_the_verdict_of_the_page(name, kind, tmp_path):
-    folder = write(name, Path(str(PUBLIC)), tmp_path / name)
-    verdict = investigate(folder, folder / "model.toml", thorough=False).verdict
-    assert verdict.kind is kind, verdict.sentence
-    if name == "cooling_water":
-        assert verdict.family == "outflow |x|^n"
-        low, high = map(float, re.search(r"of the level \S+ \((\S+) to (\S+)\)", verdict.sentence).groups())
-        assert 2.0 < low < high < 3.5
 
 
 # ---------------------------------------------------------------- the real wing's measurements

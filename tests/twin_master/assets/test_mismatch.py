@@ -319,21 +319,6 @@ class TestOnTheWing:
         with pytest.raises(MissingObservationModelError, match="predicts strains, and `frequency`"):
             asset_source(patched).check()
 
-    def test_study_on_the_published_library(self, wing, published_library):
-        """Our model holds the wing of the authors well enough to steer it; bounds for 30 missions."""
-        scenario, _, mixed = self.sources(wing, published_library)
-        knowledge = prepare_knowledge(scenario, mixed, 0)
-        misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
-        assert misfit.rms < 0.06
-        observation = scenario.observation.model_copy(update={"model_error": 0.03})
-        doubting = scenario.model_copy(update={"observation": observation})
-        certain, doubtful = (fly_seeds(chosen, mixed, range(30)) for chosen in (scenario, doubting))
-        assert certain.within.value >= 0.9
-        assert certain.rms[0].value <= 0.055
-        assert doubtful.early.value <= certain.early.value
-        assert doubtful.evidence.value > certain.evidence.value
-        assert certain.rms[1].value < 0.2
-
 
 @pytest.mark.long
 def test_the_twin_may_believe_a_calibrated_wing(library_file, tmp_path, make_calibration):

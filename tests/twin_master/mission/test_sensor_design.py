@@ -17,6 +17,7 @@ from scenarios import structure_files
 from tests.command_line import refused, said
 from tests.twin_master.runs import of_wing
 from twin_master.errors import MissionInputError
+from twin_master.mission import sensor_design
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations
 
@@ -38,6 +39,16 @@ def test_the_information_of_a_sensor_is_that_of_an_integral():
 
     exact = quad(entropy, -9.0, 12.0, limit=200)[0] - 0.5 * np.log2(2.0 * np.pi * np.e)
     assert readings.information([0]) == pytest.approx(exact, abs=0.01)
+
+
+@pytest.mark.parametrize("samples", [7, 30])
+def test_readings_are_drawn_in_states_that_are_all_alike_probable(samples, monkeypatch):
+    monkeypatch.setattr(sensor_design, "SAMPLES", samples)
+    for readings in drawn_readings(knowledge()):
+        times = np.bincount(readings.state, minlength=25)
+        assert times.max() == 1
+        assert times.sum() == min(samples, 25)
+        assert len({*(readings.state // 5)}) > 2  # not only where the first region is sound
 
 
 def test_what_moves_all_sensors_together_is_a_covariance():

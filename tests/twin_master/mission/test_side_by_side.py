@@ -20,7 +20,7 @@ from twin_master.mission.truth import DamageGrowth
 from twin_master.network.transition import TransitionModel
 from uav_twin import GraphicalModel, load_scenario
 
-ARRAYS = ("observed", "control_index", "state", "filtered", "log_evidence")
+ARRAYS = ("row", "control_index", "state", "filtered", "log_evidence")
 
 
 def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[Knowledge, StatelessAsset]:

@@ -110,15 +110,18 @@ def random_problem(seed, states=7, controls=3):
 
 
 @settings(max_examples=50, deadline=None)
-@given(seed=SEEDS, discount=st.sampled_from([0.0, 0.6, 0.9, 0.99]))
-def test_the_value_is_optimal_and_that_of_its_policy(seed, discount):
-    transition, reward = random_problem(seed)
+@given(seed=SEEDS, discount=st.sampled_from([0.0, 0.6, 0.9, 0.99]), product=st.booleans())
+def test_the_value_is_optimal_and_that_of_its_policy(seed, discount, product):
+    transition, reward = random_problem(seed, 6)
     model = TransitionModel((transition,))
+    if product:
+        model = TransitionModel(tuple(random_problem(seed, states)[0] for states in (2, 3)))
+        transition = model.matrix
     plan = value_iteration(model, reward, discount)
     scale = np.abs(reward).max() / (1.0 - discount)
-    for policy in (np.random.default_rng(seed).dirichlet(np.ones(3), 7), plan.policy):
+    for policy in (np.random.default_rng(seed).dirichlet(np.ones(3), 6), plan.policy):
         closed_loop = discount * np.einsum("su,ust->st", policy, transition)
-        exact = np.linalg.solve(np.eye(7) - closed_loop, (policy * reward).sum(axis=1))
+        exact = np.linalg.solve(np.eye(6) - closed_loop, (policy * reward).sum(axis=1))
         found = given_policy(model, reward, discount, policy)
         np.testing.assert_allclose(found.value, exact, rtol=0, atol=1e-12 * scale)
     np.testing.assert_allclose(plan.value, exact, rtol=0, atol=1e-11 * scale)
