@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -243,12 +243,11 @@ def synthetic_calibration(
         readings=(Reading("tip_stiffness", "load test", 682.1, 6.5),),
         measured=xr.Dataset(
             {
-                "load": ("pair", np.array([2.5, 5.0]), {"units": "N", "long_name": "load of the test"}),
-                "displacement": (
-                    "pair",
-                    np.array([0.004, 0.007]),
-                    {"units": "m", "long_name": "displacement of the test"},
-                ),
+                name: ("pair", np.array(values), {"units": unit, "long_name": f"{name} of the test"})
+                for name, unit, values in (
+                    ("load", "N", [2.5, 5.0]),
+                    ("displacement", "m", [0.004, 0.007]),
+                )
             }
         ),
         design=design,
@@ -259,6 +258,14 @@ def synthetic_calibration(
 def make_calibration() -> Callable[..., Calibration]:
     """What makes a calibration without a wing."""
     return synthetic_calibration
+
+
+@pytest.fixture(scope="module")
+def no_report() -> Iterator[None]:
+    """The report of a run has tests of its own and takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -254,11 +254,6 @@ def test_two_wings_are_two_fmus(wings, tmp_path):
     assert 1.0 < np.median(ratio) < stiff / soft * 1.01
 
 
-@pytest.fixture
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_the_truth_of_the_scenario_stays_and_a_run_needs_nothing_but_its_folder(wings, tmp_path):
