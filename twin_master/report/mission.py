@@ -299,8 +299,7 @@ def _joint_figure(run: Run) -> Figure:
     )
     image = None
     for number, turn in enumerate(turns):
-        row, column = divmod(number, columns)
-        axes = grid[row][column]
+        axes = grid[number // columns][number % columns]
         image = _map(
             axes, run, run["filtered/probability"][turn], cmap=_PROBABILITY_COLORS, vmin=0.0, vmax=1.0
         )
@@ -311,9 +310,9 @@ def _joint_figure(run: Run) -> Figure:
             x, y = run.scales * run.truth[turn]
             for color, width in (("white", 2.6), (style.TRUTH, 1.2)):
                 axes.plot(x, y, **_RING, markeredgecolor=color, markeredgewidth=width, label="truth")
-        axes.tick_params(labelbottom=row == rows - 1, labelleft=column == 0)
-        axes.set_xlabel(run.factors[0].label if row == rows - 1 else "", labelpad=2.0)
-        axes.set_ylabel(run.factors[1].label if column == 0 else "", labelpad=2.0)
+        axes.set_xlabel(run.factors[0].label, labelpad=2.0)
+        axes.set_ylabel(run.factors[1].label, labelpad=2.0)
+        axes.label_outer()
     for spare in [axes for row in grid for axes in row][len(turns) :]:
         spare.remove()
     height = figure.get_figheight()

@@ -59,12 +59,15 @@ def channel(samples, interval=INTERVAL):
 @pytest.mark.parametrize("coefficients", [(0.8,), (1.2, -0.6), (0.5, 0.0, 0.3)])
 def test_autoregression_is_recovered(coefficients):
     """Yule-Walker estimates have standard errors of about 1/sqrt(N)."""
-    found, innovation = autoregression(coloured(np.random.default_rng(1), coefficients, 8000))
+    series = coloured(np.random.default_rng(1), coefficients, 8000)
+    found, innovation = autoregression(series)
     padded = np.zeros(max(len(found), len(coefficients)))
     padded[: len(found)] = found
     padded[: len(coefficients)] -= coefficients
     assert np.abs(padded).max() < 5.0 / np.sqrt(8000)
     assert innovation == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 8000))
+    left = np.convolve(series, np.r_[1.0, -found])  # of the record in silence
+    assert innovation == pytest.approx(left @ left / (8000 - len(found) - 1.0), rel=1e-9)
 
 
 def test_model_of_a_coloured_record():

@@ -82,6 +82,15 @@ def test_gain_is_what_a_fit_achieves(screened):
         assert change.best[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
 
 
+def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
+    """At 7 Hz in both ring-downs, where the first mode has 3 Hz."""
+    line = 0.1 * np.cos(2.0 * np.pi * 7.0 * 0.01 * np.arange(200))
+    problem = kit.closed_problem(kinds=("ringdown",), samples=200, extra=lambda rows: line)
+    (mode,) = kit.chosen("unmodelled_mode")
+    change = next(Screen(problem, kit.fitted(problem)).changes(Term(mode, "y1")))
+    assert mode.parameters[0].prior.value(change.start[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
+
+
 def test_noise_unknown_to_the_record_counts_by_what_is_left():
     """With n0 = 0 the residual's own size stands for the noise: gains do not depend on the stand-in scale."""
     sizes = []

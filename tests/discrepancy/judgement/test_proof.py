@@ -19,7 +19,15 @@ from discrepancy.judgement.consistency_gate import (
     score_tests,
 )
 from discrepancy.judgement.naming import name
-from discrepancy.judgement.proof import correlation_time, gap_closed, log_density, prove, score_gain, scores
+from discrepancy.judgement.proof import (
+    correlation_time,
+    gap_closed,
+    held_out_gate,
+    log_density,
+    prove,
+    score_gain,
+    scores,
+)
 from discrepancy.verdict import VerdictKind
 from tests.discrepancy.bench import Bench, with_noise
 from tests.discrepancy.core import kit
@@ -74,7 +82,9 @@ def test_a_closed_gap_is_one_and_an_open_gap_zero():
     """Half the error leaves a quarter of the gap."""
     bench = Bench(amplitudes=MANY, held_out=HELD)
     before = bench.fit(np.random.default_rng(5), extra=lacking(bench, 25.0))
-    proof = prove(before, bench.fit(np.random.default_rng(5)))
+    after = bench.fit(np.random.default_rng(5))
+    assert [held_out_gate(item).passed for item in (before, after)] == [False, True]
+    proof = prove(before, after)
     assert proof.held_out_before.chi_square_per_dof > 3.0
     assert proof.gap_closed == pytest.approx(1.0, abs=0.1)
     assert proof.gap_reason == ""
@@ -96,6 +106,7 @@ def test_no_gap_is_said_and_not_divided_by():
     assert isnan(proof.gap_closed)
     assert "show no gap before" in proof.gap_reason
     bare = with_noise(fitted, None)
+    assert held_out_gate(bare).passed is None
     proof = prove(bare, bare)
     assert isnan(proof.held_out_after.chi_square_per_dof)
     assert "No noise record" in proof.gap_reason

@@ -282,7 +282,7 @@ def test_the_last_turns_of_a_watch_have_their_numbers(run, tmp_path):
     assert "now: 1020" in told
     labels = [label.get_text() for label in drawn.axes[-1].get_xticklabels()]
     assert {"1000", "1010"} <= {*labels}
-    assert "turn 1049" in [axes.get_title() for axes in figures["belief"].figure.axes]
+    assert "turn 1049" in [axes.get_title("left") for axes in figures["belief"].figure.axes]
     assert lost_ranges(read_run(place)) == "gauge 3 at turns 1008–1009; all gauges at turn 1007"
     with pytest.raises(RunFolderError, match=r"must lie in 1000\.\.1049, and 49 came"):
         report.write_report(place, now=49)

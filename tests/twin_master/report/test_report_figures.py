@@ -126,6 +126,8 @@ def test_belief_maps_show_the_joint_belief(run):
         mesh = axes.collections[0].get_array().reshape(5, 5)
         assert_array_equal(mesh, run["filtered/probability"][turn].reshape(5, 5).T)
         assert f"turn {turn}" in axes.get_title(loc="left")
+    named = [(bool(axes.get_xlabel()), bool(axes.get_ylabel())) for axes in figure.axes[:8]]
+    assert named == [(lowest, first) for lowest in (False, True) for first in (True, *(False,) * 3)]
 
 
 @pytest.mark.parametrize("count", [1, 3])
