@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ import xarray as xr
 from benchmarks.seeds import fly_seeds
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
-from reporting.progress import SilentProgress
-from tests.twin_master.runs import changed_scenario, check_resumed, of_wing
-from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from tests.twin_master.runs import check_resumed, of_wing
+from twin_master.assets.resolution import Overrides
+from twin_master.scenario.reading import parse_scenario
+from twin_master.store.writing import open_run
 from uav_twin import fly, load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing"), pytest.mark.usefixtures("no_report")]
@@ -47,16 +49,26 @@ def test_the_whole_chain_and_its_resumption(wing, tmp_path):
     check_resumed(outcome.folder, loaded, tmp_path / "part", 23, *names)
 
 
-@pytest.mark.parametrize("name", ["paper_level_turns", "bracket"])
-def test_what_flies_is_compiled_where_that_is_asked_for(name, tmp_path):
-    """And shows what the one in Python shows, as the contract of all assets says."""
+@pytest.mark.long
+def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(tmp_path):
+    loaded, groups = (
+        load_scenario("paper_level_turns"),
+        ("observed", "filtered", "smoothed", "predicted", "truth"),
+    )
     try:
         find_compiler()
     except FmuBuildError as error:
         pytest.skip(f"no C compiler: {error}")
-    compiled = changed_scenario(name, {"asset": {"packed": "compiled"}})
-    source = asset_source(resolve_scenario(compiled, Overrides()))
-    source.check()
-    source.prepare(tmp_path, SilentProgress())
-    with zipfile.ZipFile(tmp_path / "asset" / "asset.fmu") as archive:
-        assert not any(member.endswith(".py") for member in archive.namelist())
+    trees = []
+    for name, packed in (("worker", "python"), ("inside", "python"), ("compiled", "compiled")):
+        table = loaded.scenario.to_dict()
+        table["asset"]["packed"] = packed
+        scenario = replace(loaded, scenario=parse_scenario(table, "level_turns"))
+        overrides = Overrides(in_process=name == "inside")
+        trees.append(open_run(fly(scenario, tmp_path / name, overrides).folder))
+    with zipfile.ZipFile(tmp_path / "compiled" / "asset" / "asset.fmu") as archive:
+        assert not any(name.endswith(".py") for name in archive.namelist())
+    for group in groups:
+        plain, inside, compiled = (tree[group].to_dataset() for tree in trees)
+        xr.testing.assert_equal(inside, plain)
+        xr.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-12)

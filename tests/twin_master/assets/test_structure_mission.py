@@ -16,15 +16,8 @@ from fe.runtime.errors import FiniteElementError, InvalidDesignError
 from fe.structure.operators import load_and_assemble
 from tests.refusals import Inputs
 from tests.twin_master.runs import (
-    check_resumed,
-    check_same,
-    cut_off_after,
-    edited,
-    loaded_from,
-    merged,
-    table_of,
-    written,
-)
+    check_resumed, check_same, cut_off_after, edited, loaded_from, merged, table_of, written,
+)  # fmt: skip
 from twin_master.assets.candidates import with_candidates
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.assets.structure_source import StructureBelief
