@@ -339,8 +339,9 @@ def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
     Another run is no repeat; a noise of twice the record's counts half.
     """
     readings = np.random.default_rng(4).normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
-    *trials, other = repeats(np.vstack((readings, [100.0, 200.0, 300.0, 400.0])))
-    trials, other = [replace(each, noise_factor=2.0) for each in trials], replace(other, run="B")
+    rows = repeats(np.vstack((readings, [100.0, 200.0, 300.0, 400.0])))
+    *trials, other = (replace(row, noise_factor=2.0) for row in rows)
+    other = replace(other, run="B")
     rest = 0.5 * (readings - readings.mean(axis=0))
     for zero, freedom, left in ((0.0, 8.0, rest), (math.inf, 6.0, rest - rest.mean(axis=1, keepdims=True))):
         channels = {"w": replace(W, offset_deviation=zero)}
