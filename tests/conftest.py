@@ -236,10 +236,7 @@ def synthetic_calibration(
         measured=xr.Dataset(
             {
                 name: ("pair", np.array(values), {"units": unit, "long_name": f"{name} of the test"})
-                for name, unit, values in (
-                    ("load", "N", [2.5, 5.0]),
-                    ("displacement", "m", [0.004, 0.007]),
-                )
+                for name, unit, values in (("load", "N", [2.5, 5.0]), ("displacement", "m", [0.004, 0.007]))
             }
         ),
         design=design,
