@@ -259,7 +259,7 @@ def _check_words(run: Run, check: tailored.PredictiveCheck) -> dict[str, str | b
     if len(check.transform):
         sensor = int(np.nanargmin(check.coverage))
         lowest = f"{small(sensors.titles[sensor])}, {100.0 * check.coverage[sensor]:.0f} %"
-    learnt = run.get("filtered/noise_standard_deviation") is not None
+    learnt = run.scenario.learning is not None
     return {"noise": told, "error": share if high else "", "lowest": lowest, "learnt": learnt}
 
 
