@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
+from scipy.stats import binom
 
 from calibration.dynamics.records import read_records
 from discrepancy.campaign.protocol import Release
@@ -48,7 +49,7 @@ def test_a_short_noise_record_makes_no_pattern_over_the_channels():
         told += sum(
             bool(singular_patterns(fitted, kind)) for kind in kinds_of(fitted, fitted.white(generator))
         )
-    assert told <= stats.binom.isf(1e-3, 80, 0.01)
+    assert told <= binom.isf(1e-3, 80, 0.01)
 
 
 def test_variance_test_counts_only_what_the_fit_leaves():
