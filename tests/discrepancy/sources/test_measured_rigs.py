@@ -14,14 +14,7 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import load_model
-from discrepancy.sources.measured_rigs import (
-    READING_ERROR,
-    SIGNAL,
-    TIP,
-    wing_campaign,
-    write_rig_campaign,
-    write_wing_campaign,
-)
+from discrepancy.sources.measured_rigs import READING_ERROR, SIGNAL, TIP, write_rig_campaign
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import chosen
@@ -202,6 +195,10 @@ def write_records(folder, count=4, size=795, seed=3):
     return np.asarray(zero)
 
 
+def wing_campaign(data, **options):
+    return read_campaign(write_rig_campaign("real_wing", data, data / "campaign", **options))
+
+
 def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path):
     write_records(tmp_path)
     plain = wing_campaign(tmp_path, detrended=False, columns=1)
@@ -235,15 +232,11 @@ def test_a_folder_without_records_or_with_too_short_ones_is_refused(tmp_path):
 
 
 @pytest.mark.skipif(not WING.is_dir(), reason="the published measurements are not beside the project")
-def test_the_published_measurements_make_a_campaign_that_reads_back(tmp_path):
-    made = wing_campaign(WING)
+def test_the_published_measurements_make_a_campaign(tmp_path):
+    made = read_campaign(write_rig_campaign("real_wing", WING, tmp_path / "campaign"))
     assert [trial.kind for trial in made.trials] == [TrialKind.STATIC] * 2 + [TrialKind.RINGDOWN] * 5
     assert [trial.name for trial in made.held_out] == ["release 3", "release 5"]
     np.testing.assert_allclose(made.trials[0].force, [2.4525, 4.905, 7.3575, 9.81])
     np.testing.assert_allclose(made.trials[1].values[:, 0], [3.3528e-3, 7.2898e-3, 10.7442e-3, 13.7922e-3])
     assert made.channels[TIP].noise is not None
-    read = write_wing_campaign(WING, tmp_path / "campaign")
-    for one, other in zip(made.trials, read.trials, strict=True):
-        np.testing.assert_array_equal(one.values, other.values)
-        assert one.release == other.release
-    assert read.parameters == made.parameters
+    assert made.parameters["young_modulus_factor"] == (1.008, 0.0103)

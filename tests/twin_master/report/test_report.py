@@ -16,7 +16,7 @@ from calibration.result.file import run_record
 from reporting.figures import to_svg
 from reporting.page import ReportFigure
 from reporting.words import number
-from tests.refusals import Inputs
+from tests.refusals import Inputs, refused
 from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
 from twin_master.errors import RunFolderError
 from twin_master.report import page as report
@@ -252,9 +252,8 @@ def test_a_damaged_run_gives_one_sentence(run, tmp_path, file, content, sentence
     (place / file).unlink()
     if content:
         (place / file).write_text(content, encoding="utf-8")
-    with pytest.raises(RunFolderError, match=sentence) as caught:
+    with refused(RunFolderError, sentence):
         report.write_report(place)
-    assert "\n" not in str(caught.value)
     assert not (place / "report.html").exists()
 
 
@@ -282,7 +281,7 @@ def test_the_last_turns_of_a_watch_have_their_numbers(run, tmp_path):
     assert "now: 1020" in told
     labels = [label.get_text() for label in drawn.axes[-1].get_xticklabels()]
     assert {"1000", "1010"} <= {*labels}
-    assert "turn 1049" in [axes.get_title() for axes in figures["belief"].figure.axes]
+    assert "turn 1049" in [axes.get_title("left") for axes in figures["belief"].figure.axes]
     assert lost_ranges(read_run(place)) == "gauge 3 at turns 1008–1009; all gauges at turn 1007"
     with pytest.raises(RunFolderError, match=r"must lie in 1000\.\.1049, and 49 came"):
         report.write_report(place, now=49)
