@@ -10,11 +10,7 @@ from calibration.dynamics.trials import average
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import read_lengths
 from calibration.paper.procedure import read_published_results
-from calibration.static.experiments import (
-    LOAD_STANDARD_DEVIATION,
-    published_measurements,
-    read_measurements,
-)
+from calibration.static.experiments import LOAD_STANDARD_DEVIATION, published_measurements, read_measurements
 from calibration.wing.lab_data import WEIGHED_MASS_FILE, published_data, read_lab_folder, read_weighed_mass
 from tests.refusals import Inputs, refused
 

@@ -60,11 +60,9 @@ def fly(
 
 
 @pytest.fixture(scope="module")
-def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
+def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory, no_report: None) -> RunOutcome:
     """The mission of level turns; tests change copies of its folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
-        return fly(tmp_path_factory.mktemp("flown") / "run", library_file)
+    return fly(tmp_path_factory.mktemp("flown") / "run", library_file)
 
 
 @pytest.fixture

@@ -280,7 +280,12 @@ def in_a_terminal(folder: Path, answers: list[str], *words: str) -> tuple[int, s
 
 
 def test_a_terminal_is_asked(tmp_path):
+    """And a no writes nothing."""
     (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
+    code, screen = in_a_terminal(tmp_path, ["ringdown", ",", "tip", "mm", "12 mm", "n"], "swing.csv")
+    assert code == 1, screen
+    assert "Nothing was written." in screen
+    assert [path.name for path in Path().iterdir()] == ["swing.csv"]
     answers = ["swinging", "ringdown", ",", "tip", "miles per hour", "mm", "12 mm", "y"]
     code, screen = in_a_terminal(tmp_path, answers, "swing.csv", "--out", "lab")
     assert code == 0, screen
@@ -289,14 +294,6 @@ def test_a_terminal_is_asked(tmp_path):
     read = read_campaign(tmp_path / "lab")
     assert read.trials[0].values[1, 0] == 2e-3
     assert read.trials[0].release.displacement == 0.012
-
-
-def test_a_no_writes_nothing(tmp_path):
-    (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
-    code, screen = in_a_terminal(tmp_path, ["ringdown", ",", "tip", "mm", "12 mm", "n"], "swing.csv")
-    assert code == 1, screen
-    assert "Nothing was written." in screen
-    assert [path.name for path in Path().iterdir()] == ["swing.csv"]
 
 
 RIG = ("--model", "single_mass_rig")

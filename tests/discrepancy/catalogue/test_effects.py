@@ -170,9 +170,10 @@ def test_sizes_in_closed_form(setting):
     assert drag.coefficient > 10.0 * most
     coupling = only(setting, "high_pass", {"corner_ratio": 0.1}, EVERY_CHANNEL)
     assert 1.0 / coupling.time_constant == pytest.approx(0.1 * scales.angular_frequency)
-    crack = only(setting, "breathing_crack", {"stiffness_loss": 0.2}, "root, upper skin")
-    assert (crack.side, crack.exponent, np.sign(crack.coefficient)) == (-1, 1.0, -1.0)
-    assert only(setting, "breathing_crack", {"stiffness_loss": 0.2}, "root, lower skin").side == 1
+    for skin, side, loss, lost in (("upper", -1, 0.2, 0.2), ("lower", 1, 2.0, 0.9)):
+        crack = only(setting, "breathing_crack", {"stiffness_loss": loss}, f"root, {skin} skin")
+        force = -lost * root.static_stiffness * crack.reference_displacement
+        assert (crack.side, crack.exponent, crack.coefficient) == (side, 1.0, pytest.approx(force))
     root_spring = only(setting, "root_compliance", {"compliance_share": 0.1})
     assert root_spring.compliance * LENGTH**2 * scales.tip_stiffness == pytest.approx(0.1)
     waves = {"frequency_ratio": 2.0, "damping_ratio": 0.01, "cosine_ratio": 0.1, "sine_ratio": 0.0}

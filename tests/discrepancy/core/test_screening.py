@@ -28,10 +28,7 @@ def screened():
     problem = kit.closed_problem(seed=12, effect=0.12)
     none = kit.fitted(problem)
     screen = Screen(problem, none)
-    terms = (
-        Term(kit.offset_effect(deviation=10.0), "y1"),
-        Term(kit.drift_effect(deviation=10.0), "y1"),
-    )
+    terms = (Term(kit.offset_effect(deviation=10.0), "y1"), Term(kit.drift_effect(deviation=10.0), "y1"))
     return problem, none, screen, terms, [next(iter(screen.changes(term))) for term in terms]
 
 

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from evidence.identification.targets import (
-    FITTED_LEVELS,
-    LEVELS,
-    fitted_states,
-    read_targets,
-)
+from evidence.identification.targets import FITTED_LEVELS, LEVELS, fitted_states, read_targets
 from twin_master.errors import InvalidStrainLibraryError
 
 RESULTS = Path("calibration") / "step3" / "massoptimizationresults.csv"

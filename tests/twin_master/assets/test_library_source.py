@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
 from scenarios import asset_scripts
-from tests.refusals import Inputs
+from tests.refusals import Inputs, refused
 from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, merged, table_of
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
@@ -143,9 +143,8 @@ def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
         wrong.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
         cases[name] = "finite"
     for name, words in cases.items():
-        with pytest.raises(InvalidObservationLibraryError, match=words) as caught:
+        with refused(InvalidObservationLibraryError, words):
             load_observation_library(tmp_path / f"{name}.nc")
-        assert "\n" not in str(caught.value)
     given = Overrides(strain_library=library_file)
     with pytest.raises(InvalidObservationLibraryError, match="kind `strain_library`, and one FMU can be"):
         grid_of_scenario(load_scenario("level_turns"), tmp_path, overrides=given)

@@ -28,12 +28,7 @@ from twin_master.assets.asset_source import AssetReading, PairedSource, Stateles
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.errors import (
-    MissingObservationModelError,
-    MissionInputError,
-    ScenarioError,
-    TwinMasterError,
-)
+from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError, TwinMasterError
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge

@@ -29,11 +29,7 @@ def small_content(levels: list[list[int]] = LEVELS) -> dict[str, Any]:
         }
         for z1 in levels[0]
     }
-    return {
-        "states": levels,
-        "controls": ["2g", "3g"],
-        "observations": observations,
-    }
+    return {"states": levels, "controls": ["2g", "3g"], "observations": observations}
 
 
 def loaded(folder: Path, content: object) -> StrainLibrary:

@@ -15,15 +15,7 @@ from reporting.page import ReportFigure
 from scenarios import scenario_files
 from tests.command_line import said
 from tests.refusals import Inputs
-from tests.twin_master.runs import (
-    changed_scenario,
-    figures_of,
-    flight_of,
-    journal,
-    of_wing,
-    text_of,
-    written,
-)
+from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
 from twin_master.errors import TwinMasterError
 from twin_master.mission.loop import gap_of
 from twin_master.mission.turns import History, Reading, Turn

@@ -29,12 +29,7 @@ from twin_master.mission.planning import (
     read_policy,
     risk_of,
 )
-from twin_master.mission.preparation import (
-    Knowledge,
-    keep_knowledge,
-    kept_knowledge,
-    knowledge_of,
-)
+from twin_master.mission.preparation import Knowledge, keep_knowledge, kept_knowledge, knowledge_of
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, rationed

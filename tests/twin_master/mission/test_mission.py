@@ -14,11 +14,7 @@ from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError, NotResumableError
 from twin_master.mission import loop
-from twin_master.mission.journal import (
-    JOURNAL_NAME,
-    JournalFile,
-    line_of,
-)
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
 from twin_master.mission.loop import fly, kept_in, taken_up
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Plant, SensorStatus, Truth

@@ -10,11 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from tests.twin_master.runs import loaded_from, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.errors import (
-    InvalidDistributionError,
-    InvalidModelError,
-    TwinMasterError,
-)
+from twin_master.errors import InvalidDistributionError, InvalidModelError, TwinMasterError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network import memory
 from twin_master.network import transition as transition_file
