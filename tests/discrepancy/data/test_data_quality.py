@@ -28,6 +28,7 @@ from fe.runtime.patch import (
     SensorGain,
     SensorRotation,
 )
+from tests.discrepancy.core import kit
 from tests.refusals import Inputs
 
 PLAN = ExamplePlan(
@@ -166,6 +167,14 @@ def test_signs(cantilever, campaign):
         return values
 
     assert not check_against_model(shown(campaign, cool, TrialKind.FLIGHT), cantilever)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_reading_that_passes_zero_at_once_has_a_sign(sign):
+    """In its second sample: y2 begins at a tenth of its amplitude, where two modes nearly cancel."""
+    problem = kit.closed_problem(seed=2, kinds=("ringdown",), samples=300)
+    faults = check_against_model(scaled(problem.campaign, "y2", sign), problem.model)
+    assert kinds_of(faults) == ({(FaultKind.SIGN, "y2")} if sign < 0.0 else set())
 
 
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
