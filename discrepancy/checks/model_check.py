@@ -234,7 +234,8 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: Bool
     # Before the first return through zero no error of frequency matters.
     crossing = np.flatnonzero(np.sign(model) != np.sign(model[0]))
     until = max(int(crossing[0]) if crossing.size else len(model), 3)
-    return ratio * (float(np.sign(np.median(centred[:until] * np.sign(model[:until])))) or 1.0)
+    # each sample has one vote, as heavy as the prediction: none of a single wrong reading decides
+    return ratio * (float(np.sign(np.sign(centred[:until]) @ model[:until])) or 1.0)
 
 
 # ---------------------------------------------------------------- signs
