@@ -108,10 +108,10 @@ class LearntExpectation:
         seen : (G,) or None
             What the sensors say, SI.
         """
-        model, priors = self.learning.sensor_model, self.learning.priors
+        model, (name, values) = self.learning.sensor_model, self.learning.draws or ("", ())
         share = model.draw_weight
-        if (parameter := learnt.get(priors.parameter or "")) is not None:
-            draws = np.asarray(priors.draws, dtype=np.float64)
+        if (parameter := learnt.get(name)) is not None:
+            draws = np.asarray(values, dtype=np.float64)
             order = np.argsort(draws)
             at = parameter.mean + np.array([-1.0, 1.0]) * parameter.standard_deviation
             near = np.eye(len(draws))[:, order]

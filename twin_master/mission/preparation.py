@@ -23,7 +23,7 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.learning.words import Words
 from twin_master.mission.planning import planned
@@ -91,17 +91,13 @@ class Knowledge:
         if learning is None:
             return None
         units = set(scenario.observation.sensor_units)
-        priors = LearntPriors(
-            parameter=scenario.calibration.parameter if learning.parameter else None,
-            draws=self.draws.values,
-            noise_degrees=learning.noise_degrees if learning.noise else 0.0,
-            gain=learning.gauge_gain,
-            offset=learning.gauge_offset,
-            sensor_unit=units.pop() if len(units) == 1 else "",
-        )
+        draws = (scenario.calibration.parameter, self.draws.values) if learning.parameter else None
         factors = learning.transition_factors
         moves = {factor: build_graphical_model(scenario, factor).transition for factor in factors}
-        return LearningFilter(self.model, self.sensor_model, priors, moves, scenario.mission.name)
+        return LearningFilter(
+            self.model, self.sensor_model, learning, draws, moves, scenario.mission.name,
+            sensor_unit=units.pop() if len(units) == 1 else "",
+        )  # fmt: skip
 
     @cached_property
     def estimator(self) -> Estimator:

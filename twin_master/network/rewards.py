@@ -41,6 +41,15 @@ def _error_moments(observation: Float, shown: Float, variance: Float, scale: Flo
     return -(folded * unit).sum(axis=-1), (left * unit**2).sum(axis=-1)
 
 
+def _mixed(weight: Float, mean: Float, within: Float) -> tuple[Float, Float]:
+    """Return mean and variance (B, R) of mixtures with weights (B, ...) of parts with moments (R, ...)."""
+    flat, means, variances = (part.reshape(len(part), -1) for part in (weight, mean, within))
+    whole, spread = flat @ means.T, flat @ variances.T
+    for row, own, center in zip(spread, flat, whole, strict=True):
+        row += (means - center[:, None]) ** 2 @ own
+    return whole, spread
+
+
 @dataclass(frozen=True)
 class RewardExpectation:
     """Rewards under a belief.
@@ -135,17 +144,12 @@ class RewardModel:
         joint = quantity.weights(joint)
         lead = joint.shape[:-2]
         flat = joint.reshape(-1, quantity.state_count, quantity.control_count)
-        mean = np.full((len(flat), 3), np.nan)
-        variance = np.full((len(flat), 3), np.nan)
         health, health_variance = self._health_moments
-        mean[:, 0] = np.einsum("bsu,su->b", flat, health)
-        spread = health - mean[:, 0, None, None]  # (B, S, U), the largest array of a long mission
-        spread **= 2
-        spread += health_variance
-        variance[:, 0] = np.einsum("bsu,bsu->b", flat, spread)
-        control = flat.sum(axis=1)
-        mean[:, 1] = control @ self.control_reward
-        variance[:, 1] = np.einsum("bu,bu->b", control, (self.control_reward - mean[:, 1, None]) ** 2)
+        tables = np.stack([health, np.broadcast_to(self.control_reward, health.shape)])
+        within = np.stack([health_variance, np.zeros_like(health)])
+        mean, variance = (
+            np.pad(own, ((0, 0), (0, 1)), constant_values=np.nan) for own in _mixed(flat, tables, within)
+        )
         if observation is not None:
             observation = np.asarray(observation, dtype=np.float64)
             for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
@@ -187,9 +191,5 @@ class RewardModel:
         mean[0], mean[1] = self.health_per_draw[draw][:, :, controls], self.control_reward[controls]
         if observation is not None and not np.isnan(observation).all():
             mean[2], within[2] = _error_moments(observation, shown, variance, self._error_scale[controls])
-        whole = np.einsum("bksu,rksu->br", weight, mean)
-        spread = np.einsum("bksu,rksu->br", weight, within)
-        for b in range(len(weight)):
-            squared = (mean - whole[b, :, None, None, None]) ** 2
-            spread[b] += np.einsum("ksu,rksu->r", weight[b], squared)
+        whole, spread = _mixed(weight, mean, within)
         return RewardExpectation(whole, np.sqrt(spread))
