@@ -54,8 +54,8 @@ def expected_of(
     lower = upper = np.full_like(mean, np.nan)
     if quantiles:
         lower, upper = np.moveaxis(sensor_model.quantiles(joint, _LEVELS), -2, 0)
-    reward, noise = rewards.expectation(joint, observed), sensor_model.noise(joint)
-    return Expected(mean, deviation, lower, upper, noise, reward.mean, reward.standard_deviation)
+    noise = sensor_model.noise(joint)
+    return Expected(mean, deviation, lower, upper, noise, *rewards.expectation(joint, observed))
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class LearntExpectation:
         rewards = self.rewards.expectation_of(weight, hypotheses.draw, controls, shown, shown_variance, seen)
         return Expected(
             mean + center, deviation, quantiles[:, 0] + center, quantiles[:, 1] + center, noise,
-            rewards.mean, rewards.standard_deviation,
+            *rewards,
         )  # fmt: skip
 
 

@@ -51,20 +51,6 @@ def _mixed(weight: Float, mean: Float, within: Float) -> tuple[Float, Float]:
 
 
 @dataclass(frozen=True)
-class RewardExpectation:
-    """Rewards under a belief.
-
-    Attributes
-    ----------
-    mean, standard_deviation : (..., 3)
-        Of the rewards in the order of `REWARD_NAMES`. The error reward is NaN where nothing was observed.
-    """
-
-    mean: Float
-    standard_deviation: Float
-
-
-@dataclass(frozen=True)
 class RewardModel:
     """The three rewards of an asset, and their expectation under a belief.
 
@@ -125,8 +111,10 @@ class RewardModel:
         worth = np.multiply(control_weight, self.control_reward)
         return np.asarray(health_weight * self._health_moments[0] + worth)
 
-    def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> RewardExpectation:
-        """Return mean and standard deviation of each reward.
+    def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> tuple[Float, Float]:
+        """Return mean and standard deviation of each reward (..., 3), in the order of `REWARD_NAMES`.
+
+        The error reward is NaN where nothing was observed.
 
         Parameters
         ----------
@@ -160,7 +148,7 @@ class RewardModel:
                     share = quantity.draw_weight[:, None] * flat[row, state, chosen]
                     mean[row, 2] = (share * error).sum()
                     variance[row, 2] = (share * (error - mean[row, 2]) ** 2).sum()
-        return RewardExpectation(mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3))
+        return mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3)
 
     def expectation_of(
         self,
@@ -170,7 +158,7 @@ class RewardModel:
         shown: Float,
         variance: Float,
         observation: Float | None = None,
-    ) -> RewardExpectation:
+    ) -> tuple[Float, Float]:
         """Return mean and standard deviation (B, 3) under beliefs over hypotheses, states and controls.
 
         Parameters
@@ -192,4 +180,4 @@ class RewardModel:
         if observation is not None and not np.isnan(observation).all():
             mean[2], within[2] = _error_moments(observation, shown, variance, self._error_scale[controls])
         whole, spread = _mixed(weight, mean, within)
-        return RewardExpectation(whole, np.sqrt(spread))
+        return whole, np.sqrt(spread)
