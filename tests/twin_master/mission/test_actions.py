@@ -29,7 +29,7 @@ from twin_master.mission.planning import (
     read_policy,
     risk_of,
 )
-from twin_master.mission.preparation import Knowledge, keep_knowledge, kept_knowledge, knowledge_of
+from twin_master.mission.preparation import Knowledge, keep_knowledge, kept_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, rationed
@@ -68,7 +68,7 @@ def known_of(written: Scenario) -> Knowledge:
 def following(known: Knowledge, policy: BeliefPolicy, written: Scenario | None = None) -> Knowledge:
     """Return the same knowledge with a policy on the belief."""
     per_draw = known.sensor_model.value_per_draw
-    return knowledge_of(written or known.scenario, known.model, known.draws, per_draw, policy)
+    return Knowledge(written or known.scenario, known.model, known.draws, per_draw, policy)
 
 
 def side_by_side(known: Knowledge, seeds: int) -> Flights:

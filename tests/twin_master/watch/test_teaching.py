@@ -208,8 +208,8 @@ def test_a_policy_that_changes_is_told(base):
         ((z1 > 0.5) & (z2 > 0.1), "With it another control is chosen in 2 of 25 states, first 3g in the "
                                   "place of 2g at z1 60 %, z2 0 %."),
     ):  # fmt: skip
-        plan = replace(known.plan, control_index=np.where(gentle, 1 - sharp, sharp))
-        assert policy_change(known, replace(known, plan=plan)) == sentence
+        policy = np.eye(2)[np.where(gentle, 1 - sharp, sharp)]
+        assert policy_change(known, replace(known, policy=policy)) == sentence
     outcome = Outcome(b"", None, 3.5, {"policy_change": sentence})  # type: ignore[arg-type]
     for kind in TRIED:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
