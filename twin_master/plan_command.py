@@ -96,6 +96,8 @@ def _planned(knowledge: "Knowledge") -> "tuple[DecisionProblem, BeliefPlan, Comp
 
 def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     """Return what is known where actions that inspect show nothing, or gauges are not there."""
+    import numpy as np
+
     from twin_master.mission.preparation import knowledge_of
 
     scenario = knowledge.scenario
@@ -104,14 +106,17 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
         if name not in (*titles, *inspecting):
             known, gauges = inspecting or ["there is none"], f"{titles[0]} to {titles[-1]}"
             raise MissionInputError(said("plan_command.value_of", inspecting=known, gauges=gauges, name=name))
-    given, count = scenario.observation.standard_deviation, scenario.observation.count
-    each = given if isinstance(given, tuple) else (given,) * count
-    each = tuple(_BLIND if title in names else own for title, own in zip(titles, each, strict=True))
-    blind = {"standard_deviation": _BLIND}
+    shown = np.abs(knowledge.sensor_model.value_per_draw).max(axis=(0, 1, 2))
+    each = np.broadcast_to(scenario.observation.standard_deviation, len(titles))
+    blind = np.where([title in names for title in titles], each + _BLIND * shown, each)
+    levels = np.abs(knowledge.model.states.coordinates).max()
+    unread = {"standard_deviation": _BLIND * levels}
     bare = scenario.model_copy(
         update={
-            "action": tuple(a.model_copy(update=blind if a.name in names else {}) for a in scenario.action),
-            "observation": scenario.observation.model_copy(update={"standard_deviation": each}),
+            "action": tuple(a.model_copy(update=unread if a.name in names else {}) for a in scenario.action),
+            "observation": scenario.observation.model_copy(
+                update={"standard_deviation": tuple(blind.tolist())}
+            ),
             "planner": scenario.planner.model_copy(update=_UNPLANNED),
         }
     )
@@ -131,7 +136,7 @@ def _titles(scenario: "Scenario") -> tuple[str, ...]:
 _UNPLANNED = {"policy": "mode", "limit_probability": None}
 """Of the planner, where its plan is made apart."""
 _BLIND = 1e6
-"""Standard deviation of a sensor that shows nothing, SI."""
+"""Standard deviation of a sensor that shows nothing, over the largest that it could show."""
 
 
 def _draw(path: Path, figure: "Figure") -> None:

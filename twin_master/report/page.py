@@ -196,7 +196,7 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
     first, last = run.first_step, run.steps - 1
     now = course.default_now(run) if now is None else now - first
-    if not 0 <= now <= last:
+    if now not in range(run.steps):
         ends = f"{first}..{first + last}"
         raise RunFolderError(f"The present turn of the report must lie in {ends}, and {first + now} came.")
     units = ", ".join(
@@ -259,7 +259,7 @@ def _check_words(run: Run, check: tailored.PredictiveCheck) -> dict[str, str | b
     if len(check.transform):
         sensor = int(np.nanargmin(check.coverage))
         lowest = f"{small(sensors.titles[sensor])}, {100.0 * check.coverage[sensor]:.0f} %"
-    learnt = run.get("filtered/noise_standard_deviation") is not None
+    learnt = run.scenario.learning is not None
     return {"noise": told, "error": share if high else "", "lowest": lowest, "learnt": learnt}
 
 

@@ -68,6 +68,8 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     assert text.index(headline(drag.verdict)) < text.index("Its size: ") < text.index(said)
     assert f"and {number(held.chi_square_per_dof)} after it" in text
     assert text.count(f"{percent(closed)} % of the gap") == 1
+    for name, factor in (("displacement", 1e3), ("leaf_strain", 1e6)):
+        assert f">{number(factor * held.rms[name])}<" in text
     # no name, no gap to close, no proof
     assert "The best hypothesis, which is no name, closes" in page_of(drag, kind=VerdictKind.GROUP)
     for changed, words in (
