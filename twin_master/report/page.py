@@ -196,7 +196,7 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
     first, last = run.first_step, run.steps - 1
     now = course.default_now(run) if now is None else now - first
-    if not 0 <= now <= last:
+    if now not in range(run.steps):
         ends = f"{first}..{first + last}"
         raise RunFolderError(f"The present turn of the report must lie in {ends}, and {first + now} came.")
     units = ", ".join(

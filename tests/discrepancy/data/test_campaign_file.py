@@ -285,6 +285,9 @@ def test_what_cannot_be_written_says_so(tmp_path):
     )
     with pytest.raises(CampaignFileError, match="one sampling interval"):
         write_campaign(replace(campaign, channels={**campaign.channels, "tip": other}), tmp_path / "b")
+    warmer = (replace(campaign.trials[0], temperature=np.ones_like(campaign.trials[0].temperature)),)
+    with pytest.raises(CampaignFileError, match="reference_temperature"):
+        write_campaign(replace(campaign, trials=warmer, reference_temperature=None), tmp_path / "b")
     lost = Event("hit", ("nowhere",), time=0.1)
     with pytest.raises(CampaignFileError, match="'nowhere'"):
         write_campaign(replace(campaign, events=(lost,)), tmp_path / "b")
@@ -293,11 +296,13 @@ def test_what_cannot_be_written_says_so(tmp_path):
 def test_releases_and_events_that_are_none_are_refused_in_python_too(tmp_path):
     for make in (
         lambda: Release(0.0),
+        lambda: Release(0.02, -1.0),
+        lambda: Release(0.02, mode_count=0),
         lambda: Event("a b", time=0.0),
         lambda: Event("pi", time=0.0),
         lambda: Event("hit", time=1.0, until=1.0),
     ):
-        with pytest.raises(CampaignFileError):
+        with pytest.raises(ValueError, match=r"Release|Event"):
             make()
     plain = (TOML, 'displacement = 50, unit = "mm"', 'displacement = 50, unit = "1"')
     release = read_campaign(campaign_folder(tmp_path / "a", PLAIN, plain)).trials[1].release

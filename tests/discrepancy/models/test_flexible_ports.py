@@ -29,7 +29,7 @@ ROOT = 6000.0
 TIP = np.array([0.0, 0.0, 0.0, 1.0])
 ROWS = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
 """Of the tip and of the joint."""
-RELEASE = Release(displacement=0.02, deviation=0.0, at_rest=True, mode_count=1, time_zero_deviation=0.0)
+RELEASE = Release(displacement=0.02, deviation=0.01, at_rest=True, mode_count=1, time_zero_deviation=0.0)
 TIME, EARLY = np.linspace(0.0, 2.796, 700), np.linspace(0.0, 0.01, 101)
 A = 0.02 * 0.135
 """About the motion of the joint [m]."""

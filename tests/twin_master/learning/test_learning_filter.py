@@ -265,22 +265,24 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     sensor, one = GaussianSensorModel(value, [0.5]), model(levels=1)
     priors = Learning(noise_degrees=10.0, gauge_gain=0.1, gauge_offset=2.0)
     learner = LearningFilter(one, sensor, priors)
-    controls = [0, 1, 1, 0, 1, 0]
+    controls = [0, 1, 1, 0, 1, 1, 0]
     shown = value[0, 0, controls, 0]
-    seen = 1.5 + 0.93 * shown + np.array([0.1, -0.7, 0.4, 0.2, -0.1, 0.9])
+    seen = 1.5 + 0.93 * shown + np.array([0.1, -0.7, 0.4, 0.2, -0.1, np.nan, 0.9])
+    there = ~np.isnan(seen)
     estimates = run(learner, seen[:, None], controls)
     carried, learnt = [turn.carried for turn in estimates], estimates[-1].learnt
     # Bayesian linear regression of (o - h) / sigma on (offset, gain) in their prior deviations.
-    design = np.stack([np.full(6, 2.0), 0.1 * shown], axis=1) / 0.5
-    left = (seen - shown) / 0.5
+    design = np.stack([np.full(6, 2.0), 0.1 * shown[there]], axis=1) / 0.5
+    left = (seen - shown)[there] / 0.5
     covariance = np.linalg.inv(np.eye(2) + design.T @ design)
     mean = covariance @ design.T @ left
     squares = 10.0 + left @ left - mean @ design.T @ left
     scale2 = squares / (10.0 + 6.0 - 2.0)
     for place, name, prior in ((0, "gauge_offset[1]", 2.0), (1, "gauge_gain[1]", 0.1)):
-        found = learnt[name].mean, learnt[name].standard_deviation
-        wanted = prior * mean[place], prior * np.sqrt(scale2 * covariance[place, place])
-        assert found == pytest.approx(wanted)
+        found, wide = learnt[name], prior * np.sqrt(scale2 * covariance[place, place])
+        assert (found.mean, found.standard_deviation) == pytest.approx((prior * mean[place], wide))
+        ends = norm(prior * mean[place], wide).ppf([0.05, 0.95])
+        assert (found.lower, found.upper) == pytest.approx(ends)
     noise, squared = learnt["noise_scale[1]"], invgamma(8.0, scale=0.5 * squares)
     assert noise.mean == pytest.approx(squared.expect(np.sqrt))
     assert (noise.lower, noise.upper) == pytest.approx(np.sqrt(squared.ppf([0.05, 0.95])))
