@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
+from scipy.stats import binom
 
 from calibration.dynamics.records import read_records
 from discrepancy.campaign.protocol import Release
@@ -14,7 +15,7 @@ from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Trial, 
 from discrepancy.errors import FitError
 from discrepancy.location.backbone import backbones
 from discrepancy.location.dependence import modal_motion
-from discrepancy.location.locate import locate, outlier_remarks
+from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
 from discrepancy.location.map import features, residual_map
 from discrepancy.location.omnibus_tests import variance_test
 from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
@@ -37,6 +38,18 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
         proportion.append(np.mean([place != ("g3", "release 1") for place in found]))
     assert np.mean(silent) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 30)
     assert np.mean(proportion) <= 0.05
+
+
+def test_a_short_noise_record_makes_no_pattern_over_the_channels():
+    """Noise of a channel that its record takes for smaller is no finding of a sensor."""
+    bench, generator = Bench(count=120, noise_freedom=20.0), np.random.default_rng(5)
+    told = 0
+    for _ in range(40):
+        fitted = bench.fit(generator)
+        told += sum(
+            bool(singular_patterns(fitted, kind)) for kind in kinds_of(fitted, fitted.white(generator))
+        )
+    assert told <= binom.isf(1e-3, 80, 0.01)
 
 
 def test_variance_test_counts_only_what_the_fit_leaves():
