@@ -1,6 +1,7 @@
 """Fleets: plan, shards, store, what goes on after a kill, and what is refused."""
 
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from tests.twin_master.runs import check_same, edited, flight_of, text_of, writt
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderError
 from twin_master.fleet import flight
+from twin_master.fleet.command import engine_of
 from twin_master.fleet.flight import group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Estimated, group_figures
@@ -220,6 +222,12 @@ def test_the_command_line(library_file, tmp_path):
     (notices,) = (tmp_path / "b" / "fleet.zarr").glob("*/notices")
     shutil.rmtree(notices)
     assert "lacks notices: fly the fleet again" in refused("compare", tmp_path / "a", tmp_path / "b")
+
+
+def test_all_processors_fly_unless_the_user_says_how_many():
+    cores = len(os.sched_getaffinity(0))
+    assert [engine_of(workers, None).workers for workers in (None, 0, 3)] == [cores, 0, 3]
+    assert engine_of(None, "tcp://127.0.0.1:9") == Engine(cluster="tcp://127.0.0.1:9")
 
 
 def test_without_the_extra_or_a_scheduler_nothing_is_begun(library_file, tmp_path, monkeypatch):
