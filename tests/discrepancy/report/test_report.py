@@ -205,6 +205,12 @@ def test_what_can_be_decided(drag, able):
     for group in able.groups:
         assert group[0].replace("_", " ") in text
     assert " add " not in " ".join(needs(able, drag.campaign, FEW, ()))  # trials that its model cannot follow
+    unproved = needs(able, replace(drag.campaign, trials=drag.campaign.fitted), FEW, ())
+    assert [line for line in unproved if "nothing can be proved" in line] == unproved[-1:]
+    assert "nothing can be proved" not in text
+    quiet = {name: replace(item, noise=None) for name, item in drag.campaign.channels.items()}
+    *_, asked = needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
+    assert asked.startswith(f"Give a noise record for {', '.join(quiet)} (")
 
 
 def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag):
