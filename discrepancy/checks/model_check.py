@@ -237,7 +237,8 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: Bool
     # Before the first return through zero no error of frequency matters.
     crossing = np.flatnonzero(np.sign(model) != np.sign(model[0]))
     until = max(int(crossing[0]) if crossing.size else len(model), 3)
-    return ratio * (float(np.sign(np.median(centred[:until] * np.sign(model[0])))) or 1.0)
+    # each sample has one vote, as heavy as the prediction: none of a single wrong reading decides
+    return ratio * (float(np.sign(np.sign(centred[:until]) @ model[:until])) or 1.0)
 
 
 # ---------------------------------------------------------------- signs
@@ -304,7 +305,8 @@ def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial)
     noise = channel.noise_in(trial)
     if trial.is_dynamic:
         # Amplitudes only: a small error of frequency would outweigh what the places of two gauges differ by.
-        sign = 1.0 if float(data[: max(len(data) // 50, 3)].mean() * model[0]) >= 0.0 else -1.0
+        first = slice(max(len(data) // 50, 3))
+        sign = 1.0 if float(data[first] @ model[first]) >= 0.0 else -1.0
         rest = np.asarray(sign * np.std(data) - np.std(model))
         deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * np.std(model))
     else:

@@ -30,8 +30,8 @@ CUT = 0.04
 HELD_OUT_FALLS = ("fall_14", "fall_5")
 LARGEST_LEVEL = 10.0
 """Where the tank's level sensor ends: readings there are left out [V]."""
-SMOOTHED = 0.12
-"""Window of the local cubic through the pendulum's angle [s]; its encoder counts in 0.0029 rad."""
+SMOOTHED = 7
+"""Samples through which the local cubic of the pendulum's angle goes; its encoder counts in 0.0029 rad."""
 STEP = 0.02
 """A sample of the pendulum is the mean over this [s]: one of its slower record, six of its faster one."""
 SHIPPED = Path(__file__).with_name("rigs")
@@ -139,7 +139,7 @@ def _pendulum(data: Path) -> Made:
         joined = max(round(STEP / float(np.median(np.diff(table[:, 0])))), 1)
         whole = len(table) // joined * joined  # what is left over at the end is dropped
         time, angle, _, torque = table[:whole].reshape(-1, joined, table.shape[1]).mean(axis=1).T
-        angle = savgol_filter(angle, 2 * round(0.5 * SMOOTHED / STEP) + 1, 3)
+        angle = savgol_filter(angle, SMOOTHED, 3)
         tables[f"{name}.csv"] = table_text({"time": np.round(time, 9), "angle": angle, "torque": torque})
     return tables, {}
 

@@ -86,6 +86,8 @@ def test_digitised_records_are_fitted_by_their_extremes(reference):
         (0.0280, 0.0573), rel=0.03
     )
     assert sum(name.startswith("ring_down_") for name in read.input_hashes) == 5
+    said = "ringdown_trial1_digitised.csv to ringdown_trial5_digitised.csv read"
+    assert read.origins[2].text == said
 
 
 def folder_with(root, above, *steps):

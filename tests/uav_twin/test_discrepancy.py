@@ -324,7 +324,7 @@ def test_from_an_example_to_a_verdict(campaign, tmp_path):
     assert seen["seating_offset"][:2] == ["A", "offset ratio"]
     assert 0.0 < float(seen["seating_offset"][2]) < float(seen["seating_offset"][3]) == 0.03
     assert "Not testable: washout and inertia_relief. The campaign has no flight trial to fit." in shown
-    assert "Hold out a trial" in shown or "held out" in shown
+    assert "Note: Held out for proof by the rule of the workflow: unloading." in shown
     out = tmp_path / "verdict"
     shown = said("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--calibrate", "1")
     stored = read_verdict_file(out / "verdict.json")
@@ -364,7 +364,7 @@ def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path)
     assert "Fault:" in shown.stdout
     assert "no channel has the column 'weather'" in shown.stdout
     error = refused("discrepancy", "run", str(campaign), *RIG, "--out", str(tmp_path / "v"))
-    assert "1000" in error or "10^" in error or "unit" in error
+    assert "shows about 1000 times what the model says (mm given as m?)" in error
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
     page = (tmp_path / "v" / "report.html").read_text(encoding="utf-8")
     assert "Proof" not in page

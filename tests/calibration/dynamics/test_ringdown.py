@@ -17,6 +17,7 @@ from calibration.dynamics.trials import (
     fit_trials,
     prepare,
     refine_by_extremes,
+    spectral_peaks,
     spectrum,
 )
 from calibration.errors import CalibrationError, ExperimentDataError
@@ -139,6 +140,12 @@ def test_any_two_separate_modes_are_recovered(first, second, ratios, share, phas
     fit = fit_ring_down(RingDownRecord(time, signal), free=True, start=-1.0)
     assert [m.frequency for m in fit.modes] == pytest.approx([first, second], rel=1e-5)
     assert [m.damping_ratio for m in fit.modes] == pytest.approx(ratios, rel=1e-4)
+
+
+def test_a_second_mode_that_is_soon_gone_is_found_in_the_beginning():
+    time = np.arange(0.0, 8.0, 1.0 / 200.0)
+    signal = ring_down(time, (5.65, 29.0), (0.01, 0.02), (0.01, 5e-4))
+    assert spectral_peaks(RingDownRecord(time, signal)) == pytest.approx((5.65, 29.0), rel=0.02)
 
 
 def test_the_spectrum_of_a_cosine():

@@ -14,7 +14,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
-from discrepancy.checks.quality import check_data
+from discrepancy.checks.quality import check_data, clipped_run
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.sensing import observe
@@ -28,6 +28,7 @@ from fe.runtime.patch import (
     SensorGain,
     SensorRotation,
 )
+from tests.discrepancy.core import kit
 from tests.refusals import Inputs
 
 PLAN = ExamplePlan(
@@ -181,6 +182,14 @@ def test_signs(cantilever, campaign):
     assert not check_against_model(shown(campaign, cool, TrialKind.FLIGHT), cantilever)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_reading_that_passes_zero_at_once_has_a_sign(sign):
+    """In its second sample: y2 begins at a tenth of its amplitude, where two modes nearly cancel."""
+    problem = kit.closed_problem(seed=2, kinds=("ringdown",), samples=300)
+    faults = check_against_model(scaled(problem.campaign, "y2", sign), problem.model)
+    assert kinds_of(faults) == ({(FaultKind.SIGN, "y2")} if sign < 0.0 else set())
+
+
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
 @pytest.mark.parametrize("pair", [("g0", "g1"), ("g1", "g2")])
 def test_swapped_channels(cantilever, campaign, kind, pair):
@@ -234,6 +243,12 @@ def test_clipped_and_dead_channels(campaign):
     assert "smallest value -0.0003" in faults[0].sentence
     saturated = check_data(shown(campaign, limited(-1.0, 0.01, 0), kind=TrialKind.STATIC))
     assert (FaultKind.CLIPPED, "x") in kinds_of(saturated)
+    for values, load, run in (
+        ((0, 1, 2, 3, 3, 3), (0, 1, 2, 3, 4, 5), 3),
+        ((0, 1, 2, 3, 3, 3), (0, 1, 2, 3, 3, 3), 0),  # repeats
+        ((1, 1, 2, 3, 3, 3), (0, 1, 2, 3, 4, 5), 0),  # few digits
+    ):
+        assert clipped_run(np.array(values), 3.0, np.array(load)) == run
     unplugged = check_data(shown(campaign, limited(1e-6, 1e-6, 2), name="loading"))
     assert kinds_of(unplugged) == {(FaultKind.DEAD, "g1")}
 

@@ -228,6 +228,18 @@ def test_statistic_is_the_fall_of_the_penalised_sum_of_squares():
     assert score_tests(problem, found, {}) == []
 
 
+def test_p_value_beside_a_short_noise_record_is_that_of_the_f_test():
+    """Of the sums of squares without and with the directions, in deviations of the record."""
+    problem = kit.with_noise(kit.closed_problem(seed=3, effect=0.4), y1=NoiseRecord(0.02, 12.0))
+    found, _, _ = asked(problem)
+    columns = 0.02 * np.random.default_rng(5).standard_normal((2, 9, 1)) * [1.0, 0.0, 0.0]
+    (test,) = score_tests(problem, found, {"both": {"a": {0: columns[0]}, "b": {0: columns[1]}}})
+    known = 12.0 + problem.counts[0]
+    square, freedom = 12.0 + found.sums[0], known - found.spent[0] - 2
+    fall = test.statistic * square / known
+    assert test.p_value == pytest.approx(stats.f.sf(0.5 * fall / ((square - fall) / freedom), 2, freedom))
+
+
 @pytest.mark.parametrize("freedom", [pytest.param(inf, marks=pytest.mark.long), 30.0])
 def test_p_values_are_uniform_where_the_name_is_right(freedom):
     """100 campaigns with the effect that is named: Kolmogorov-Smirnov, and the rejections at 5 %."""

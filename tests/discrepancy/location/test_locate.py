@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
+from scipy.stats import binom
 
 from calibration.dynamics.records import read_records
 from discrepancy.campaign.protocol import Release
@@ -14,8 +15,8 @@ from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Trial, 
 from discrepancy.errors import FitError
 from discrepancy.location.backbone import backbones
 from discrepancy.location.dependence import modal_motion
-from discrepancy.location.locate import locate, outlier_remarks
-from discrepancy.location.map import residual_map
+from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
+from discrepancy.location.map import features, residual_map
 from discrepancy.location.omnibus_tests import variance_test
 from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
 from tests.discrepancy.bench import SHAPES, Bench, sensitivity, with_noise
@@ -37,6 +38,18 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
         proportion.append(np.mean([place != ("g3", "release 1") for place in found]))
     assert np.mean(silent) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 30)
     assert np.mean(proportion) <= 0.05
+
+
+def test_a_short_noise_record_makes_no_pattern_over_the_channels():
+    """Noise of a channel that its record takes for smaller is no finding of a sensor."""
+    bench, generator = Bench(count=120, noise_freedom=20.0), np.random.default_rng(5)
+    told = 0
+    for _ in range(40):
+        fitted = bench.fit(generator)
+        told += sum(
+            bool(singular_patterns(fitted, kind)) for kind in kinds_of(fitted, fitted.white(generator))
+        )
+    assert told <= binom.isf(1e-3, 80, 0.01)
 
 
 def test_variance_test_counts_only_what_the_fit_leaves():
@@ -231,6 +244,17 @@ def test_one_channel_and_few_static_points():
     assert all(np.isfinite(cell.p_value) for cell in found.cells)
 
 
+def test_harmonics_of_a_motion_are_those_of_its_phase():
+    item = Bench(count=400).fit(np.random.default_rng(2)).trials[0]
+    angle = 2.0 * np.pi * 5.0 * item.trial.time
+    moved = {"prediction": np.cos(angle), "rates": -np.sin(angle)}
+    found = features(replace(item, **{name: np.tile(row[:, None], 4) for name, row in moved.items()}), 0)
+    for order, name in ((2, "2nd harmonic"), (3, "3rd harmonic")):
+        wave = np.cos(order * angle + 0.3)
+        left = wave - found[name] @ np.linalg.lstsq(found[name], wave, rcond=None)[0]
+        assert np.linalg.norm(left) < 0.02 * np.linalg.norm(wave)
+
+
 # -------------------------------- the hand-over record, and the split of a motion into its modes
 
 
@@ -355,6 +379,12 @@ def test_two_modes_are_separated():
     noise = np.random.default_rng(3).standard_normal(TIME.size)
     signal = _viscous() + _viscous(0.03, 30.0) + 0.01 * noise
     first, second = backbones(TIME, signal, (5.0, 30.0), noise_deviation=0.01)
+    for curve, frequency, ratio in (
+        (first, 5.0, 0.01),
+        (second, 30.0, 0.03),
+    ):  # errors are those that are made
+        assert 0.2 < np.mean(((curve.frequency - frequency) / curve.frequency_error) ** 2) < 3.0
+        assert 0.2 < np.mean(((curve.damping_ratio - ratio) / curve.damping_ratio_error) ** 2) < 3.0
     assert second.time[-1] < 3.0 < 8.0 < first.time[-1]
     assert np.all(second.amplitude > 4.0 * second.amplitude_error)
     np.testing.assert_allclose(second.frequency[:2], 30.0, rtol=2e-3)

@@ -17,7 +17,7 @@ from discrepancy.errors import ModelError
 from discrepancy.model_choice import choose_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.interface import Model
+from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
@@ -147,6 +147,9 @@ def test_an_fmu_that_is_stepped_converges_to_the_lumped_model(stepped, lumped, n
     short = replace(what, time=what.time[:100], force=what.force[:100])
     given: dict[str, Any] = {"clock": (0.0, -0.03), "outputs": BOTH} if what is RINGDOWN else {}
     coarse, fine = (share(stepped, lumped, short, *items, **given, n=n) for n in (1, 4))
+    derived = tuple(("displacement", quantity) for quantity in Quantity.DISPLACEMENT.moving)
+    moved = stepped.respond(short, derived, ModelPatch(items), Conditions(**GIVEN))
+    np.testing.assert_array_equal(moved.rates[:, 1], moved.values[:, 2])
     assert coarse < 4e-4
     assert np.log(coarse / fine) / np.log(4.0) > (1.4 if name == "root of speed" else 1.75)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from calibration.result.file import load_calibration, result_bytes, save_calibration
 from calibration.result.record import ParameterPrior
@@ -21,6 +22,7 @@ from discrepancy.models.interface import Model, Response
 from discrepancy.models.scales import Scales
 from discrepancy.parameters.calibration import calibrate_parameters
 from fe.reduction.model_cache import reduced_model
+from tests.discrepancy.core import kit
 
 FORCE = np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
 NOISE = 0.02
@@ -129,6 +131,10 @@ def on_grid(law, values, priors):
         yield middle, float(np.sqrt(np.sum(mass * (axis - middle) ** 2)))
 
 
+def valley(force, p):
+    return force / 10.0 * p[0] * p[1]
+
+
 def ridge(force, p):
     return force / 10.0 * p[0] * p[1] + 0.5 * (force / 40.0) ** 2 * p[2]
 
@@ -140,6 +146,8 @@ def ridge(force, p):
         # both are cut off, the readings being up to ten deviations beyond either end
         ("Gaussian", line, (1.1, 0.7), ((1.0, 0.2, -3.0, 1.06), (0.5, 0.3, -3.0, 0.6))),
         ("Gaussian", line, (1.1, 0.7), ((1.2, 0.2, 1.12, 2.0), (0.9, 0.3, 0.72, 2.0))),
+        # a narrow valley at a corner
+        ("Gaussian", valley, (0.94, 0.97), ((1.0, 0.05, 0.914, 1.03), (1.0, 0.05, 0.988, 1.09))),
         # one beside a bent valley of two, which ends, too
         (
             "quadrature",
@@ -176,6 +184,28 @@ def test_one_parameter_is_integrated_as_densely_as_one_likes():
     said = " ".join(found.findings)
     assert "end of its range" in said
     assert "not explained by these parameters" in said
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_the_colour_of_the_noise_is_no_gap_where_its_record_has_it(monkeypatch, recorded):
+    """A record of 400 samples tells the colour only roughly, and 1500 residuals are not white."""
+    monkeypatch.setattr(
+        "discrepancy.parameters.calibration.checked", lambda campaign, *_, **__: (campaign, ())
+    )
+    generator = np.random.default_rng(101)
+
+    def coloured(rows):
+        white = generator.standard_normal(len(rows) + 300)
+        return 0.02 * lfilter([1.0], [1.0, -1.2, 0.5], white)[300:]
+
+    white = 0.02 * generator.standard_normal(400)
+    samples = coloured(white) + white if recorded else white
+    problem = kit.closed_problem(seed=0, kinds=("ringdown",), samples=1500, extra=coloured)
+    record = NoiseRecord(float(samples.std()), 399.0, samples - samples.mean(), 0.01, "pre-trigger")
+    campaign = kit.with_noise(problem, y1=record).campaign
+    campaign = replace(campaign, trials=campaign.trials[:1])
+    choice = ModelChoice(problem.model, ModelKind.LUMPED, "chain.toml", "0" * 64)
+    assert calibrate_parameters(campaign, choice, samples=20).explained is recorded
 
 
 def test_what_is_not_told_is_said():

@@ -98,6 +98,7 @@ def test_what_a_law_of_speed_takes_is_its_equation(law, lowest, exponent):
     kicked = [speed.kick(values, 3.5, strength, duration, False) for duration in (2.0, 1e4)]
     assert kicked[0] == pytest.approx(exact.y[0, -1], abs=1e-6)
     assert kicked[1] == pytest.approx(lowest, abs=1e-2)
+    assert speed.steady(values, x, -3.5) == (0.0 if lowest else -speed.steady(values, x, 3.5))
     if lowest:
         assert speed.kick(values, 1.9, strength, 2.0, False) == 1.9
         assert speed.steady(values, 0.0, 1.9) == 0.0

@@ -230,6 +230,15 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
 
 
+def test_nothing_is_learnt_of_the_control_that_was_flown_last(library_file, tmp_path):
+    """A turn of 3g, and one of 2g that nothing follows."""
+    text = text_of("growing_damage", ("steps = 50", "steps = 2"), ('"2g" = -0.1, "3g"', '"2g" = 9.0, "3g"'))
+    fleet = ensemble(str(written(tmp_path, text)), range(2), Overrides(strain_library=library_file))
+    (record,) = learn_fleet(fly_fleet(fleet, tmp_path / "fleet").folder)["groups"].values()
+    flown = {control: rate["flown"] for control, rate in record["probability"].items()}
+    assert flown == {"2g": False, "3g": True}
+
+
 def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     """Readings of inspections, too: without them damage that is found and repaired would not have been."""
     text = text_of("inspected_wing", ("steps = 120", "steps = 5"), ('policy = "belief"', 'policy = "qmdp"'))

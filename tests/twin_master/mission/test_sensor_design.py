@@ -18,7 +18,7 @@ from tests.command_line import refused, said
 from tests.twin_master.runs import of_wing
 from twin_master.errors import MissionInputError
 from twin_master.mission import sensor_design
-from twin_master.mission.preparation import Knowledge, knowledge_of
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations
 from twin_master.plan_command import _without
 
@@ -98,7 +98,7 @@ def test_a_gauge_that_is_taken_away_tells_nothing_whatever_its_unit():
     observation = known.scenario.observation.model_copy(update={"standard_deviation": size * 125e-6})
     large = known.scenario.model_copy(update={"observation": observation})
     values = size * known.sensor_model.value_per_draw
-    model = _without(knowledge_of(large, known.model, known.draws, values), ["24"]).sensor_model
+    model = _without(Knowledge(large, known.model, known.draws, values), ["24"]).sensor_model
     seen = np.where(np.arange(24) == 23, values[0, 0, 1], np.nan)
     assert np.ptp(model.log_likelihood(seen, 1)) < 1e-6
 
