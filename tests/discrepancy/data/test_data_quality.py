@@ -132,6 +132,19 @@ def test_other_factors_are_no_unit_slips(cantilever, campaign, factor):
         assert not kinds_of(check_against_model(released, cantilever))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_turns_at_nearly_one_load_are_no_slip(cantilever, campaign, seed):
+    """Between them there is noise over next to nothing."""
+    noise = np.random.default_rng(seed).normal(0.0, [5e-5, 2e-6, 1e-6, 5e-7], (20, 4))
+
+    def gentle(trial):
+        rows = trial.rows(np.repeat([trial.load_factor.argmax(), trial.load_factor.argmin()], [1, 19]))
+        load = rows.load_factor * (1.0 + 1e-4 * np.arange(20))
+        return replace(rows, load_factor=load, values=rows.values + noise)
+
+    assert not check_against_model(every(campaign, gentle, TrialKind.FLIGHT), cantilever)
+
+
 def test_slips_of_inputs(cantilever, campaign):
     def kilo(trial):
         return replace(trial, force=trial.force * 1e-3)
