@@ -21,11 +21,10 @@ from tests.twin_master.runs import check_same, cut_off_after, text_of, written
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import (
-    InvalidStrainLibraryError,
+    InvalidObservationLibraryError,
     MissionInputError,
     NotResumableError,
     RunFolderError,
-    RunFolderExistsError,
     ScenarioError,
 )
 from twin_master.network.twin import build_graphical_model
@@ -128,7 +127,7 @@ def test_a_replacement_that_was_killed_is_put_back_and_said_and_not_before(whole
     lock = lock_run_folder(aside)  # it is being replaced
     assert restore_folder(whole.with_name("run")) is False
     os.close(lock)
-    with pytest.raises(RunFolderExistsError, match="holds a run already"):
+    with pytest.raises(RunFolderError, match="holds a run already"):
         fly(whole.with_name("run"), library_file)
     assert [path.name for path in whole.parent.iterdir()] == ["run"]
 
@@ -158,7 +157,7 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
     assert not folder_config(tmp_path)
     with pytest.raises(NotResumableError, match="is no run folder"):
         read_config(tmp_path)
-    with pytest.raises(RunFolderExistsError, match="not touched"):
+    with pytest.raises(RunFolderError, match="not touched"):
         make(tmp_path, "second", replace=True)
     for name in ("timing.json", "summary.json"):  # of a run that is finished both are whole
         for file in ("timing.json", "summary.json"):
@@ -232,7 +231,7 @@ def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, scenario,
     check_same(moved, whole, *SAME)
     for path in moved.rglob("*"):
         assert path.is_dir() or str(tmp_path).encode() not in path.read_bytes(), path
-    with pytest.raises(InvalidStrainLibraryError):
+    with pytest.raises(InvalidObservationLibraryError):
         fly(tmp_path / "never", library)
     assert not (tmp_path / "never").exists()
     if scenario == "level_turns":
@@ -300,7 +299,7 @@ def test_a_full_disk_loses_nothing(flown, tmp_path, library_file, monkeypatch):
 
 def test_existing_folders_are_refused(whole, tmp_path, library_file):
     written(whole, "mine", name="notes.txt")
-    with pytest.raises(RunFolderExistsError, match="--resume"):
+    with pytest.raises(RunFolderError, match="--resume"):
         fly(whole, library_file)
     fly(whole, library_file, replace=True)
     assert not (whole / "notes.txt").exists()
@@ -309,7 +308,7 @@ def test_existing_folders_are_refused(whole, tmp_path, library_file):
     mine.mkdir()
     thesis = written(mine, "important", name="thesis.txt")
     for place, sentence in ((mine, "not touched"), (thesis, "no folder")):
-        with pytest.raises(RunFolderExistsError, match=sentence):
+        with pytest.raises(RunFolderError, match=sentence):
             fly(place, library_file, replace=True)
     assert thesis.read_text(encoding="utf-8") == "important"
     (tmp_path / "empty").mkdir()
@@ -340,7 +339,7 @@ def test_what_cannot_be_resumed(tmp_path, library_file):
     with pytest.raises(NotResumableError, match="strain library changed"):
         resume_run(folder)
     copy.unlink()
-    with pytest.raises(InvalidStrainLibraryError, match="cannot be read"):
+    with pytest.raises(InvalidObservationLibraryError, match="cannot be read"):
         resume_run(folder)
     copy.write_bytes(content)
     lock = lock_run_folder(folder)

@@ -70,7 +70,7 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
 
     Raises
     ------
-    RunFolderExistsError, FleetError
+    RunFolderError, FleetError
         There is no fleet, nothing has flown, or its transitions cannot be learnt.
     """
     folder, progress = Path(folder), progress or SilentProgress()
@@ -297,7 +297,7 @@ def learn_from_fleet(
 
     Raises
     ------
-    RunFolderExistsError, FleetError
+    RunFolderError, FleetError
         There is no fleet, nothing has flown, or its transitions cannot be learnt.
     """
     record = learn_fleet(folder, progress=progress)

@@ -68,7 +68,7 @@ def write_fleet_report(folder: Path | str) -> Path:
 
     Raises
     ------
-    RunFolderExistsError
+    RunFolderError
         The folder holds no fleet.
     FileNotWrittenError
         The disk is full or the folder cannot be written.
@@ -81,7 +81,7 @@ def fleet_page(folder: Path, most: int) -> str:
 
     Raises
     ------
-    RunFolderExistsError
+    RunFolderError
         The folder holds no fleet.
     FleetError
         It is damaged.

@@ -78,7 +78,7 @@ class GaussianSensorModel(QuantityModel):
 
     Raises
     ------
-    InvalidModelError, InvalidDistributionError
+    InvalidModelError
         If shapes do not fit, a value is not finite, a standard deviation not positive or an error negative.
     """
 

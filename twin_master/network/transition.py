@@ -76,7 +76,7 @@ class TransitionModel:
 
         Raises
         ------
-        InvalidDistributionError, InvalidModelError
+        InvalidModelError
             A table is none of transitions, or the controls have other states.
         """
         checked = [

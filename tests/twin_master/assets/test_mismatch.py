@@ -28,7 +28,7 @@ from twin_master.assets.asset_source import AssetReading, PairedSource, Stateles
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError, TwinMasterError
+from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
@@ -311,7 +311,7 @@ class TestOnTheWing:
             assert source.write_field(tmp_path / "wing.vtu", health, control)
         table["belief"]["patch"] = str(written(tmp_path, PATCH, name="patch.json"))
         patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
-        with pytest.raises(MissingObservationModelError, match="predicts strains, and `frequency`"):
+        with pytest.raises(MissionInputError, match="predicts strains, and `frequency`"):
             asset_source(patched).check()
 
 

@@ -20,7 +20,7 @@ from tests.command_line import command
 from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import FleetError, RunFolderExistsError
+from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import attention, group_figures, leaving
@@ -107,7 +107,7 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     assert journals(again) == alone
     state = json.loads((again / "watched.json").read_text())["assets"]
     assert [state[f"north/wing-{number}"]["last"]["turn"] for number in range(3)] == [TURNS - 1] * 3
-    with pytest.raises(RunFolderExistsError, match="another fleet"):
+    with pytest.raises(RunFolderError, match="another fleet"):
         FleetWatch(load_fleet(fleet_file, seed=8), again, print, print)
     done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out", "--turns", 3)
     assert done.returncode == 0, done.stderr
@@ -449,7 +449,7 @@ def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
     assert len(set(printed)) < len(set(soon))
     table = fleet_page(tmp_path / "flown", WORST).partition("Who needs attention next")[2]
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]
-    with pytest.raises(RunFolderExistsError, match="not the folder of a fleet"):
+    with pytest.raises(RunFolderError, match="not the folder of a fleet"):
         fleet_page(tmp_path, WORST)
 
 

@@ -12,7 +12,7 @@ from reporting.errors import DiskFullError
 from tests.twin_master.runs import flight_of, journal, of_library, table_of
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
-from twin_master.errors import AssetOutputError, NotResumableError
+from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
 from twin_master.mission.loop import fly, kept_in, taken_up
@@ -98,9 +98,9 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
     def short(_control: object, _health: object) -> AssetReading:
         return AssetReading(np.zeros(3))
 
-    with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
+    with pytest.raises(MissionInputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
         flight_of(*paper, kept.append, asset=StatelessAsset(broken))
-    with pytest.raises(AssetOutputError, match="expects 24 values"):
+    with pytest.raises(MissionInputError, match="expects 24 values"):
         flight_of(*paper, asset=StatelessAsset(short))
 
 

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from tests.twin_master.runs import loaded_from, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.errors import InvalidDistributionError, InvalidModelError, TwinMasterError
+from twin_master.errors import InvalidModelError, TwinMasterError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network import memory
 from twin_master.network import transition as transition_file
@@ -128,7 +128,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("make", "sentence"), REFUSED)
 def test_what_does_not_fit_is_refused(make, sentence):
-    with pytest.raises((InvalidModelError, InvalidDistributionError), match=sentence):
+    with pytest.raises(InvalidModelError, match=sentence):
         make()
 
 
