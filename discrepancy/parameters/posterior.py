@@ -55,9 +55,7 @@ class Marginal:
         self._problem = problem
         shared = problem.shared
         self.free = np.flatnonzero(shared.scale[: shared.count] > 0.0)
-        mean, scale = shared.centre[self.free], shared.scale[self.free]
-        self.low = (shared.low[self.free] - mean) / scale
-        self.high = (shared.high[self.free] - mean) / scale
+        self.low, self.high = shared.ends[:, self.free]
         self._near = problem.start(NOTHING)
         self.refused: list[tuple[FloatArray, str]] = []
 
@@ -248,7 +246,13 @@ class CutGaussian:
         """Logarithm of its integral within the range, up to a constant [nat]."""
         return float(self.whole + logsumexp(self.even[1]) - np.log(EVEN))
 
-    def draws(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
+    def draws(self, count: int, generator: np.random.Generator) -> FloatArray:
+        """Return draws (count, P), of equal weight."""
+        points, weight = self.weighed(self.mean, generator.random((TRIED * count, len(self.mean))))
+        chosen = np.searchsorted(np.cumsum(softmax(weight)), stratified(generator, count))
+        return np.asarray(points[np.minimum(chosen, len(points) - 1)])
+
+    def draws_about(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return a draw about each of the means (N, P), which stand in place of its own."""
         shape = (TRIED, *means.shape)
         points, weight = self.weighed(np.broadcast_to(means, shape), generator.random(shape))
@@ -266,7 +270,7 @@ LARGEST_MASS, MOST_NODES = 0.04, 90
 CHECKED = ((1.0, 0.12), (2.0, 0.5))
 """The posterior is a Gaussian if its energy, so many deviations from the mean along each principal direction,
 or where the range ends before, is that of one within so many nats."""
-EVEN, TRIED = 1024, 16
+EVEN, TRIED = 1024, 32
 """Draws of a Gaussian that tell its share within the range, and of which one is kept."""
 EMPTY = 700.0
 """Energy [nat] above the least where nothing is left of a density."""
@@ -321,9 +325,9 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
         procedure, draws = "quadrature", _along(index, marginal, optima, count, generator)
     else:
         chosen = generator.choice(len(parts), count, p=softmax([part.log_evidence for part in parts]))
-        draws = np.array([part.mean for part in parts])[chosen]
+        draws = np.empty((count, len(every)))
         for at, part in enumerate(parts):
-            draws[chosen == at] = part.draws(draws[chosen == at], generator)
+            draws[chosen == at] = part.draws(int(np.sum(chosen == at)), generator)
     return ParameterPosterior(procedure, draws, optima, marginal)
 
 
@@ -390,7 +394,7 @@ def _along(
     for at, node in enumerate(nodes.tolist()):
         rows = np.flatnonzero(nearest == at)
         place = np.ix_(rows, ~one)
-        draws[place] = others[node].draws(draws[place], generator)
+        draws[place] = others[node].draws_about(draws[place], generator)
     return draws
 
 

@@ -131,6 +131,10 @@ def on_grid(law, values, priors):
         yield middle, float(np.sqrt(np.sum(mass * (axis - middle) ** 2)))
 
 
+def valley(force, p):
+    return force / 10.0 * p[0] * p[1]
+
+
 def ridge(force, p):
     return force / 10.0 * p[0] * p[1] + 0.5 * (force / 40.0) ** 2 * p[2]
 
@@ -142,6 +146,8 @@ def ridge(force, p):
         # both are cut off, the readings being up to ten deviations beyond either end
         ("Gaussian", line, (1.1, 0.7), ((1.0, 0.2, -3.0, 1.06), (0.5, 0.3, -3.0, 0.6))),
         ("Gaussian", line, (1.1, 0.7), ((1.2, 0.2, 1.12, 2.0), (0.9, 0.3, 0.72, 2.0))),
+        # a narrow valley at a corner
+        ("Gaussian", valley, (0.94, 0.97), ((1.0, 0.05, 0.914, 1.03), (1.0, 0.05, 0.988, 1.09))),
         # one beside a bent valley of two, which ends, too
         (
             "quadrature",
