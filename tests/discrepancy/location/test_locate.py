@@ -242,6 +242,11 @@ def test_one_channel_and_few_static_points():
     assert not found.disagrees
     assert not found.disagreements
     assert all(np.isfinite(cell.p_value) for cell in found.cells)
+    # a quarter of a record that does not count leaves a bin of time empty
+    item = fitted.trials[0]
+    used = item.used & (np.arange(len(item.used)) >= len(item.used) // 4)[:, None]
+    late = replace(fitted, trials=(replace(item, trial=replace(item.trial, used=used)),))
+    assert min(cell.count for cell in locate(late).cells if cell.axis == "time") > 0
 
 
 def test_harmonics_of_a_motion_are_those_of_its_phase():
