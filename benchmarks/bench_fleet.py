@@ -34,7 +34,7 @@ def run() -> list[Measurement]:
     together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / turns
     alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     alone /= ALONE * scenario.mission.steps
-    seen = flown.observed, flown.control_index
+    seen = flown.row, flown.control_index
     sensors = knowledge.sensor_model
     likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *seen)) / turns
     worsening, scaled = Worsening.of(scenario), scaled_likelihood(sensors, *seen)[0]

@@ -9,23 +9,31 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import matplotlib as mpl
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.models.structures import WingModel
 from discrepancy.report.figures import missing_force_figure
-from discrepancy.sources.measured_rigs import SIGNAL, wing_campaign
+from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
 from discrepancy.workflow import Investigation, investigate
 from reporting.figures import publication_style
 
 BEGINS = (0.8, 1.0, 1.25)
+
+
+def wing_campaign(data: Path, begin: float) -> Campaign:
+    """Return the campaign of the published records, the ring-downs from a moment on."""
+    with TemporaryDirectory() as folder:
+        return read_campaign(write_rig_campaign("real_wing", data, Path(folder), begin=begin))
 
 
 def report(found: Investigation, table: Table, label: str) -> None:
@@ -141,7 +149,7 @@ def main() -> int:
     console = Console(width=160)
     runs = []
     for begin in given.begin:
-        campaign = wing_campaign(given.data, begin=begin)
+        campaign = wing_campaign(given.data, begin)
         runs.append(investigate(campaign, model))
         console.print(f"From {begin:g} s, held-out trials, rms: {held_out_rms(campaign, runs[-1])}")
         report(runs[-1], table, f"all, ring-downs from {begin:g} s")
@@ -149,7 +157,7 @@ def main() -> int:
     console.print(alone(runs, given.begin))
     first = runs[0]
     table = Table("records", "verdict", "", "held out: rms, mV", "χ²/dof")
-    whole = wing_campaign(given.data)
+    whole = wing_campaign(given.data, BEGINS[0])
     still = replace(
         whole,
         channels={name: channel for name, channel in whole.channels.items() if name != SIGNAL},

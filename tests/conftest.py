@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,24 +81,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(pytest.mark.skip(LONG))
     listed = set(NOT_QUICK.read_text("utf-8").split())
     if config.getoption("quick"):
-        left_out = [
-            item
-            for item in items
-            if item.nodeid.partition("[")[0] in listed or item.get_closest_marker("slow") is not None
-        ]
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in set(left_out)]
+        left_out = {item for item in items if item.nodeid.partition("[")[0] in listed}
+        left_out |= {item for item in items if item.get_closest_marker("slow")}
+        config.hook.pytest_deselected(items=[*left_out])
+        items[:] = [item for item in items if item not in left_out]
     if not getattr(config.option, "loadgroup", False):  # not in a worker of `--dist loadgroup`
         return
     group = {item.path: str(item.path.relative_to(config.rootpath)) for item in items}
-    for item in items:
-        shared = [name for name in SHARED if name in getattr(item, "fixturenames", ())]
-        if shared:
-            group[item.path] = shared[0]
-    for item in items:
-        named = item.get_closest_marker("xdist_group")
-        if named:
-            group[item.path] = named.args[0]
+    shared = {item: getattr(item, "fixturenames", ()) for item in items}
+    group |= {item.path: name for item in items for name in SHARED[::-1] if name in shared[item]}
+    group |= {item.path: mark.args[0] for item in items for mark in item.iter_markers("xdist_group")}
     slow = {group[item.path] for item in items if item.get_closest_marker("slow")}
     waiting = {group[item.path] for item in items if set(COMPILED) & set(item.path.parts)}
     long = Counter(group[item.path] for item in items if item.nodeid.partition("[")[0] in listed)
@@ -243,12 +235,8 @@ def synthetic_calibration(
         readings=(Reading("tip_stiffness", "load test", 682.1, 6.5),),
         measured=xr.Dataset(
             {
-                "load": ("pair", np.array([2.5, 5.0]), {"units": "N", "long_name": "load of the test"}),
-                "displacement": (
-                    "pair",
-                    np.array([0.004, 0.007]),
-                    {"units": "m", "long_name": "displacement of the test"},
-                ),
+                name: ("pair", np.array(values), {"units": unit, "long_name": f"{name} of the test"})
+                for name, unit, values in (("load", "N", [2.5, 5.0]), ("displacement", "m", [0.004, 0.007]))
             }
         ),
         design=design,
@@ -259,6 +247,14 @@ def synthetic_calibration(
 def make_calibration() -> Callable[..., Calibration]:
     """What makes a calibration without a wing."""
     return synthetic_calibration
+
+
+@pytest.fixture(scope="module")
+def no_report() -> Iterator[None]:
+    """The report of a run has tests of its own and takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
+        yield
 
 
 @pytest.fixture(scope="session")

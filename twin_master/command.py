@@ -220,8 +220,9 @@ def watch(
 ) -> None:
     """Watch a real asset: observations in, a decision for each turn out, as a line of JSON.
 
-    The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed. Everything is
-    kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
+    The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed.
+
+    Everything is kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up.
     """
     from twin_master.store.writing import REPORT_NAME
     from twin_master.watch import opening as from_python

@@ -20,7 +20,7 @@ from twin_master.assets.resolution import Overrides, given_overrides, resolve_sc
 from twin_master.errors import MissionInputError
 from twin_master.fleet.flight import source_of
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.truth import Plant
+from twin_master.mission.truth import Plant, decided_to_end
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.sentences import said
 
@@ -124,7 +124,8 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         """Fly one step under a control: observation, reward, terminated, truncated, info.
 
         An asset that ends its simulation by itself terminates the episode, with the last observation, no
-        reward and the sentence in `info["ended"]`; the last step of the mission truncates it.
+        reward and the sentence in `info["ended"]`, and so does an action that ends the mission, with what
+        came of it; the last step of the mission truncates it.
 
         Raises
         ------
@@ -143,6 +144,15 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         except FmuEndedError as error:
             self._step = self.scenario.mission.steps
             return self._seen, 0.0, True, False, self._info | {"ended": error.sentence}
+        if self.scenario.ends(int(action)):
+            self._step = self.scenario.mission.steps
+            return (
+                observation,
+                reward,
+                True,
+                False,
+                info | {"ended": decided_to_end(self.scenario, int(action))},
+            )
         return observation, reward, False, self._step >= self.scenario.mission.steps, info
 
     def close(self) -> None:

@@ -8,23 +8,11 @@ class TwinMasterError(Exception):
 
 
 class InvalidModelError(TwinMasterError, ValueError):
-    """State space, controls, sensors or rewards do not fit together."""
-
-
-class InvalidDistributionError(TwinMasterError, ValueError):
-    """A row of a stochastic matrix, or a belief, is no probability distribution."""
+    """State space, controls, sensors or rewards do not fit together, or a distribution is none."""
 
 
 class InvalidObservationError(TwinMasterError, ValueError):
     """An observation has the wrong shape or holds an infinite value."""
-
-
-class InvalidStrainLibraryError(TwinMasterError, ValueError):
-    """A strain library file is missing, damaged or incomplete."""
-
-
-class InvalidObservationLibraryError(TwinMasterError, ValueError):
-    """An observation library is missing, damaged, or cannot be sampled as asked."""
 
 
 class PlanningError(TwinMasterError, RuntimeError):
@@ -63,36 +51,16 @@ class ScenarioError(TwinMasterError, ValueError):
     """A scenario file cannot be read or does not keep to the schema."""
 
 
-class UnknownScenarioError(ScenarioError):
-    """No shipped scenario and no file has the name that was asked for."""
-
-
-class MissionError(TwinMasterError, RuntimeError):
-    """A mission cannot be flown on."""
-
-
-class MissingObservationModelError(MissionError):
-    """The twin cannot be given predicted observations for the scenario's asset."""
-
-
-class AssetOutputError(MissionError):
-    """The asset returned something that is no observation."""
-
-
 class RunFolderError(TwinMasterError, RuntimeError):
-    """A run folder cannot be used as asked."""
-
-
-class RunFolderExistsError(RunFolderError):
-    """The folder that a run was to be written to exists already."""
+    """A run folder cannot be used as asked, such as one that exists already."""
 
 
 class NotResumableError(RunFolderError):
     """A run cannot be continued from the folder."""
 
 
-class MissionInputError(MissionError, ValueError):
-    """Something that a mission was told to use is not there or does not fit."""
+class MissionInputError(TwinMasterError, ValueError):
+    """Something that a mission was told to use, or what flies, is not there or does not fit."""
 
 
 class FleetError(TwinMasterError, RuntimeError):
@@ -107,7 +75,6 @@ def check_names(
     whose: str,
     where: str,
     rows: Iterable[tuple[str, Iterable[str], Collection[str]]],
-    error: type[TwinMasterError] = MissionInputError,
     advice: str = "",
 ) -> None:
     """Check names of several sorts against those that are known.
@@ -120,15 +87,13 @@ def check_names(
         What knows names: "the binding uav_wing".
     rows : iterable of (str, names, known names)
         What the names are of, in the singular.
-    error : type
-        What is raised.
     advice : str
         What to do, behind a colon.
     """
     for what, names, known in rows:
         unknown = sorted({*names} - {*known})
         if unknown:
-            raise error(
+            raise MissionInputError(
                 f"{whose} {what} {', '.join(unknown)}, which {where} does not know; it knows "
                 f"{', '.join(known) or 'none'}{f': {advice}' if advice else ''}."
             )

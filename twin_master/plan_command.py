@@ -74,14 +74,11 @@ def _knowledge(
 
     resolved = resolve_scenario(load_scenario(scenario), Overrides(seed=seed, calibration=calibration))
     believed_source(resolved).check()
-    planner = resolved.planner
-    unplanned = resolved.model_copy(update={"planner": planner.model_copy(update=_UNPLANNED)})
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:
-            unplanned = with_candidates(unplanned, candidates, Path(folder, "candidates"))
-        found = prepared_alone(unplanned, believed_source(unplanned), terminal.progress())
-        places = _places(unplanned)
-    return replace(found, scenario=unplanned.model_copy(update={"planner": planner})), places
+            resolved = with_candidates(resolved, candidates, Path(folder, "candidates"))
+        found = prepared_alone(resolved, believed_source(resolved), terminal.progress())
+        return found, _places(resolved)
 
 
 def _planned(knowledge: "Knowledge") -> "tuple[DecisionProblem, BeliefPlan, ComparedPolicy]":
@@ -96,7 +93,7 @@ def _planned(knowledge: "Knowledge") -> "tuple[DecisionProblem, BeliefPlan, Comp
 
 def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     """Return what is known where actions that inspect show nothing, or gauges are not there."""
-    from twin_master.mission.preparation import knowledge_of
+    import numpy as np
 
     scenario = knowledge.scenario
     titles, inspecting = _titles(scenario), [action.name for action in scenario.action if action.inspects]
@@ -104,22 +101,20 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
         if name not in (*titles, *inspecting):
             known, gauges = inspecting or ["there is none"], f"{titles[0]} to {titles[-1]}"
             raise MissionInputError(said("plan_command.value_of", inspecting=known, gauges=gauges, name=name))
-    given, count = scenario.observation.standard_deviation, scenario.observation.count
-    each = given if isinstance(given, tuple) else (given,) * count
-    each = tuple(_BLIND if title in names else own for title, own in zip(titles, each, strict=True))
-    blind = {"standard_deviation": _BLIND}
+    shown = np.abs(knowledge.predicted).max(axis=(0, 1, 2))
+    each = np.broadcast_to(scenario.observation.standard_deviation, len(titles))
+    blind = np.where([title in names for title in titles], each + _BLIND * shown, each)
+    levels = np.abs(knowledge.model.states.coordinates).max()
+    unread = {"standard_deviation": _BLIND * levels}
     bare = scenario.model_copy(
         update={
-            "action": tuple(a.model_copy(update=blind if a.name in names else {}) for a in scenario.action),
-            "observation": scenario.observation.model_copy(update={"standard_deviation": each}),
-            "planner": scenario.planner.model_copy(update=_UNPLANNED),
+            "action": tuple(a.model_copy(update=unread if a.name in names else {}) for a in scenario.action),
+            "observation": scenario.observation.model_copy(
+                update={"standard_deviation": tuple(blind.tolist())}
+            ),
         }
     )
-    found = knowledge_of(
-        bare, knowledge.model, knowledge.draws, knowledge.sensor_model.value_per_draw,
-        true=knowledge.rewards.true_per_draw,
-    )  # fmt: skip
-    return replace(found, scenario=bare.model_copy(update={"planner": scenario.planner}))
+    return replace(knowledge, scenario=bare)
 
 
 def _titles(scenario: "Scenario") -> tuple[str, ...]:
@@ -128,10 +123,8 @@ def _titles(scenario: "Scenario") -> tuple[str, ...]:
     return section.titles or tuple(str(number + 1) for number in range(section.count))
 
 
-_UNPLANNED = {"policy": "mode", "limit_probability": None}
-"""Of the planner, where its plan is made apart."""
 _BLIND = 1e6
-"""Standard deviation of a sensor that shows nothing, SI."""
+"""Standard deviation of a sensor that shows nothing, over the largest that it could show."""
 
 
 def _draw(path: Path, figure: "Figure") -> None:

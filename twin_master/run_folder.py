@@ -16,7 +16,7 @@ from reporting.folders import lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance
-from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
+from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
@@ -71,20 +71,19 @@ def create_run_folder(
 
     Raises
     ------
-    RunFolderExistsError
-        The folder exists and is not to be replaced, or is no run folder.
     RunFolderError
-        Another process is flying in the folder that is to be replaced.
+        The folder exists and is not to be replaced, or is no run folder; or another process is flying in the
+        folder that is to be replaced.
     FileNotWrittenError
         The disk is full or the place is not writable.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
+        raise RunFolderError(f"{folder} exists and is no folder: choose another --out.")
     occupied = folder.is_dir() and any(folder.iterdir())
     if occupied and folder_config(folder, config["kind"]) is None:
-        raise RunFolderExistsError(said("run_folder.foreign", folder=folder))
+        raise RunFolderError(said("run_folder.foreign", folder=folder))
     if occupied and not replace:
-        raise RunFolderExistsError(said("run_folder.there", folder=folder))
+        raise RunFolderError(said("run_folder.there", folder=folder))
     with ExitStack() as holding:
         with whole_folder(folder, lock_run_folder) as fresh:
             holding.callback(os.close, lock_run_folder(fresh))
@@ -217,7 +216,7 @@ def begun_folder(
 
     Raises
     ------
-    RunFolderExistsError
+    RunFolderError
         The folder exists.
     """
     config = {

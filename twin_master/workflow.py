@@ -93,7 +93,7 @@ def fly(
 
     Raises
     ------
-    RunFolderExistsError
+    RunFolderError
         The folder exists.
     TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError
         With one clear sentence; the run folder stays resumable.

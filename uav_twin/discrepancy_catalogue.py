@@ -107,12 +107,8 @@ def _values(text: str, identifier: str, given: list[str], names: list[str]) -> d
 
 def convert(out: Path, *, data: Path, rig: str = "real_wing") -> None:
     """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""
-    modelled = rig != parts.THE_WING
-    if modelled:
-        campaign = parts.read_campaign(parts.write_rig_campaign(rig, data, out))
-    else:
-        campaign = parts.write_wing_campaign(data, out)
-    print_record("convert", campaign=campaign, out=out, modelled=modelled)
+    campaign = parts.read_campaign(parts.write_rig_campaign(rig, data, out))
+    print_record("convert", campaign=campaign, out=out, modelled=(out / "model.toml").exists())
 
 
 def apply(

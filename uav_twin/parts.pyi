@@ -66,9 +66,7 @@ from discrepancy.sources.examples import example_campaign as example_campaign
 from discrepancy.sources.examples import plan_of as plan_of
 from discrepancy.sources.examples import write_example as write_example
 from discrepancy.sources.from_run import run_campaign as run_campaign
-from discrepancy.sources.measured_rigs import THE_WING as THE_WING
 from discrepancy.sources.measured_rigs import write_rig_campaign as write_rig_campaign
-from discrepancy.sources.measured_rigs import write_wing_campaign as write_wing_campaign
 from discrepancy.verdict import VerdictKind as VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder as check_verdict_folder
 from discrepancy.verdict_folder import write_verdict_folder as write_verdict_folder

@@ -171,9 +171,8 @@ class DampedCosines:
         amplitude = coefficient[:count] + 1j * coefficient[count : 2 * count]
         fitted = basis @ coefficient
         square = np.sum((self._signal - fitted) ** 2, axis=0)
-        half = 0.5 * pole * self._width
-        slope = 0.5 * self._width * (1.0 / np.tanh(half) - 1.0 / half) if self._width else 0.0
-        moved = (self._time[:, None] + slope) * wave
+        # by the poles; what averages add to it is in proportion to the wave, as its amplitude is
+        moved = self._time[:, None] * wave
         covariance = np.zeros((2 * count + channels * own,) * 2)
         used = np.delete(np.arange(len(covariance)), [] if frequencies_fitted else np.s_[count : 2 * count])
         freedom = max(self._signal.size - used.size, 1)

@@ -12,7 +12,7 @@ from math import ceil, inf
 import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter, zoom_fft
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from discrepancy.campaign.noise_tests import ljung_box
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRecord, Trial
@@ -169,7 +169,8 @@ def line_near(samples: FloatArray, interval: float, shown: float, reach: float) 
     ]
     level = near.mean() * 2.0 / len(samples)  # mean power that a line of noise alone takes from the sum
     independent = 1.0 + 2.0 * reach / resolution
-    stands_out = level > 0.0 and line @ line > 0.5 * chi2.isf(LINE_LEVEL / independent, 2) * level
+    far = f_distribution.isf(LINE_LEVEL / independent, 2, 2 * len(near))  # few ordinates tell the level
+    stands_out = level > 0.0 and line @ line > far * level
     return line if stands_out else None
 
 

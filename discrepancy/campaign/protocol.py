@@ -1,10 +1,11 @@
 """How trials began and what happened in them, as files and models have it: one record each."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from keyword import iskeyword
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
@@ -41,8 +42,8 @@ class Release:
 
     Raises
     ------
-    CampaignFileError
-        The displacement is zero.
+    ValueError
+        A value is out of its range, such as a displacement of zero.
     """
 
     displacement: Number
@@ -78,7 +79,7 @@ class Event:
 
     Raises
     ------
-    CampaignFileError
+    ValueError
         The name cannot be used in expressions, or trials or end are none.
     """
 

@@ -1,16 +1,19 @@
 """Units of a campaign's files as pint knows them, and their conversion to SI."""
 
 import re
+import tomllib
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
+from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Quantity
 from reporting.units import exact_meaning
 from reporting.words import listing
 
-STANDARD_GRAVITY = 9.80665
-"""m/s^2 in one g, exact by definition."""
+_TABLES = Path(__file__).with_suffix(".toml")
 _NEVER_CONVERTED = {"degC", "°C", "K"}
 """Temperatures: a campaign has one of the two for all."""
 
@@ -28,35 +31,19 @@ class Units(NamedTuple):
         That of values in memory; of a signal it is nominal.
     drawn : tuple of float and str
         Factor from SI, and unit, in figures.
+    foreign : mapping of str to float
+        Units that instruments show besides, and what one of them is in SI.
     """
 
-    usual: tuple[str, ...]
+    usual: Sequence[str]
     written: str
     si: str
     drawn: tuple[float, str]
+    foreign: Mapping[str, float] = MappingProxyType({})
 
 
-UNITS = {
-    Quantity.STRAIN: Units(("1", "microstrain", "percent"), "microstrain", "1", (1e6, "µε")),
-    Quantity.DISPLACEMENT: Units(("m", "mm", "um"), "mm", "m", (1e3, "mm")),
-    Quantity.VELOCITY: Units(("m/s", "mm/s", "km/h"), "m/s", "m/s", (1.0, "m/s")),
-    Quantity.ACCELERATION: Units(("m/s2", "mm/s2", "g"), "m/s2", "m/s2", (1.0, "m/s²")),
-    Quantity.SIGNAL: Units(("V", "mV", "1"), "V", "V", (1.0, "signal")),
-    Quantity.ANGLE: Units(("rad", "mrad", "deg"), "rad", "rad", (1.0, "rad")),
-    Quantity.ANGULAR_VELOCITY: Units(("rad/s", "deg/s", "rpm"), "rad/s", "rad/s", (1.0, "rad/s")),
-    Quantity.ANGULAR_ACCELERATION: Units(("rad/s2", "deg/s2"), "rad/s2", "rad/s2", (1.0, "rad/s²")),
-    Quantity.FORCE: Units(("N", "mN", "kN"), "N", "N", (1.0, "N")),
-    Quantity.TORQUE: Units(("N m", "mN m", "kN m"), "N m", "N m", (1.0, "N m")),
-    Quantity.PRESSURE: Units(("Pa", "hPa", "kPa", "bar", "mbar", "MPa"), "Pa", "Pa", (1e-3, "kPa")),
-    Quantity.LEVEL: Units(("m", "cm", "mm"), "m", "m", (1.0, "m")),
-    Quantity.FLOW: Units(("m3/s", "l/s", "l/min", "m3/h"), "m3/s", "m3/s", (1.0, "m³/s")),
-    Quantity.TEMPERATURE: Units(("degC", "K"), "degC", "degC", (1.0, "°C")),
-    Quantity.HEAT: Units(("W", "mW", "kW"), "W", "W", (1.0, "W")),
-    Quantity.VOLTAGE: Units(("V", "mV", "kV"), "V", "V", (1.0, "V")),
-    Quantity.CURRENT: Units(("A", "mA"), "A", "A", (1.0, "A")),
-    Quantity.CHARGE: Units(("C", "mC", "A h"), "C", "C", (1.0, "C")),
-}
-"""All that files, tables and figures know of a quantity: a new kind of sensor is one more row."""
+UNITS = {Quantity(name): Units(**row) for name, row in tomllib.loads(_TABLES.read_text("utf-8")).items()}
+"""Of each quantity: a new kind of sensor is one more table in `units.toml`."""
 
 
 @cache

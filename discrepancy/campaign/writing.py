@@ -85,7 +85,9 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
     if trial.kind is TrialKind.FLIGHT:
         columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
-        columns["temperature"] = trial.temperature + (campaign.reference_temperature or 0.0)
+        if campaign.reference_temperature is None:
+            raise CampaignFileError(said("campaign.no_reference", trial=trial))
+        columns["temperature"] = trial.temperature + campaign.reference_temperature
     for index, region in enumerate(trial.regions):
         name = region if region in USUAL_REGIONS else f"{schema.OF_REGION}{region}"
         for key, values in ((name, trial.health), (f"{name}_deviation", trial.health_deviation)):

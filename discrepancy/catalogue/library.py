@@ -140,8 +140,8 @@ def check(effects: Iterable[Effect]) -> None:
 
 def _faults(effect: Effect) -> Iterator[str]:
     """Yield what is not sound in an entry, as a sentence goes on after its identifier."""
-    if not _IDENTIFIER.fullmatch(effect.identifier):
-        yield " must have an identifier of lower-case letters, digits and underscores."
+    if not (effect.name and _IDENTIFIER.fullmatch(str(effect.identifier))):
+        yield " must have a name, and an identifier of lower-case letters, digits and underscores."
     if not effect.acts_on:
         yield " does not say which trials it acts on."
     if not effect.parameters:

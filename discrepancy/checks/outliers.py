@@ -163,10 +163,9 @@ def _is_event(rest: FloatArray, index: int, shape: tuple[int, int]) -> bool:
 
 @lru_cache(maxsize=32)
 def _patterns(width: int, degree: int) -> FloatArray:
-    """Return what the local polynomial leaves of a wrong reading (row 0), of kinks and of steps, near it."""
+    """Return what the local polynomial leaves of a wrong reading (row 0), a kink and steps at a sample."""
     places = np.arange(-2 * width, 2 * width + 1)
-    signals = [places == 0, *(np.abs(places - shift) for shift in (-1.0, -0.5, 0.0, 0.5, 1.0))]
-    signals += [places > shift for shift in (-0.5, 0.5)]
+    signals = places == 0, np.abs(places), places >= 0, places > 0
     weights = _weights(width, degree)
     return np.stack([np.convolve(np.asarray(signal, dtype=float), weights, "valid") for signal in signals])
 

@@ -3,28 +3,15 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from math import log, pi
+from math import log
 from statistics import median
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.campaign.units import STANDARD_GRAVITY, UNITS, conversion_of
+from discrepancy.campaign.units import UNITS, conversion_of
 
 from .fault import DataFault, FaultKind, fault
 
-FOREIGN: Mapping[Quantity, Mapping[str, float]] = {
-    Quantity.DISPLACEMENT: {"cm": 1e-2, "inch": 0.0254, "foot": 0.3048},
-    Quantity.VELOCITY: {"inch/s": 0.0254, "foot/s": 0.3048, "m/min": 1.0 / 60.0, "knot": 1852.0 / 3600.0},
-    Quantity.ANGLE: {"turn": 2.0 * pi},
-    Quantity.ANGULAR_VELOCITY: {"Hz": 2.0 * pi},
-    Quantity.FORCE: {"kgf": STANDARD_GRAVITY, "lbf": 4.4482216152605},
-    Quantity.TORQUE: {"kgf m": STANDARD_GRAVITY, "lbf ft": 1.3558179483314, "lbf inch": 0.1129848290276},
-    Quantity.PRESSURE: {"psi": 6894.757293168, "mm of water": STANDARD_GRAVITY, "mm Hg": 133.322387415},
-    Quantity.LEVEL: {"inch": 0.0254, "foot": 0.3048},
-    Quantity.FLOW: {"l/h": 1e-3 / 3600.0, "m3/min": 1.0 / 60.0},
-    Quantity.CHARGE: {"mA h": 3.6},
-}
-"""Units that instruments show beside the usual ones, and what one of them is in SI."""
 _DRIVES = {
     TrialKind.STATIC: (Quantity.FORCE, "N"), TrialKind.FORCED: (Quantity.FORCE, "N"),
     TrialKind.RINGDOWN: (Quantity.DISPLACEMENT, ""), TrialKind.FLIGHT: (Quantity.ACCELERATION, "g"),
@@ -81,7 +68,7 @@ def slip_between(scale: float, quantity: Quantity, stated: str = "", *, drive: b
         return None
     units = {*UNITS[quantity].usual, *([stated] if stated else [])}
     sizes = {unit: conversion_of(quantity, unit) for unit in sorted(units)}
-    sizes |= FOREIGN.get(quantity, {})
+    sizes |= UNITS[quantity].foreign
     slips = [
         Slip(sizes[meant] / size if drive else size / sizes[meant], meant, unit)
         for unit, size in sizes.items()

@@ -5,6 +5,7 @@ recorded of the noise.
 """
 
 import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import astuple
 from pathlib import Path
@@ -35,26 +36,10 @@ _DAMAGED = (
 _PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
 """What the file has of a channel as it is."""
 _NOTE = "unit of each channel: see the coordinate `unit`"
-_OF_TRIAL = {
-    "time": ("row", "s", "time"),
-    "force": ("row", "N", "applied force, upwards positive"),
-    "load_factor": ("row", "1", "load factor"),
-    "temperature": ("row", "K", "temperature less the reference"),
-    "health": ("row region", "1", "stiffness losses"),
-    "health_deviation": ("row region", "1", "prior standard deviations of the stiffness losses"),
-}
-_OF_FIT = {
-    "prediction": ("row channel", "", "mean of the posterior prediction, gains and offsets included"),
-    "residual": ("row channel", "", "measured less predicted"),
-    "noise_deviation": ("channel", "", "standard deviation of the noise"),
-    "predictive_deviation": (
-        "row channel", "", "standard deviation of a measured value under the posterior prediction",
-    ),
-    "standardised": ("row channel", "1", "residual over noise"),
-    "leverage": ("row channel", "1", "share of the fit in the variance"),
-    "rates": ("row channel", "", "time derivative of the prediction, per s"),
-}  # fmt: skip
-"""Dimensions, unit (empty: of the channel) and words of the arrays of a trial and of its fit, by name."""
+_ARRAYS: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(
+    Path(__file__).with_suffix(".toml").read_text("utf-8")
+)
+"""Dimensions, unit and words of the arrays of a trial and of its fit, by name."""
 
 
 def write_residuals(path: Path, residuals: ResidualSet, attributes: Mapping[str, str] | None = None) -> Path:
@@ -145,11 +130,11 @@ def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
         "measured": (("row", "channel"), trial.values, {"long_name": "measured value", "comment": _NOTE}),
         "used": (("row", "channel"), item.used.astype(np.int8), {"long_name": "1 where the sample counts"}),
     }
-    for record, known in ((trial, _OF_TRIAL), (item, _OF_FIT)):
-        for name, (dimensions, unit, text) in known.items():
+    for record, part in ((trial, "trial"), (item, "fit")):
+        for name, known in _ARRAYS[part].items():
             if (values := getattr(record, name)) is not None:
-                of_unit = {"units": unit} if unit else {"comment": _NOTE}
-                variables[name] = (dimensions.split(), values, {"long_name": text, **of_unit})
+                words = {key: text for key, text in known.items() if key != "dimensions"}
+                variables[name] = (known["dimensions"], values, words)
     said: dict[str, Any] = {
         "name": trial.name, "kind": trial.kind.value, "run": trial.run, "start": trial.start,
         "held_out": int(trial.held_out), "load_place": json.dumps(trial.load_place),
@@ -166,7 +151,7 @@ def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
 
 def _trial(group: xr.Dataset) -> FittedTrial:
     attributes = group.attrs
-    rows: dict[str, Any] = {name: group[name].values for name in _OF_TRIAL}
+    rows: dict[str, Any] = {name: group[name].values for name in _ARRAYS["trial"]}
     for name, values in rows.items():
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{name} is not finite")
@@ -185,5 +170,5 @@ def _trial(group: xr.Dataset) -> FittedTrial:
         regions=tuple(json.loads(attributes["regions"])) if "regions" in attributes else USUAL_REGIONS,
         **rows,
     )
-    found = {name: group[name].values for name in _OF_FIT.keys() - {"standardised"} if name in group}
+    found = {name: group[name].values for name in _ARRAYS["fit"].keys() - {"standardised"} if name in group}
     return FittedTrial(trial, **found)

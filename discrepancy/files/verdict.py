@@ -20,6 +20,7 @@ from fe.runtime.patch import ModelPatch
 from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 from reporting.folders import restore_folder
+from reporting.words import brief
 
 VERDICT_SCHEMA = "uav-twin verdict 4"
 """Value of the key `schema`; files of earlier numbers are read too."""
@@ -36,8 +37,11 @@ class StoredVerdict:
     proof: Proof | None
     origin: Origin
 
+    def __repr__(self) -> str:
+        return brief(self, verdict=self.verdict, model=self.origin.model, campaign=self.origin.campaign)
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class VerdictFolder(StoredVerdict):
     """What `uav-twin discrepancy run` left: the content of `verdict.json`, and more.
 

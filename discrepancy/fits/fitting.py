@@ -124,7 +124,7 @@ def fit(
     """
     descent = _Descent(problem, candidate, local_only)
     damping = 1e-3
-    state = descent.state(_bounded(start), known)
+    state = descent.state(_bounded(problem, start), known)
     if not np.isfinite(state.objective):
         names = candidate.identifiers or "no effect"
         raise FitError(said("models.not_finite", names=names))
@@ -180,7 +180,7 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
     ModelError
         If the structure cannot carry the effects.
     """
-    point = _bounded(point)
+    point = _bounded(problem, point)
     responses = [problem.answer(number, point, candidate) for number in range(len(problem.trials))]
     return _compared(problem, point, responses)[0]
 
@@ -218,17 +218,24 @@ class _Descent:
         return State(point, *compared, parts)
 
     def step(self, state: State, damping: float) -> tuple[Point, float]:
-        """Return the step and the decrease it promises [nat], and keep the deviations of the effects."""
+        """Return the step and the decrease it promises [nat], and keep the deviations of the effects.
+
+        What is at the end of its range and would leave it stays (Bertsekas 1982, SIAM J. Control Optim. 20).
+        """
         problem, first = self.problem, self.problem.shared.size
         own = first + self.candidate.size
         found = normal_equations(problem, state, self.candidate, problem.precisions(state.sums))
         size = len(found.gradient)
         effects = np.eye(size)[:, first:own]
         self.deviation = np.sqrt(np.diag(solved(upper_factor(found.matrix), effects)[first:own]))
-        free = slice(own if self.local_only else 0, size)
-        damped = (found.matrix + damping * np.diag(np.diag(found.matrix)))[free, free]
+        low, high = problem.shared.ends
+        at, downhill = state.point.shared, finite(found.gradient)[:first]
+        held = ((at <= low) & (downhill < 0.0)) | ((at >= high) & (downhill > 0.0))
+        free = np.arange(size) >= (own if self.local_only else 0)
+        free[:first] &= ~held
+        damped = (found.matrix + damping * np.diag(np.diag(found.matrix)))[np.ix_(free, free)]
         step = np.zeros(size)
-        step[free] = solved(upper_factor(damped), finite(found.gradient)[free])
+        step[free] = solved(upper_factor(damped), found.gradient[free])
         ends = np.cumsum([own, *(data.unknowns.size for data in problem.trials)])
         local = tuple(step[a:b] for a, b in pairwise(ends.tolist()))
         return Point(step[:first], local, step[first:own]), 0.5 * float(found.gradient @ step)
@@ -242,11 +249,11 @@ class _Descent:
         """
         for share in STEP_SHARES:
             try:
-                ahead = _ahead(self.candidate, state.point, step, share)
+                ahead = _ahead(self.problem, self.candidate, state.point, step, share)
                 there = objective(self.problem, self.candidate, ahead)
                 if share == 1.0 and state.objective <= there < np.inf:
                     correction, _ = self.step(self.state(ahead, state.linearisations), damping)
-                    ahead = _ahead(self.candidate, ahead, correction)
+                    ahead = _ahead(self.problem, self.candidate, ahead, correction)
                     there = objective(self.problem, self.candidate, ahead)
                 if there < state.objective:
                     return self.state(ahead, state.linearisations)
@@ -269,15 +276,19 @@ def _finished(problem: Problem, candidate: Candidate, state: State, converged: b
     )  # fmt: skip
 
 
-def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
+def _ahead(problem: Problem, candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
     """Return the point a share of a step ahead."""
     local = tuple(u + share * du for u, du in zip(point.local, step.local, strict=True))
     effect = candidate.stepped(point.effect, share * step.effect)
-    return _bounded(Point(point.shared + share * step.shared, local, effect))
+    return _bounded(problem, Point(point.shared + share * step.shared, local, effect))
 
 
-def _bounded(point: Point) -> Point:
-    return replace(point, effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))
+def _bounded(problem: Problem, point: Point) -> Point:
+    return replace(
+        point,
+        shared=np.clip(point.shared, *problem.shared.ends),
+        effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT),
+    )
 
 
 def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateFit | None:

@@ -86,7 +86,7 @@ def _predicted(
         residual = problem.residual(number, adapted.point, adapted.responses[number])
         items.append(
             FittedTrial(
-                trial=data.trial,
+                trial=replace(data.trial, used=data.weight > 0.0),  # after a gap a filter leaves out more
                 prediction=prediction,
                 residual=residual * data.deviation,  # what a remainder takes up is what is left
                 noise_deviation=data.deviation,

@@ -220,9 +220,10 @@ class Problem:
         def slope(by_shared: FloatArray, by_local: FloatArray, step: float = PARAMETER_STEP) -> FloatArray:
             return (self.response(number, by_shared, by_local, patch)[0] - response) / step
 
-        parameters = [
-            slope(moved(shared, k, SHARED_STEP), local, SHARED_STEP) for k in range(self.shared.count)
-        ]
+        # inwards from the end of a range
+        inwards = shared + SHARED_STEP > self.shared.ends[1]
+        steps = np.where(inwards, -SHARED_STEP, SHARED_STEP)[: self.shared.count]
+        parameters = [slope(moved(shared, k, step), local, step) for k, step in enumerate(steps.tolist())]
         columns = [slope(shared, moved(local, k)) for k in range(first, last)]
         if unknowns.has_time_zero:
             of_time = slope(shared, moved(local, last)) if rates is None else rates * unknowns.scale[last]

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
-from math import isinf, prod
+from math import inf, isinf, prod
 
 import numpy as np
 
@@ -60,6 +60,15 @@ class GlobalUnknowns:
     def count(self) -> int:
         """Number P of calibrated parameters."""
         return len(self.low)
+
+    @cached_property
+    def ends(self) -> FloatArray:
+        """Least and greatest of the scaled variables (2, Q), by the ranges of the model."""
+        found = np.tile([[-inf], [inf]], self.size)
+        free = np.flatnonzero(self.scale[: self.count])
+        ends = np.array([self.low, self.high])
+        found[:, free] = (ends[:, free] - self.centre[free]) / self.scale[free]
+        return found
 
     def parameters(self, u: FloatArray) -> FloatArray:
         """Return the calibrated parameters, kept within the range of the model."""

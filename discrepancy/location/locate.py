@@ -94,7 +94,7 @@ def singular_patterns(residuals: ResidualSet, kind: Kind) -> list[Disagreement]:
     Vectors of the residual matrix (samples x channels, in units of the noise). Their p-value is that of the
     largest singular value of a noise matrix of this size: Tracy and Widom's law (Johnstone 2001, Ann.
     Statist. 29, 295-327) by the gamma distribution of its moments (Chiani 2014, J. Multivar. Anal. 129,
-    69-81).
+    69-81), averaged over what a noise record may be wrong by: that of the loudest channel.
     """
     found: list[Disagreement] = []
     matrix = np.vstack(kind.white)
@@ -105,9 +105,13 @@ def singular_patterns(residuals: ResidualSet, kind: Kind) -> list[Disagreement]:
     surplus = max(float(np.sum(singular**2)) - rows * columns, 1e-9)
     roots = np.sqrt(max(rows, columns) - 1.0), np.sqrt(min(rows, columns))
     scale = sum(roots) * sum(1.0 / root for root in roots) ** (1.0 / 3.0)
+    known = filter(None, map(residuals.degrees_of_freedom, kind.items[0].trial.channels))
+    freedom = min([*known, 1e9])
+    louder = freedom / stats.chi2.isf(((np.arange(1000) + 0.5) / 1000) ** (1.0 / columns), freedom)
     # After k patterns the rest is compared with whole noise matrices: a little too strict, never lax.
     for value, weights in zip(singular[:MOST_PATTERNS] ** 2, right, strict=False):
-        p = float(stats.gamma.sf((value - sum(roots) ** 2) / scale + 9.84801, 46.446, scale=0.186054))
+        off = (value / louder - sum(roots) ** 2) / scale
+        p = float(np.mean(stats.gamma.sf(off + 9.84801, 46.446, scale=0.186054)))
         if p > PATTERN_LEVEL:
             break
         share = float(np.clip((value - max(rows, columns)) / surplus, 0.0, 1.0))

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import benjamini_yekutieli, periodogram, variance_p_value
-from discrepancy.campaign.records import BoolArray, FloatArray, Trial
+from discrepancy.campaign.records import BoolArray, FloatArray
 
 from .residuals import FittedTrial, ResidualSet, quadratic_moments
 
@@ -136,8 +136,6 @@ class Cell:
     ----------
     trial, channel : str
         Names.
-    state : str
-        Kind, run and health of the trial.
     axis : str
         "whole", "time", "amplitude", "frequency" or "load".
     low, high : float
@@ -157,7 +155,6 @@ class Cell:
 
     trial: str
     channel: str
-    state: str
     axis: str
     low: float
     high: float
@@ -188,26 +185,13 @@ def residual_map(
     return tuple(replace(cell, significant=bool(flag)) for cell, flag in zip(cells, found, strict=True))
 
 
-def state_of(trial: Trial) -> str:
-    """Return kind, run and health of a trial in a few words."""
-    words = [trial.kind.value]
-    if trial.run:
-        words.append(f"run {trial.run}")
-    if np.any(trial.health):
-        losses = ", ".join(
-            f"{name} = {loss:.2g}" for name, loss in zip(trial.regions, trial.health[0], strict=True)
-        )
-        words.append(losses + ("" if np.ptp(trial.health, axis=0).max() == 0 else " .."))
-    return ", ".join(words)
-
-
 def _cells(residuals: ResidualSet, item: FittedTrial, white: FloatArray) -> Iterator[Cell]:
     trial = item.trial
     for column, channel in enumerate(trial.channels):
         freedom, used = residuals.degrees_of_freedom(channel), item.used[:, column]
         if not used.any():
             continue
-        base = Cell(trial.name, channel, state_of(trial), "whole", np.nan, np.nan, 0, "", np.nan, 1.0)
+        base = Cell(trial.name, channel, "whole", np.nan, np.nan, 0, "", np.nan, 1.0)
         for axis, low, high, where in _stretches(item, column):
             cell = replace(base, axis=axis, low=low, high=high, count=int(where.sum()))
             tables = features(item, column) if axis == "whole" else {"mean": np.ones((cell.count, 1))}
@@ -234,9 +218,8 @@ def _stretches(item: FittedTrial, column: int) -> Iterator[tuple[str, float, flo
     for axis, values, edges in axes:
         place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
         for number, (low, high) in enumerate(pairwise(edges.tolist())):
-            where = used & (place == number)
-            if low < high and where.any():
-                yield axis, low, high, where
+            if low < high:
+                yield axis, low, high, used & (place == number)
 
 
 def _along(

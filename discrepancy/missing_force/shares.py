@@ -191,7 +191,8 @@ class ForceShares:
 def _share(before: FloatArray, after: FloatArray, noise: FloatArray) -> FloatArray:
     """Return 1 - (after - noise) / (before - noise), nought where nothing is missing."""
     gap = before - noise
-    return np.where(gap > 0.0, 1.0 - np.maximum(after - noise, 0.0) / np.where(gap > 0.0, gap, 1.0), 0.0)
+    left = np.ones_like(gap)
+    return 1.0 - np.divide(np.maximum(after - noise, 0.0), gap, out=left, where=gap > 0.0)
 
 
 def _noise(trial: SeenTrial) -> FloatArray:

@@ -19,7 +19,6 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace, state_motion
 from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
-from fe.runtime.arrays import PLACE
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import ALIKE, Boundaries, Laws, static_solution, steps_under
 from fe.runtime.motion_arrays import ModalMotion
@@ -68,7 +67,7 @@ class FmuMotion(FmuPace):
             return sampled(values, step, times, orders, orders)
         amounts, still = self._amounts(case, linear=True), self._still(case)
         stamps, back = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
-        even = np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
+        even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
         if not even:  # as many lengths of steps as stamps would take long
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
         loads = [] if case.course is None else [Load(case.lever, case.course)]
@@ -142,7 +141,6 @@ class FmuMotion(FmuPace):
         (q, v_end), (pulls, lagged) = np.zeros((2, 2, count)), np.zeros((2, 2, len(laws)))
         out = ModalMotion(q, v_end, pulls, lagged, moving.memory)
         before, taken = 2.0 * free[0, v] - free[1, v], np.zeros(count)
-        friction = laws.of_speed == 1
         asset, first, courses = self.begun(run)
         values, acts = [first], np.column_stack([*courses.values()])
         pushed = [list(courses).index(name) for name in names]
@@ -152,7 +150,6 @@ class FmuMotion(FmuPace):
             moving.q[:], moving.v[:] = values[-1][x,], speed
             go.push[:] = np.concatenate((0.5 * h * h * push, h * push))
             go.begin[:] = go.end[:] = push
-            moving.memory[friction, PLACE] = rows[friction] @ moving.q  # where it holds the port
             compiled_kernel().integrate(
                 tuple(go), 0, 1, 0, True, number > 0, given, tuple(moving), tuple(out)
             )

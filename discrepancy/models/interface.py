@@ -314,11 +314,10 @@ class Model(ABC):
             whole = (self.patch + patch).in_trial(trial.name)
             self.check(trial)
             self.check_outputs(outputs)
-            ports = self.ports
             for item in whole:
-                at_port = isinstance(item, PortForce) and item.port in ports
-                if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
-                    port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not ports else ""
+                if not (isinstance(item, SENSORS) or self.supports(type(item))):
+                    portless = isinstance(item, INTERNAL_FORCES) and not self.ports
+                    port = " (it has no port)" if portless else ""
                     raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
             try:
                 return trial, self._respond(trial, outputs, whole, conditions)

@@ -19,6 +19,7 @@ from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
+from discrepancy.search.honest_evidence import left_by
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
@@ -78,7 +79,8 @@ def calibrate_parameters(
     campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
-    gate = absolute_gate(problem, posterior.optima[0])
+    best = posterior.optima[0]  # what noise is coloured like, beyond what its record tells, is no gap
+    gate = absolute_gate(problem, replace(best, remainder=left_by(problem, best)))
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
     return Calibration(
         asset=campaign.name if asset is None else asset,

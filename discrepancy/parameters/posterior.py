@@ -4,13 +4,16 @@ from collections.abc import Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
-from scipy.special import ndtr
-from scipy.stats import multivariate_normal
+from scipy.optimize import lsq_linear
+from scipy.special import log_ndtr, logsumexp, softmax
+from scipy.stats import truncnorm
+from scipy.stats.qmc import Sobol
 
 from calibration.result.record import Procedure
 from calibration.static.posterior import stratified
@@ -18,6 +21,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, fit
+from discrepancy.fits.normal_equations import normal_equations, solved, upper_factor
 from discrepancy.fits.problem import Problem
 
 NOTHING = Candidate()
@@ -51,9 +55,7 @@ class Marginal:
         self._problem = problem
         shared = problem.shared
         self.free = np.flatnonzero(shared.scale[: shared.count] > 0.0)
-        mean, scale = shared.centre[self.free], shared.scale[self.free]
-        self.low = (shared.low[self.free] - mean) / scale
-        self.high = (shared.high[self.free] - mean) / scale
+        self.low, self.high = shared.ends[:, self.free]
         self._near = problem.start(NOTHING)
         self.refused: list[tuple[FloatArray, str]] = []
 
@@ -121,7 +123,7 @@ class Marginal:
         return 0.5 * float(u @ u) - found.log_evidence
 
     def optima(self, seed: int) -> list[CandidateFit]:
-        """Return the maxima of the posterior that tell, the most probable first.
+        """Return the maxima of the posterior that tell, with their evidence within the range, greatest first.
 
         Raises
         ------
@@ -129,33 +131,133 @@ class Marginal:
             If the model fails at its prior mean.
         """
         problem = self._problem
-        fits = [self._within(fit(problem, NOTHING, problem.start(NOTHING), iterations=40))]
+        fits = [fit(problem, NOTHING, problem.start(NOTHING), iterations=40)]
         generator = np.random.default_rng(seed)
         for _ in range(STARTS):
             start = problem.start(NOTHING)
-            start.shared[self.free] = np.clip(generator.standard_normal(len(self.free)), self.low, self.high)
+            start.shared[self.free] = generator.standard_normal(len(self.free))
             with suppress(FitError, ModelError):
-                fits.append(self._within(fit(problem, NOTHING, start, iterations=40)))
+                fits.append(fit(problem, NOTHING, start, iterations=40))
         found: list[CandidateFit] = []
+        every = np.ones(len(self.free), dtype=bool)
         for item in sorted(fits, key=lambda item: round(item.objective, 3)):  # of equal ones the first
             if not any(self._same(other, item) for other in found):
-                found.append(item)
+                found.append(replace(item, log_evidence=self.about(item, every).log_evidence))
         found.sort(key=lambda item: -item.log_evidence)
         best = found[0]
         self._near = best.point
         return [item for item in found if item.log_evidence > best.log_evidence - COMPARABLE]
-
-    def _within(self, found: CandidateFit) -> CandidateFit:
-        """Return a fit at the end of the range where its last step ended beyond it."""
-        shared = found.point.shared.copy()
-        shared[self.free] = np.clip(shared[self.free], self.low, self.high)
-        return replace(found, point=replace(found.point, shared=shared))
 
     def _same(self, first: CandidateFit, second: CandidateFit) -> bool:
         free = self.free
         shift = first.point.shared[free] - second.point.shared[free]
         covariance = first.covariance[np.ix_(free, free)]
         return bool(shift @ np.linalg.solve(covariance, shift) < APART**2)
+
+    def about(self, found: CandidateFit, fitted: NDArray[np.bool_]) -> "CutGaussian":
+        """Return the Gaussian that a fit tells of those (P,) that were fitted, be it at an end or not."""
+        problem, which = self._problem, self.free[fitted]
+        equations = normal_equations(problem, found, NOTHING, problem.precisions(found.sums))
+        step = solved(upper_factor(equations.matrix), equations.gradient)
+        return CutGaussian(
+            found.point.shared[which] + step[which],
+            found.covariance[np.ix_(which, which)],
+            self.low[fitted],
+            self.high[fitted],
+            found.log_evidence + 0.5 * float(equations.gradient @ step),
+        )
+
+
+@dataclass(frozen=True)
+class CutGaussian:
+    """A Gaussian of scaled parameters, cut off at their range.
+
+    Attributes
+    ----------
+    mean, covariance : (P,), (P, P) ndarray
+        Of the Gaussian that goes on beyond the range; its mean may lie there.
+    low, high : (P,) ndarray
+        Ends of the range.
+    whole : float
+        ln of its integral without the range, up to a constant [nat].
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    low: FloatArray
+    high: FloatArray
+    whole: float
+
+    @cached_property
+    def tilt(self) -> tuple[FloatArray, FloatArray]:
+        """Cholesky factor (P, P), and how ends of the range push what is drawn before them (P,)."""
+        factor = np.linalg.cholesky(self.covariance)
+        root = np.linalg.inv(factor)
+        at_ends = lsq_linear(root, root @ self.mean, (self.low, self.high), method="bvls").x
+        normal = root @ (at_ends - self.mean)
+        return np.asarray(factor), np.asarray(normal - np.diag(factor) * (root.T @ normal))
+
+    def weighed(self, means: FloatArray, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return draws (..., P) about means (..., P), and the logs of their weights (...).
+
+        Each parameter is drawn within its range given those before it, and weighed by what of it lies there:
+        the mean weight is the share within the range (Genz 1992, J. Comput. Graph. Stat. 1 (2)). It is drawn
+        about where the density is largest (Botev 2017, J. R. Statist. Soc. B 79 (1)).
+
+        Parameters
+        ----------
+        means : (..., P) ndarray
+            In place of `mean`.
+        uniform : (..., P) ndarray
+            Numbers between 0 and 1.
+        """
+        factor, tilt = self.tilt
+        normal, weight = np.zeros_like(uniform), np.zeros(uniform.shape[:-1])
+        for at, (row, shift) in enumerate(zip(factor, tilt.tolist(), strict=True)):
+            given = means[..., at] + normal @ row
+            low, high = ((end[at] - given) / row[at] - shift for end in (self.low, self.high))
+            normal[..., at] = shift + truncnorm.ppf(uniform[..., at], low, high)
+            # in the lower tail, where no digits are lost
+            upper = low > 0.0
+            below, above = np.where(upper, -high, low), np.where(upper, -low, high)
+            weight += log_ndtr(above) + np.log1p(-np.exp(log_ndtr(below) - log_ndtr(above)))
+            weight += shift * (0.5 * shift - normal[..., at])
+        return np.clip(means + normal @ factor.T, self.low, self.high), weight
+
+    def energy(self, u: FloatArray) -> float:
+        """Return -ln of the density at scaled parameters (P,), up to a constant [nat]."""
+        return 0.5 * float((u - self.mean) @ np.linalg.solve(self.covariance, u - self.mean))
+
+    @cached_property
+    def even(self) -> tuple[FloatArray, FloatArray]:
+        """Draws (N, P) spread evenly, and their weights (N,), whose mean is the share within the range."""
+        uniform = Sobol(max(len(self.mean), 1), rng=0).random(EVEN)[:, : len(self.mean)]
+        return self.weighed(self.mean, uniform)
+
+    @cached_property
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (P,) and covariance (P, P) within the range."""
+        points, weight = self.even
+        share = softmax(weight)
+        return share @ points, np.atleast_2d(np.cov(points.T, aweights=share))
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of its integral within the range, up to a constant [nat]."""
+        return float(self.whole + logsumexp(self.even[1]) - np.log(EVEN))
+
+    def draws(self, count: int, generator: np.random.Generator) -> FloatArray:
+        """Return draws (count, P), of equal weight."""
+        points, weight = self.weighed(self.mean, generator.random((TRIED * count, len(self.mean))))
+        chosen = np.searchsorted(np.cumsum(softmax(weight)), stratified(generator, count))
+        return np.asarray(points[np.minimum(chosen, len(points) - 1)])
+
+    def draws_about(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
+        """Return a draw about each of the means (N, P), which stand in place of its own."""
+        shape = (TRIED, *means.shape)
+        points, weight = self.weighed(np.broadcast_to(means, shape), generator.random(shape))
+        chosen = np.argmax(weight + generator.gumbel(size=weight.shape), axis=0)
+        return np.asarray(points[chosen, np.arange(len(means))])
 
 
 # ---------------------------------------------------------------- the posterior
@@ -166,14 +268,12 @@ the whole prior, and points of the density between two nodes."""
 LARGEST_MASS, MOST_NODES = 0.04, 90
 """Nodes are added until no interval between two holds more of the posterior than this."""
 CHECKED = ((1.0, 0.12), (2.0, 0.5))
-"""The posterior is a Gaussian if its energy, so many deviations from the optimum along each principal
-direction, is that of one within so many nats."""
-CUT = 0.01
-"""Share of a Gaussian beyond the model's range from which on it is drawn otherwise."""
+"""The posterior is a Gaussian if its energy, so many deviations from the mean along each principal direction,
+or where the range ends before, is that of one within so many nats."""
+EVEN, TRIED = 1024, 32
+"""Draws of a Gaussian that tell its share within the range, and of which one is kept."""
 EMPTY = 700.0
 """Energy [nat] above the least where nothing is left of a density."""
-REDRAWN = 1000
-"""Times that a draw beyond the model's range is drawn anew; the few that are left stand at its end."""
 LEAST_SPREAD = 1e-9
 """Nodes closer together than this share of the grid are one."""
 
@@ -203,11 +303,11 @@ class ParameterPosterior:
 def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPosterior:
     """Return `count` draws of the posterior of a problem's parameters.
 
-    One parameter is integrated by quadrature. Of several the Gaussian at the optimum is taken where the
-    energy along its principal axes is that of a Gaussian; else the parameter that is most cut off, or told
-    least, is integrated by quadrature, the others being Gaussian given it (a nested Laplace approximation,
-    Rue, Martino and Chopin 2009, J. R. Statist. Soc. B 71 (2)). Where several optima tell, each has its
-    Gaussian, weighed by its Laplace evidence.
+    One parameter is integrated by quadrature. Of several the Gaussian about the optimum, cut off at the
+    range, is taken where the energy along the principal axes of what is left is that of a Gaussian; else the
+    parameter that is told least is integrated by quadrature, the others being such a Gaussian given it (a
+    nested Laplace approximation, Rue, Martino and Chopin 2009, J. R. Statist. Soc. B 71 (2)). Where several
+    optima tell, each has its Gaussian, weighed by its evidence.
 
     Raises
     ------
@@ -217,67 +317,36 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     marginal = Marginal(problem)
     optima = tuple(marginal.optima(seed))
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
-    free = marginal.free
-    centres = [item.point.shared[free] for item in optima]
-    spreads = [item.covariance[np.ix_(free, free)] for item in optima]
-    trial = generator.multivariate_normal(centres[0], spreads[0], 4000, method="cholesky")
-    beyond = np.mean((trial < marginal.low) | (trial > marginal.high), axis=0)
-    cut = float(np.mean(~marginal.inside(trial)))
+    every = np.ones(len(marginal.free), dtype=bool)
+    parts = [marginal.about(item, every) for item in optima]
     procedure: Procedure = "several optima" if len(optima) > 1 else "Gaussian"
-    if len(free) == 1 or (
-        len(optima) == 1 and not (cut < CUT and is_gaussian(marginal, centres[0], spreads[0]))
-    ):
-        # what is fitted at the end of its range is no Gaussian there: such a parameter is integrated itself
-        index = int(np.argmax(beyond if beyond.max() > CUT else np.diag(spreads[0])))
+    if len(every) == 1 or (len(parts) == 1 and not is_gaussian(marginal, parts[0])):
+        index = int(np.argmax(np.diag(parts[0].moments[1])))
         procedure, draws = "quadrature", _along(index, marginal, optima, count, generator)
     else:
-        ends = marginal.low, marginal.high
-        shares = [mass_inside(*item, *ends) for item in zip(centres, spreads, strict=True)]
-        evidence = np.array([item.log_evidence for item in optima]) + np.log(np.maximum(shares, 1e-300))
-        weight = np.exp(evidence - evidence.max())
-        chosen = generator.choice(len(optima), count, p=weight / weight.sum())
-        draws = np.array(centres)[chosen]
-        for at, spread in enumerate(spreads):
-            draws[chosen == at] = cut_off(draws[chosen == at], spread, *ends, generator)
+        chosen = generator.choice(len(parts), count, p=softmax([part.log_evidence for part in parts]))
+        draws = np.empty((count, len(every)))
+        for at, part in enumerate(parts):
+            draws[chosen == at] = part.draws(int(np.sum(chosen == at)), generator)
     return ParameterPosterior(procedure, draws, optima, marginal)
 
 
-def is_gaussian(marginal: Marginal, centre: FloatArray, covariance: FloatArray) -> bool:
-    """Return whether the energy rises along the principal axes as that of a Gaussian does."""
-    least = marginal(centre)
+def is_gaussian(marginal: Marginal, part: CutGaussian) -> bool:
+    """Return whether the energy rises along the principal axes as that of a Gaussian cut off does."""
+    mean, covariance = part.moments
     spread, directions = np.linalg.eigh(covariance)
     axes = (directions * np.sqrt(np.maximum(spread, 0.0))).T
+    least = marginal(mean) - part.energy(mean)
+
+    def agrees(step: FloatArray, allowed: float) -> bool:
+        room = np.where(step > 0.0, part.high - mean, mean - part.low) / np.maximum(np.abs(step), 1e-300)
+        point = np.clip(mean + min(1.0, room.min()) * step, part.low, part.high)
+        return bool(abs(marginal(point) - part.energy(point) - least) < allowed)
+
     return all(
-        abs(marginal(centre + side * size * axis) - least - 0.5 * size**2) < allowed
+        agrees(side * size * axis, allowed)
         for axis, (size, allowed), side in product(axes, CHECKED, (-1.0, 1.0))
     )
-
-
-def mass_inside(centre: FloatArray, covariance: FloatArray, low: FloatArray, high: FloatArray) -> float:
-    """Return the share of a Gaussian that lies between `low` and `high` (P,) in every direction [1]."""
-    if len(centre) == 1:
-        deviation = float(np.sqrt(covariance[0, 0]))
-        return float(ndtr((high[0] - centre[0]) / deviation) - ndtr((low[0] - centre[0]) / deviation))
-    how = {"allow_singular": True, "lower_limit": low, "rng": np.random.default_rng(0)}
-    return float(multivariate_normal.cdf(high, centre, covariance, **how))
-
-
-def cut_off(
-    centres: FloatArray,
-    covariance: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
-    generator: np.random.Generator,
-) -> FloatArray:
-    """Return a draw about each of the centres (N, P), anew where it is beyond the range."""
-    drawn, rows = np.full_like(centres, np.inf), np.arange(len(centres))
-    for _ in range(REDRAWN):
-        if not len(rows):
-            break
-        shift = generator.multivariate_normal(np.zeros(len(low)), covariance, len(rows), method="cholesky")
-        drawn[rows] = centres[rows] + shift
-        rows = rows[np.any((drawn[rows] < low) | (drawn[rows] > high), axis=1)]
-    return np.clip(drawn, low, high)
 
 
 def _along(
@@ -289,29 +358,24 @@ def _along(
 ) -> FloatArray:
     """Return draws (count, P): one parameter by quadrature, the others given it.
 
-    At each node of the one the others are fitted and integrated with the nuisances: Gaussian given the one,
-    and cut off at the model's range. The evidence of a node has the share of that Gaussian that lies within.
+    At each node of the one the others are fitted and integrated with the nuisances: a Gaussian given the
+    one, cut off at the model's range.
     """
     free, best = marginal.free, optima[0]
     one = np.arange(len(free)) == index
-    ends = marginal.low[~one], marginal.high[~one]
     centre = float(best.point.shared[free[index]])
-    fits: dict[float, CandidateFit] = {}
+    points = {centre: best.point}
+    others: dict[float, CutGaussian] = {}
     energy: dict[float, float] = {}
-
-    def others(found: CandidateFit) -> tuple[FloatArray, FloatArray]:
-        """Return mean (P - 1,) and covariance of the others at a node."""
-        return found.point.shared[free[~one]], found.covariance[np.ix_(free[~one], free[~one])]
 
     def visit(node: float) -> None:
         """Fit at a node, from what was found beside it; infinite where the model cannot be had."""
-        known = {centre: best.point} | {u: item.point for u, item in fits.items()}
-        near = known[min(known, key=lambda place: abs(place - node))]
+        near = points[min(points, key=lambda place: abs(place - node))]
         energy[node] = np.inf
         with suppress(FitError, ModelError):
-            fits[node] = found = marginal.fitted(np.where(one, node, 0.0), fixed=one, near=near)
-            share = 1.0 if one.all() else mass_inside(*others(found), *ends)
-            energy[node] = 0.5 * node**2 - found.log_evidence - float(np.log(max(share, np.exp(-EMPTY))))
+            found = marginal.fitted(np.where(one, node, 0.0), fixed=one, near=near)
+            points[node], others[node] = found.point, marginal.about(found, ~one)
+            energy[node] = 0.5 * node**2 - others[node].log_evidence
 
     for node in sorted(_first_nodes(marginal, optima, index), key=lambda node: abs(node - centre)):
         visit(node)
@@ -321,15 +385,16 @@ def _along(
         visit(0.5 * sum(sorted(energy)[largest : largest + 2]))
         fine, mass = _distribution(energy)
     values = np.interp(stratified(generator, count), mass, fine)
-    draws = np.repeat(values[:, None], len(free), axis=1)
-    if not one.all():
-        nodes = np.array(sorted(fits))
-        means, spreads = zip(*(others(fits[node]) for node in nodes.tolist()), strict=True)
-        centres = Akima1DInterpolator(nodes, np.array(means))(np.clip(values, nodes[0], nodes[-1]))
-        nearest = np.abs(values[:, None] - nodes).argmin(axis=1)
-        for at, spread in enumerate(spreads):
-            rows = np.flatnonzero(nearest == at)
-            draws[np.ix_(rows, ~one)] = cut_off(centres[rows], spread, *ends, generator)
+    nodes = np.array(sorted(others))
+    means = np.array([others[node].mean for node in nodes.tolist()])
+    draws: FloatArray = np.insert(
+        Akima1DInterpolator(nodes, means)(np.clip(values, nodes[0], nodes[-1])), index, values, axis=1
+    )
+    nearest = np.abs(values[:, None] - nodes).argmin(axis=1)
+    for at, node in enumerate(nodes.tolist()):
+        rows = np.flatnonzero(nearest == at)
+        place = np.ix_(rows, ~one)
+        draws[place] = others[node].draws_about(draws[place], generator)
     return draws
 
 

@@ -202,7 +202,7 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     trials = [name for name in names if name in largest]
     norm = scale_of([window.size for window in windows])
     both = any(window.with_effect for window in windows)
-    figure, ((axes,),) = panels(1, 1, 0.34 * len(trials) + 0.9)
+    figure, ((axes,),) = panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
     for row, name in enumerate(trials):
         own = [window for window in windows if window.trial == name]
         _draw_record(axes, row, own, norm, both=both)

@@ -44,11 +44,6 @@ LARGEST_PLAIN = 1e6
 """Numbers from here on have a power of ten."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
-MOTIONS = {
-    "N": ("force", "m", "m/s"), "N m": ("moment", "rad", "rad/s"),
-    "N or N m": ("force", "m or rad", "m/s or rad/s"),
-}  # fmt: skip
-"""What is missing at a port, and units of its displacement and speed, by the unit of the force."""
 
 
 def estimate_text(estimate: Estimate) -> tuple[str, str]:
@@ -107,7 +102,9 @@ def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
 
 def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
     """Return what is missing, and the units of displacement and speed of its port."""
-    return MOTIONS.get(force.unit, ("flow", "", force.unit.partition("/s times")[0]))
+    flow = "flow", "", force.unit.partition("/s times")[0]
+    what, place, rate = WORDS.content["motions"].get(force.unit, flow)
+    return what, place, rate
 
 
 def force_sentence(force: ForceAtPort) -> str:
@@ -185,19 +182,15 @@ def added_label(investigation: Investigation) -> str:
     return _labels((term.effect.name, term.place, term.free_shape) for term in terms)
 
 
-_GREEK = {
-    "alpha": "α", "beta": "β", "chi": "χ", "delta": "δ", "eps": "ε", "eta": "η", "kappa": "κ", "mu": "μ",
-    "nu": "ν",
-    "phi": "φ", "pi": "π", "rho": "ρ", "tau": "τ", "theta": "θ", "zeta": "ζ",
-}  # fmt: skip
-_GREEK_WORD = re.compile(rf"\b({'|'.join(_GREEK)})(?=\b|_)")
+_WORD = re.compile(r"\b([a-z]+)(?=\b|_)")
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def formula(text: str) -> str:
     """Return an equation of the catalogue with Greek letters, powers and arrows as they are printed."""
-    text = _GREEK_WORD.sub(lambda match: _GREEK[match.group(1)], text).replace("->", "→")
-    return re.sub(r"\^(\d)(?!\w)", lambda match: match.group(1).translate(_POWERS), text)
+    greek = WORDS.content["greek"]
+    text = _WORD.sub(lambda match: greek.get(match[1], match[1]), text).replace("->", "→")
+    return re.sub(r"\^(\d)(?!\w)", lambda match: match[1].translate(_POWERS), text)
 
 
 def percent(share: float) -> str:

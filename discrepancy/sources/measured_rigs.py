@@ -1,11 +1,11 @@
-"""Published measurements of rigs as campaigns, each with its model beside it: read as they were published.
+"""Published measurements as campaigns, of rigs with their models beside them: read as they were published.
 
 The data are not part of the package; `docs/measured_rigs.md` says where they are.
 """
 
 from collections.abc import Callable, Sequence
-from math import inf
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.linalg import helmert
@@ -13,18 +13,14 @@ from scipy.signal import savgol_filter
 
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.errors import CalibrationError
-from calibration.static.experiments import LoadDisplacementData, read_measurements
-from discrepancy.campaign.noise import pre_trigger_record
-from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from calibration.static.experiments import read_measurements
+from discrepancy.campaign.reading import CAMPAIGN_FILE
 from discrepancy.campaign.sampling import FloatArray
-from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.sentences import said
 from reporting.files import atomic_write_text
-from reporting.provenance import hash_record
 from reporting.table_file import table_text
+from reporting.toml_file import toml_text
 from reporting.words import be, counted
 
 FALLING = 3.0
@@ -34,43 +30,46 @@ CUT = 0.04
 HELD_OUT_FALLS = ("fall_14", "fall_5")
 LARGEST_LEVEL = 10.0
 """Where the tank's level sensor ends: readings there are left out [V]."""
-SMOOTHED = 0.12
-"""Window of the local cubic through the pendulum's angle [s]; its encoder counts in 0.0029 rad."""
+SMOOTHED = 7
+"""Samples through which the local cubic of the pendulum's angle goes; its encoder counts in 0.0029 rad."""
 STEP = 0.02
 """A sample of the pendulum is the mean over this [s]: one of its slower record, six of its faster one."""
-THE_WING = "real_wing"
-"""Among the rigs of the command line, the one with a model of its own (`real_wing.write_wing_campaign`)."""
 SHIPPED = Path(__file__).with_name("rigs")
-"""Model and campaign of each rig. Deviations of noise are those of the sixth differences of its records."""
-TRIAL = """
-[[trial]]
-name = "{name}"
-kind = "driven"
-file = "{name}.csv"
-begins = "unknown"
-"""
+"""What is known of each campaign, and the model of a rig. Deviations of noise are those of the sixth
+differences of its records."""
+
+Made = tuple[dict[str, str], dict[str, Any]]
+"""Tables of a campaign by their files, and what its file says besides: as many trials as were published."""
 
 
-def write_rig_campaign(rig: str, data: Path, folder: Path) -> Path:
-    """Write a campaign and `model.toml` from a published folder; return the folder.
+def write_rig_campaign(rig: str, data: Path, folder: Path, **options: Any) -> Path:
+    """Write a campaign, and the `model.toml` of a rig, from a published folder; return the folder.
+
+    Parameters
+    ----------
+    rig : str
+        One of `RIGS`.
+    data, folder : Path
+        Where the records are, and where the campaign goes.
+    **options
+        Of `real_wing`: those of its records.
 
     Raises
     ------
     CampaignFileError
         If there is no such rig, a file is missing, or one is not as it was published.
+    CampaignDataError
+        If a record cannot be used.
     FileNotWrittenError, DiskFullError
         As `reporting.files.atomic_file`.
     """
     if rig not in RIGS:
-        raise CampaignFileError(f"There is no rig {rig!r}: give one of {', '.join((THE_WING, *RIGS))}.")
-    tables = RIGS[rig](Path(data))
-    campaign, model = (
-        (SHIPPED / rig / name).read_text(encoding="utf-8") for name in ("campaign.toml", "model.toml")
-    )
-    for name in (name for name in tables if name.startswith("fall_")):  # as many as were published
-        trial = name.removesuffix(".csv")
-        campaign += TRIAL.format(name=trial) + ("held_out = true\n" if trial in HELD_OUT_FALLS else "")
-    for name, text in {"model.toml": model, **tables, "campaign.toml": campaign}.items():
+        raise CampaignFileError(f"There is no rig {rig!r}: give one of {', '.join(RIGS)}.")
+    tables, more = RIGS[rig](Path(data), **options)
+    shipped = {file.name: file.read_text(encoding="utf-8") for file in (SHIPPED / rig).glob("*.toml")}
+    first = toml_text({"remarks": more.pop("remarks", [])})
+    whole = f"{first}{shipped.pop(CAMPAIGN_FILE)}\n{toml_text(more)}"
+    for name, text in {**shipped, **tables, CAMPAIGN_FILE: whole}.items():
         atomic_write_text(folder / name, text)
     return folder
 
@@ -104,17 +103,23 @@ def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
     return np.round(time[inside] - time[0], 9), z[inside]
 
 
-def _phone(data: Path) -> dict[str, str]:
+def _phone(data: Path) -> Made:
     """Return the falls; the sensor shows acceleration less gravity: nought in a free fall, and its bias."""
     rest = _numbers(data / "at_rest.txt", ("time", "x", "y", "z"), None, 0)
     files = sorted(data.glob("fall_*.csv"), key=lambda path: path.stem.split("_")[1].zfill(9))
     if not files:
         raise CampaignFileError(said("rigs.no_falls", data=data))
     falls = {file.name: table_text(dict(zip(("time", "z"), fall_of(file), strict=True))) for file in files}
-    return {"noise.csv": table_text({"time": np.round(rest[:, 0], 9), "z": rest[:, 3]}), **falls}
+    trials = [
+        {"name": file.stem, "kind": "driven", "file": file.name, "begins": "unknown",
+         "held_out": file.stem in HELD_OUT_FALLS}
+        for file in files
+    ]  # fmt: skip
+    falls["noise.csv"] = table_text({"time": np.round(rest[:, 0], 9), "z": rest[:, 3]})
+    return falls, {"trial": trials}
 
 
-def _tanks(data: Path) -> dict[str, str]:
+def _tanks(data: Path) -> Made:
     """Return the record for estimation, and the one for validation, held out."""
     table = _numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
     time: FloatArray = 4.0 * np.arange(len(table), dtype=np.float64)
@@ -123,10 +128,10 @@ def _tanks(data: Path) -> dict[str, str]:
     return {
         f"{name}.csv": table_text({"time": time, "pump": pump, "level": level})
         for name, pump, level in zip(("estimation", "validation"), pumps, levels, strict=True)
-    }
+    }, {}
 
 
-def _pendulum(data: Path) -> dict[str, str]:
+def _pendulum(data: Path) -> Made:
     """Return angle in, torque out: of a rod that turns over, a motion from torques would soon be another."""
     tables = {}
     for name in ("pd_trajectory", "ilqr"):
@@ -134,17 +139,9 @@ def _pendulum(data: Path) -> dict[str, str]:
         joined = max(round(STEP / float(np.median(np.diff(table[:, 0])))), 1)
         whole = len(table) // joined * joined  # what is left over at the end is dropped
         time, angle, _, torque = table[:whole].reshape(-1, joined, table.shape[1]).mean(axis=1).T
-        angle = savgol_filter(angle, 2 * round(0.5 * SMOOTHED / STEP) + 1, 3)
+        angle = savgol_filter(angle, SMOOTHED, 3)
         tables[f"{name}.csv"] = table_text({"time": np.round(time, 9), "angle": angle, "torque": torque})
-    return tables
-
-
-RIGS: dict[str, Callable[[Path], dict[str, str]]] = {
-    "falling_phone": _phone,
-    "two_tanks": _tanks,
-    "pendulum": _pendulum,
-}
-"""What makes the tables of a campaign from a published folder, by the name of the rig."""
+    return tables, {}
 
 
 # ---------------------------------------------------------------- the wing of Kapteyn et al. 2021
@@ -152,8 +149,6 @@ RIGS: dict[str, Callable[[Path], dict[str, str]]] = {
 
 SIGNAL, TIP = "spanwise", "tip"
 """Names of the channels: the strain signal of the ring-downs, the displacement of the loading runs."""
-ROOT_GAUGE = "strain[17]"
-"""Where the model's strain is read for the signal: the gauge of the largest strain, 0.35 m from the root."""
 READING_ERROR = 33e-6 / 3.0**0.5
 """Deviation of a value read off the plot [V]: evenly within +-33 microvolt (a pixel is 66).
 
@@ -162,33 +157,21 @@ makes it less.
 """
 TREND = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
-PARAMETERS = {
-    "young_modulus_factor": (1.0080, 0.0103),
-    "servo_mass": (0.1680, 0.0140),
-    "pitot_mass": (0.1360, 0.0280),
-    "damping_alpha": (1.03, 0.37),
-    "damping_beta": (7.56e-4, 1.84e-4),
-}
-"""Mean and deviation of the calibrated parameters: the joint posterior (docs/calibration.md), which allows
-for what the amplitude does to the frequency and the damping ratio that were calibrated to."""
-
-
 BEGIN = 0.8
 """Begin of the window since the release [s]; before it higher modes ring that the model does not meet."""
 COLUMNS = 4
 """Columns of the plot that are averaged into one sample. Four (32 ms) have a zero of their frequency response
 at 30.8 Hz, where the second bending mode rings."""
-RELEASE, MODE_COUNT = 0.05, 2
+RELEASE = {"displacement": 0.05, "deviation": 1.0, "at_rest": False, "mode_count": 2}
 """Nominal displacement of the tip at the window's begin [m], where the unknown scale of the signal makes any
 value as good; modes whose state there is free."""
+AT_TIP = {"name": TIP, "quantity": "displacement", "unit": "m", "output": "load_point_displacement"}
 HELD_OUT = (3, 5)
 """Trials kept for proof, counted from 1."""
 
 
-def wing_campaign(
-    data: Path | str, *, begin: float = BEGIN, columns: int = COLUMNS, detrended: bool = True
-) -> Campaign:
-    """Return the published measurements of the real wing as a campaign.
+def _wing(data: Path, *, begin: float = BEGIN, columns: int = COLUMNS, detrended: bool = True) -> Made:
+    """Return the ring-downs, of unknown scale, and the loading runs if `step2` is there.
 
     Parameters
     ----------
@@ -200,21 +183,7 @@ def wing_campaign(
         Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
         weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
         What moves slowly in one trial alone is noise and stays.
-
-    Returns
-    -------
-    Campaign
-        Two static trials of the channel `tip` [m] (if `step2` is there), and the ring-downs of the channel
-        `spanwise` [V], of unknown scale.
-
-    Raises
-    ------
-    CampaignFileError
-        If the folder holds no ring-down records.
-    CampaignDataError
-        If a record cannot be used.
     """
-    data = Path(data)
     try:
         records = read_records(data)
         loaded = any((data / above / "step2").is_dir() for above in (".", "datafiles", "src/datafiles"))
@@ -227,38 +196,30 @@ def wing_campaign(
     windows = [_windowed(record, zero, begin, columns) for record in records]
     scatter, interval = trial_scatter(windows), float(windows[0][0][1])
     spread = float(np.std(scatter, ddof=1))
-    noise = pre_trigger_record(scatter * np.hypot(1.0, READING_ERROR / spread), interval, SIGNAL, str(data))
-    channels = {SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf)}
-    trials: list[Trial] = []
+    noise = scatter * np.hypot(1.0, READING_ERROR / spread)
+    tables = {"noise.csv": table_text({"time": interval * np.arange(float(len(noise))), SIGNAL: noise})}
+    channels: list[dict[str, Any]] = []
+    trials: list[dict[str, Any]] = []
     if pairs is not None:
         by_load = pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load))
-        at_tip = NoiseRecord(float(np.hypot(pairs.displacement_standard_deviation, by_load)), inf)
-        channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", at_tip)
-        trials += _loading_runs(pairs)
-    release = Release(RELEASE, 1.0, at_rest=False, mode_count=MODE_COUNT)
+        deviation = float(np.hypot(pairs.displacement_standard_deviation, by_load))
+        channels.append({**AT_TIP, "noise": {"standard_deviation": deviation}})
+        for number in np.unique(pairs.run).tolist():
+            rows, run, file = pairs.run == number, f"run {number + 1}", f"loading_{number + 1}.csv"
+            tables[file] = table_text({"force": pairs.load[rows], TIP: pairs.displacement[rows]})
+            trials.append({"name": f"loading {run}", "kind": "static", "file": file, "run": run})
     for number, (time, signal) in enumerate(windows, start=1):
-        given = {"values": signal[:, None], "release": release, "held_out": number in HELD_OUT}
-        trials.append(Trial.plain(f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), time, **given))
-    return Campaign(
-        "The real wing of Kapteyn et al. 2021",
-        channels,
-        tuple(trials),
-        None,
-        PARAMETERS,
-        hash_record([trial.values.ravel().tolist() for trial in trials]),
-        (
-            f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the "
-            f"release; {counted(columns, 'column')} of the plot averaged into a sample of "
-            f"{1e3 * interval:.3g} ms.",
-            f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
-            f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
-        ),
+        name, file = f"release {number}", f"release_{number}.csv"
+        tables[file] = table_text({"time": time, SIGNAL: signal})
+        given = {"name": name, "kind": "ringdown", "file": file, "held_out": number in HELD_OUT}
+        trials.append({**given, "release": RELEASE})
+    remarks = (
+        f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the release; "
+        f"{counted(columns, 'column')} of the plot averaged into a sample of {1e3 * interval:.3g} ms.",
+        f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
+        f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
     )
-
-
-def write_wing_campaign(data: Path | str, out: Path | str) -> Campaign:
-    """Write `wing_campaign` as a folder and return it as read from there; errors as there and of writing."""
-    return read_campaign(write_campaign(wing_campaign(data), out))
+    return tables, {"remarks": remarks, **({"channel": channels} if channels else {}), "trial": trials}
 
 
 def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
@@ -311,10 +272,10 @@ def _windowed(
     return interval * np.arange(float(count)), np.asarray((record.signal - zero)[kept].mean(axis=1))
 
 
-def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
-    trials = []
-    for number in np.unique(pairs.run).tolist():
-        rows, run = pairs.run == number, f"run {number + 1}"
-        given = {"values": pairs.displacement[rows][:, None], "force": pairs.load[rows], "run": run}
-        trials.append(Trial.plain(f"loading {run}", TrialKind.STATIC, (TIP,), np.zeros(rows.sum()), **given))
-    return trials
+RIGS: dict[str, Callable[..., Made]] = {
+    "real_wing": _wing,
+    "falling_phone": _phone,
+    "two_tanks": _tanks,
+    "pendulum": _pendulum,
+}
+"""What makes the tables of a campaign from a published folder, by the name of the rig."""

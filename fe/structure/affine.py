@@ -310,7 +310,7 @@ def natural_frequencies(
     SolutionError
         If there is no mass, there are not so many modes, or the iteration did not converge.
     """
-    if count >= structure.unknowns:
+    if count not in range(1, structure.unknowns):
         most = structure.unknowns - 1
         raise SolutionError(said("structure.modes", count=count, unknowns=structure.unknowns, most=most))
     stiffness, mass, _ = structure.at(values or {})

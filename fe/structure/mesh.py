@@ -24,7 +24,6 @@ from .tables import MOTIONS, StructureDesign
 
 EVERYTHING = "all"
 """The set of all cells, which no file has to hold."""
-_LISTED = 12
 _Content = TypeVar("_Content", bound=Sized)
 
 
@@ -148,9 +147,7 @@ class StructureMesh(CellMesh):
     def _content(self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str) -> _Content:
         found = _named(sets, name)
         if found is None:
-            more = f" and {len(sets) - _LISTED} more" if len(sets) > _LISTED else ""
-            known = (", ".join([*sets][:_LISTED]) or "none") + more
-            raise MeshError(said("mesh.unknown", where=where, mesh=self, kind=kind, name=name, known=known))
+            raise MeshError(said("mesh.unknown", where=where, mesh=self, kind=kind, name=name, known=sets))
         if not len(found):
             raise MeshError(f"{where}: the set {name!r} of {self.source} holds no {member}.")
         return found

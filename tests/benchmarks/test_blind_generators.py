@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import benchmarks.blind
 from benchmarks.blind.cases import DETECTABLE, KINDS, Order, finite_signals, make_case, orders, workbench
 from benchmarks.blind.changes import Changes, Fault
 from benchmarks.blind.detectability import reference
 from benchmarks.blind.effects import DRAWS, LUMPED, jenkins
-from benchmarks.blind.instruments import Chance, draw_chance, measure, true_signals
+from benchmarks.blind.instruments import draw_chance, measure, true_signals
 from benchmarks.blind.laws import BOUC_WEN, DRAG, FRICTION, GAP, POWER, Law
-from benchmarks.blind.lumped_rig import MASS, PORTS, LumpedRig, lumped_campaign, model_text
+from benchmarks.blind.lumped_rig import PORTS, model_text
 from benchmarks.blind.structure import Release, Structure
 from benchmarks.blind.traps import TRAPS
 from benchmarks.blind.writing import write_case
@@ -25,122 +26,70 @@ pytestmark = pytest.mark.long  # the loops of the generators are compiled in hal
 
 RATE = 250.0
 STIFFNESS, W = 1000.0, 10.0 * np.pi  # N/m, rad/s: 5 Hz
+ONE = np.ones((1, 1))
+OSCILLATOR = Structure(STIFFNESS * ONE, STIFFNESS / W**2 * ONE, 0.0, 0.0, ONE, {"x": ONE[0]}, 1)
 
 
-def oscillator(alpha: float = 0.0, **more: float) -> Structure:
-    """One mass on one spring; its motion is the port."""
-    one = np.ones(1)
-    return Structure(
-        np.array([[STIFFNESS]]),
-        np.array([[STIFFNESS / W**2]]),
-        alpha,
-        0.0,
-        np.ones((1, 1)),
-        {"x": one},
-        1,
-        **more,
-    )
-
-
-def release(amplitude: float = 0.01, seconds: float = 2.0) -> Release:
-    one = np.ones(1)
-    return Release(amplitude, one, one, np.arange(int(seconds * RATE)) / RATE)
-
-
-def peaks(values: np.ndarray) -> np.ndarray:
-    inner = values[1:-1]
-    at = np.flatnonzero((inner >= values[:-2]) & (inner > values[2:])) + 1
-    # the vertex of the parabola through three samples
-    a, b, c = values[at - 1], values[at], values[at + 1]
-    return b - (c - a) ** 2 / (8.0 * (a - 2.0 * b + c))
-
-
-def motion(
-    law: Law, amplitude: float = 0.01, seconds: float = 2.0, structure: Structure | None = None
-) -> np.ndarray:
-    return (structure or oscillator()).ringdown(release(amplitude, seconds), [law])[:, 0]
+def moved(structure: Structure, law: Law, amplitude: float = 0.01, refinement: int = 1) -> np.ndarray:
+    """Return the outputs (500, C) after a release of the last coordinate."""
+    end = np.eye(len(structure.mass))[-1]
+    return structure.ringdown(Release(amplitude, end, end, np.arange(500) / RATE), [law], refinement)
 
 
 # ---------------------------------------------------------------- laws
 
 
-def test_dry_friction_takes_two_widths_from_every_half_swing_and_stops_within_one():
-    friction = 0.4
-    width = friction / STIFFNESS
-    values = motion(Law("x", FRICTION, (friction, 0.0)))
-    swing = 2.0 * np.pi / W
-    turns = np.interp(np.arange(0.0, 12.5) * swing / 2.0, np.arange(len(values)) / RATE, values)
-    wanted = (0.01 - 2.0 * width * np.arange(13)) * (-1.0) ** np.arange(13)
-    # between samples the turning points are rounded off by (w dt)^2 / 8
-    np.testing.assert_allclose(turns[:12], wanted[:12], atol=0.01 * 0.01)
-    assert np.ptp(values[-50:]) == 0.0
-    assert abs(values[-1]) <= width
-
-
-def test_structural_damping_has_the_same_decrement_at_every_amplitude():
-    loss = 0.05
-    tops = peaks(motion(Law("x", FRICTION, (loss * STIFFNESS, 1.0))))
-    # Moving from rest at a to rest at b: (1 + g) b^2 = (1 - g) a^2 in each half, out and back.
-    wanted = (1.0 - loss) / (1.0 + loss)
-    np.testing.assert_allclose(tops[1:] / tops[:-1], wanted, rtol=2e-3)
-
-
-def _period(values: np.ndarray) -> float:
-    up = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
-    crossing = (up + values[up] / (values[up] - values[up + 1])) / RATE
-    return float((crossing[-1] - crossing[0]) / (len(crossing) - 1))
-
-
-def test_drifting_stiffness_follows_airy_functions():
-    from scipy.special import airy
-
-    rate = 0.05
-    values = oscillator(stiffness_rate=rate).ringdown(release())[:, 0]
-    scale = (rate * W**2) ** (1.0 / 3.0)
-
-    def argument(t: np.ndarray | float) -> np.ndarray:
-        return -(1.0 + rate * np.asarray(t)) * W**2 / scale**2
-
-    a0, da0, b0, db0 = airy(argument(0.0))
-    a, b = np.linalg.solve([[a0, b0], [da0, db0]], [0.01, 0.0])
-    ai, _, bi, _ = airy(argument(release().times))
-    np.testing.assert_allclose(values, a * ai + b * bi, atol=1e-8)
+@pytest.mark.parametrize("exponent", [0.0, 1.0])
+def test_friction_takes_its_work_from_every_half_swing(exponent):
+    """Dry: two widths, and it stops within one. Structural, g k |x|: from rest at a to rest at b
+    (1 + g) b^2 = (1 - g) a^2, on a softer spring inwards and a stiffer one outwards."""
+    g, width, half = 0.05, 4e-4, np.arange(12)
+    values = moved(OSCILLATOR, Law("x", FRICTION, (STIFFNESS * (g if exponent else width), exponent)))[:, 0]
+    swing = np.pi / W * (0.5 * ((1.0 - g) ** -0.5 + (1.0 + g) ** -0.5) if exponent else 1.0)
+    turns = CubicSpline(np.arange(len(values)) / RATE, values)(half * swing)
+    wanted = 0.01 * ((1.0 - g) / (1.0 + g)) ** (half / 2.0) if exponent else 0.01 - 2.0 * width * half
+    np.testing.assert_allclose(turns, wanted * (-1.0) ** half, atol=5e-6)
+    if not exponent:
+        assert np.ptp(values[-50:]) == 0.0
+        assert abs(values[-1]) <= width
 
 
 def test_masing_rule_holds_for_jenkins_elements():
     """Loads up, down, up: the unloading branch is the first branch twice as large."""
     law = jenkins("x", 0.8 * STIFFNESS, 5.0, -0.5)
     forces = np.concatenate([np.linspace(0.1, 6.0, 60), np.linspace(6.0, -6.0, 121)[1:]])
-    values = oscillator().static(forces[None], [law])[:, 0]
+    values = OSCILLATOR.static(forces[None], [law])[:, 0]
     first = np.interp(np.linspace(0.0, 6.0, 25), [0.0, *forces[:60]], [0.0, *values[:60]])
     down = values[59] - np.interp(np.linspace(0.0, 12.0, 25), 6.0 - forces[59:180], values[59:180])
     np.testing.assert_allclose(down, 2.0 * first, atol=2e-3 * values.max())
     assert values[59] > 6.0 / STIFFNESS * 1.05
-
-
-def test_jenkins_elements_hold_the_stated_force_when_all_slip():
-    stiffness, slip = 800.0, 5.0
-    for chi in (-0.5, 0.0, -0.8):
-        law = jenkins("x", stiffness, slip, chi, 4000)
-        assert float(law.stiffness @ law.slip) == pytest.approx(slip, rel=2e-3)
+    for chi in (-0.5, 0.0, -0.8):  # when all slip they hold the stated force
+        law = jenkins("x", 800.0, 5.0, chi, 4000)
+        assert float(law.stiffness @ law.slip) == pytest.approx(5.0, rel=2e-3)
 
 
 @pytest.mark.parametrize(
-    "law",
+    "changes",
     [
-        Law("joint", GAP, (2000.0, 4e-4)),
-        Law("joint", POWER, (-1500.0, 1.0, -1.0)),
-        Law("end", POWER, (4e6, 3.0, 0.0)),
-        Law("end", DRAG, (8.0,)),
-        Law("joint", BOUC_WEN, (2000.0, 0.002, 1.0)),
+        Changes(),  # in closed form
+        Changes(clock_rate=0.01, clock_zero=0.02),
+        Changes(stiffness_rate=0.05),
+        Changes(laws=(Law("joint", GAP, (2000.0, 4e-4)),), clock_zero=1.3e-3),
+        Changes(laws=(Law("joint", POWER, (-1500.0, 1.0, -1.0)),)),
+        Changes(laws=(Law("end", POWER, (4e6, 3.0, 0.0)),)),
+        Changes(laws=(Law("end", DRAG, (8.0,)),)),
+        Changes(laws=(Law("joint", BOUC_WEN, (2000.0, 0.002, 1.0)),)),
     ],
 )
-def test_motion_of_the_rig_against_a_general_integrator(law):
-    structure = LumpedRig().structure(_mean(), Changes())
-    end, port = PORTS["end"], PORTS[law.port]
-    times = np.arange(250) / RATE
-    values = structure.ringdown(Release(0.012, end, end, times), [law])
-    inverse = np.linalg.inv(structure.mass)
+def test_motion_of_the_rig_against_a_general_integrator(changes):
+    work = workbench("lumped")
+    trial = next(trial for trial in work.plan.trials if trial.release == 0.012)
+    structure = work.rig.structure(work.mean.parameters, changes)
+    values = work.rig.respond(structure, changes, trial, 0.012)[0][:250]
+    shown = true_signals(work.rig, work.plan, work.mean, changes)[trial.name][:250]
+    np.testing.assert_allclose(shown, values[:, [0, 2, 4]] / [1e-3, 1e-3, 1e-6])
+    law = changes.laws[0] if changes.laws else Law("end", DRAG, (0.0,))
+    port, inverse = PORTS[law.port], np.linalg.inv(structure.mass)
     damping = structure.alpha * structure.mass + structure.beta * structure.stiffness
 
     def force(x: float, z: float) -> float:
@@ -155,7 +104,8 @@ def test_motion_of_the_rig_against_a_general_integrator(law):
         u, v, z = state[:3], state[3:6], state[6]
         x, speed = port @ u, port @ v
         inside = force(x, z) if law.kind != DRAG else law.numbers[0] * abs(speed) * speed
-        a = inverse @ (-structure.stiffness @ u - damping @ v - port * inside)
+        elastic = (1.0 + changes.stiffness_rate * t) * structure.stiffness @ u
+        a = inverse @ (-elastic - damping @ v - port * inside)
         dz = (
             speed * (1.0 if speed * z <= 0.0 else 1.0 - abs(z) / law.numbers[1])
             if law.kind == BOUC_WEN
@@ -164,57 +114,59 @@ def test_motion_of_the_rig_against_a_general_integrator(law):
         return np.concatenate([v, a, [dz]])
 
     # The held state: the rig's own first sample, checked for equilibrium apart from the holding force.
-    start = values[0, :3]
+    at_once = replace(changes, clock_zero=0.0)
+    start = work.rig.respond(structure, at_once, trial, 0.012)[0][0, :3]
     z = law.numbers[1] * (1.0 - np.exp(-(port @ start) / law.numbers[1])) if law.kind == BOUC_WEN else 0.0
     rest = structure.stiffness @ start + port * force(port @ start, z)
     np.testing.assert_allclose(rest[:2], 0.0, atol=2e-3)
     assert start[2] == pytest.approx(0.012)
-    found = solve_ivp(
-        rates,
-        (0.0, times[-1]),
-        [*start, 0.0, 0.0, 0.0, z],
-        "DOP853",
-        times,
-        rtol=1e-9,
-        atol=1e-12,
-        max_step=1e-3,
-    )
-    np.testing.assert_allclose(values[:, :3], found.y[:3].T, atol=0.012 * 3e-4)
+    times = (1.0 + changes.clock_rate) * trial.rows[:250] + changes.clock_zero
+    begin = [*start, 0.0, 0.0, 0.0, z]
+    found = solve_ivp(rates, (0.0, times[-1]), begin, "DOP853", times, rtol=1e-9, atol=1e-12, max_step=1e-3)
+    np.testing.assert_allclose(values[:, :3], found.y[:3].T, atol=0.012 * (3e-4 if changes.laws else 1e-6))
 
 
-def _mean() -> dict[str, float]:
-    return {name: mean for name, (mean, _) in lumped_campaign().priors.items()}
+def behind_a_spring(light: float, alpha: float, beta: float, modes: int) -> Structure:
+    """A mass behind a light one; its higher modes may move without inertia."""
+    stiffness, port = np.array([[3000.0, -2000.0], [-2000.0, 2000.0]]), np.array([1.0, 0.0])
+    return Structure(stiffness, np.diag([light, 1.0]), alpha, beta, np.eye(2), {"root": port}, modes)
 
 
 def test_flexibility_behind_a_port_is_the_limit_of_light_masses():
     """Higher modes without inertia: the same as with all modes, where their masses are small."""
-    stiffness = np.array([[3000.0, -2000.0], [-2000.0, 2000.0]])
-    mass = np.diag([1e-3, 1.0])
-    ports = {"root": np.array([1.0, 0.0])}
-    end = np.array([0.0, 1.0])
-    parts = (stiffness, mass, 0.2, 2e-3, np.eye(2), ports)
-    few, all_modes = Structure(*parts, 1), Structure(*parts, 2)
+    few, all_modes = (behind_a_spring(1e-3, 0.2, 2e-3, modes) for modes in (1, 2))
     law = Law("root", GAP, (600.0, 0.001))
-    at = Release(0.02, end, end, np.arange(300) / RATE)
     # The light mass is stiff: a small step for it.
-    wanted = all_modes.ringdown(at, [law], refinement=10)
-    np.testing.assert_allclose(few.ringdown(at, [law]), wanted, atol=0.02 * 3e-3)
+    np.testing.assert_allclose(moved(few, law, 0.02), moved(all_modes, law, 0.02, 10), atol=0.02 * 3e-3)
 
 
 def test_friction_behind_a_flexibility_sticks_where_a_rigid_one_sticks():
     """The joint of a beam on a stiff spring: it holds until the spring's force exceeds the friction."""
-    stiffness = np.array([[3000.0, -2000.0], [-2000.0, 2000.0]])
-    mass = np.diag([1e-6, 1.0])
-    parts = (stiffness, mass, 0.0, 1e-3, np.eye(2), {"root": np.array([1.0, 0.0])})
-    end = np.array([0.0, 1.0])
-    at = Release(0.02, end, end, np.arange(500) / RATE)
-    values = Structure(*parts, 1).ringdown(at, [Law("root", FRICTION, (5.0, 0.0))])[:, 0]
-    moves = np.abs(np.diff(values)) > 1e-6
+    values = moved(behind_a_spring(1e-6, 0.0, 1e-3, 1), Law("root", FRICTION, (5.0, 0.0)), 0.02)
+    moves = np.abs(np.diff(values[:, 0])) > 1e-6
     assert moves[:20].any()
     assert not moves[-250:].any()
     # Stuck, the end swings on the second spring alone.
-    end_motion = Structure(*parts, 1).ringdown(at, [Law("root", FRICTION, (5.0, 0.0))])[-250:, 1]
-    assert _period(end_motion - end_motion.mean()) == pytest.approx(2.0 * np.pi / np.sqrt(2000.0), rel=5e-3)
+    end = values[-250:, 1] - values[-250:, 1].mean()
+    up = np.flatnonzero((end[:-1] < 0.0) & (end[1:] >= 0.0))
+    crossing = (up + end[up] / (end[up] - end[up + 1])) / RATE
+    period = (crossing[-1] - crossing[0]) / (len(crossing) - 1)
+    assert period == pytest.approx(2.0 * np.pi / np.sqrt(2000.0), rel=5e-3)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.97, 1.01, 5.0])  # the last two have another branch far away
+def test_a_softening_spring_holds_loads_up_to_its_limit(share):
+    """k x - c x^3 = F has a state on the way from rest up to F = 2/3 k sqrt(k / (3 c))."""
+    cubic = 4e5
+    limit = 2.0 / 3.0 * STIFFNESS * np.sqrt(STIFFNESS / (3.0 * cubic))
+    law = Law("x", POWER, (-cubic, 3.0, 0.0))
+    (at_half,), (at_share,) = OSCILLATOR.static(np.array([[0.5 * limit, share * limit]]), (law,))
+    assert STIFFNESS * at_half - cubic * at_half**3 == pytest.approx(0.5 * limit)
+    if share > 1.0:
+        assert np.isnan(at_share)
+    else:
+        assert STIFFNESS * at_share - cubic * at_share**3 == pytest.approx(share * limit)
+        assert 0.0 < at_share < np.sqrt(STIFFNESS / (3.0 * cubic))
 
 
 # ---------------------------------------------------------------- instruments
@@ -225,32 +177,6 @@ def _signals(changes: Changes) -> dict[str, np.ndarray]:
     return true_signals(work.rig, work.plan, work.mean, changes)
 
 
-def test_nothing_hidden_is_the_linear_rig():
-    work = workbench("lumped")
-    structure = work.rig.structure(work.mean.parameters, Changes())
-    trial = next(t for t in work.plan.trials if t.kind == "ringdown")
-    shown = _signals(Changes())[trial.name][:, trial.channels.index("x3")] * 1e-3
-    w2, shapes = np.linalg.eigh(
-        np.linalg.solve(np.sqrt(MASS), structure.stiffness) @ np.linalg.inv(np.sqrt(MASS))
-    )
-    start = np.linalg.solve(structure.stiffness, PORTS["end"])
-    start *= trial.release / start[2]
-    decay = 0.5 * (structure.alpha + structure.beta * w2)
-    damped = np.sqrt(w2 - decay**2)
-    t = trial.rows[:, None]
-    q = np.exp(-decay * t) * (np.cos(damped * t) + decay / damped * np.sin(damped * t))
-    wanted = (q * (shapes.T @ np.sqrt(MASS) @ start)) @ shapes.T @ np.linalg.inv(np.sqrt(MASS))
-    np.testing.assert_allclose(shown, wanted[:, 2], atol=1e-12)
-
-
-def test_integrated_linear_motion_is_the_closed_form():
-    work = workbench("lumped")
-    structure = work.rig.structure(work.mean.parameters, Changes())
-    end = PORTS["end"]
-    at = Release(0.012, end, end, np.arange(500) / RATE + 1.3e-3)
-    np.testing.assert_allclose(structure.ringdown(at), structure.free_ringdown(at), atol=0.012 * 1e-6)
-
-
 def test_high_pass_turns_and_shrinks_a_steady_tone_as_its_transfer_function_says():
     tau = 0.05
     before, after = _signals(Changes()), _signals(Changes(faults=(Fault("high_pass", ("x3",), (tau,)),)))
@@ -258,7 +184,8 @@ def test_high_pass_turns_and_shrinks_a_steady_tone_as_its_transfer_function_says
     k = trial.channels.index("x3")
     assert after[trial.name][0, k] == 0.0
     late = slice(250, 850)
-    structure = workbench("lumped").rig.structure(_mean(), Changes())
+    work = workbench("lumped")
+    structure = work.rig.structure(work.mean.parameters, Changes())
     w = structure.angular_frequency[0]
     decay = 0.5 * (structure.alpha + structure.beta * w**2)
     pole = complex(-decay, np.sqrt(w**2 - decay**2))
@@ -269,18 +196,18 @@ def test_high_pass_turns_and_shrinks_a_steady_tone_as_its_transfer_function_says
     assert complex(c, d) / complex(a, b) == pytest.approx(wanted, rel=2e-2)
 
 
-def test_clock_gain_offset_drift_and_temperature():
+def test_gain_offset_drift_line_and_temperature():
     plan = workbench("lumped").plan
     plain = _signals(Changes())
     shown = _signals(
         Changes(
-            clock_rate=0.01,
             faults=(
                 Fault("gain", ("s1",), (0.1,)),
                 Fault("drift", ("s3",), (50.0, 1.0)),
                 Fault("thermal", ("s2",), (2e-6,)),
                 Fault("offset", ("x1",), (3e-4,), "B"),
-            ),
+                Fault("line", ("x3",), (50.0, 0.4, 0.3)),
+            )
         )
     )
     warm = next(t for t in plan.trials if t.kind == "static" and t.temperature)
@@ -293,9 +220,9 @@ def test_clock_gain_offset_drift_and_temperature():
     np.testing.assert_allclose(change[:, columns["x1"]], 0.0)
     np.testing.assert_allclose((shown[other.name] - plain[other.name])[:, columns["x1"]], 0.3)
     ring = next(t for t in plan.trials if t.kind == "ringdown")
-    x = ring.channels.index("x1")
-    early = np.interp(1.01 * ring.rows[:500], ring.rows, plain[ring.name][:, x])
-    np.testing.assert_allclose(shown[ring.name][:500, x], early, atol=0.03)
+    x = ring.channels.index("x3")
+    line = 0.5 * np.cos(100.0 * np.pi * ring.rows - np.arctan2(0.3, 0.4))
+    np.testing.assert_allclose((shown[ring.name] - plain[ring.name])[:, x], line, atol=1e-9)
 
 
 def test_load_cell_and_modulus():
@@ -405,40 +332,21 @@ def test_generators_share_no_code_with_what_names():
 
 
 def test_chance_stays_within_reach_of_the_prior():
-    plan = lumped_campaign()
+    plan = workbench("lumped").plan
     for seed in range(20):
-        chance: Chance = draw_chance(np.random.default_rng(seed), plan)
+        chance = draw_chance(np.random.default_rng(seed), plan)
         for name, (mean, deviation) in plan.priors.items():
             assert abs(chance.parameters[name] - mean) <= 2.5 * deviation
 
 
-@pytest.mark.parametrize(("share", "runs_away"), [(0.5, False), (3.0, True)])
-def test_motion_that_runs_away_is_no_campaign(share, runs_away):
-    """A law that takes more stiffness from a joint than it has lets it snap."""
+def test_motion_that_runs_away_is_no_campaign():
+    """A law that takes more stiffness from a joint than it has lets it snap; some releases nothing holds."""
     work = workbench("lumped")
-    joint = work.bench.joint
-    law = Law(joint.port, BOUC_WEN, (share * joint.stiffness, 0.3 * joint.displacement, 1.0))
+    joint, end = work.bench.joint, work.bench.free
     chance = draw_chance(np.random.default_rng(1), work.plan)
-    assert (finite_signals(work, chance, Changes(laws=(law,))) is None) is runs_away
-
-
-def test_a_release_that_nothing_holds_is_no_campaign():
-    work = workbench("lumped")
-    soft = Law("end", POWER, (-2.0 * work.bench.free.stiffness / work.bench.release**2, 3.0, 0.0))
-    chance = draw_chance(np.random.default_rng(1), work.plan)
-    assert finite_signals(work, chance, Changes(laws=(soft,))) is None
-
-
-@pytest.mark.parametrize("share", [0.5, 0.97, 1.03, 3.0])
-def test_a_softening_spring_holds_loads_up_to_its_limit(share):
-    """k x - c x^3 = F has a state on the way from rest up to F = 2/3 k sqrt(k / (3 c))."""
-    cubic = 4e5
-    limit = 2.0 / 3.0 * STIFFNESS * np.sqrt(STIFFNESS / (3.0 * cubic))
-    law = Law("x", POWER, (-cubic, 3.0, 0.0))
-    (at_half,), (at_share,) = oscillator().static(np.array([[0.5 * limit, share * limit]]), (law,))
-    assert STIFFNESS * at_half - cubic * at_half**3 == pytest.approx(0.5 * limit)
-    if share > 1.0:
-        assert np.isnan(at_share)
-    else:
-        assert STIFFNESS * at_share - cubic * at_share**3 == pytest.approx(share * limit)
-        assert 0.0 < at_share < np.sqrt(STIFFNESS / (3.0 * cubic))
+    for law, runs_away in (
+        (Law(joint.port, BOUC_WEN, (0.5 * joint.stiffness, 0.3 * joint.displacement, 1.0)), False),
+        (Law(joint.port, BOUC_WEN, (3.0 * joint.stiffness, 0.3 * joint.displacement, 1.0)), True),
+        (Law("end", POWER, (-2.0 * end.stiffness / work.bench.release**2, 3.0, 0.0)), True),
+    ):
+        assert (finite_signals(work, chance, Changes(laws=(law,))) is None) is runs_away

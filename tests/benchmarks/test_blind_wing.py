@@ -7,8 +7,7 @@ from benchmarks.blind.cases import Order, Workbench, make_case, workbench
 from benchmarks.blind.changes import Changes, Fault
 from benchmarks.blind.instruments import Chance, true_signals
 from benchmarks.blind.laws import FRICTION, Law
-from benchmarks.blind.plan import TrialPlan
-from benchmarks.blind.wing_rig import WingRig
+from benchmarks.blind.structure import Structure
 from fe.wing.responses import eigenmodes, solve_static
 
 pytestmark = pytest.mark.long  # the full model is projected once, in about 20 s
@@ -20,6 +19,8 @@ STATE = {
     "damping_alpha": 1.05,
     "damping_beta": 7.4e-4,
 }
+STICKING = Changes(laws=(Law("root", FRICTION, (6.0, 0.0)),))
+TIP = 1.778  # m from the root
 
 
 @pytest.fixture(scope="module")
@@ -28,132 +29,108 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Workbench:
     return workbench("wing", tmp_path_factory.getbasetemp() / "blind")
 
 
-@pytest.fixture(scope="module")
-def rig(work: Workbench) -> WingRig:
-    assert isinstance(work.rig, WingRig)
-    return work.rig
+def wing(work: Workbench, **changes: object) -> Structure:
+    return work.rig.structure(STATE, Changes(**changes))
 
 
-def _trial(work: Workbench, name: str) -> TrialPlan:
-    return next(trial for trial in work.plan.trials if trial.name == name)
+def shown(work: Workbench, name: str, amplitude: float = 0.0, **changes: object) -> np.ndarray:
+    """Return the outputs of a trial."""
+    trial = next(trial for trial in work.plan.trials if trial.name == name)
+    return work.rig.respond(wing(work, **changes), Changes(**changes), trial, amplitude)[0]
 
 
-def test_projected_wing_is_the_full_model(work, rig):
-    operators = rig.store.operators
-    structure = rig.structure(STATE, Changes())
-    tip, _ = rig.respond(structure, Changes(), _trial(work, "tip 1"))
-    flight, _ = rig.respond(structure, Changes(), _trial(work, "flight 1"))
-    force = _trial(work, "tip 1").rows[5]
-    full = solve_static(operators, 1.013, load_factor=0.0, tip_force=float(force))
-    noise = 5e-6
+def rows(work: Workbench, name: str) -> np.ndarray:
+    return next(trial.rows for trial in work.plan.trials if trial.name == name)
+
+
+def test_projected_wing_is_the_full_model(work):
+    operators, noise = work.rig.store.operators, 5e-6
+    tip, flight, force = shown(work, "tip 1"), shown(work, "flight 1"), float(rows(work, "tip 1")[5])
+    full = solve_static(operators, 1.013, load_factor=0.0, tip_force=force)
     np.testing.assert_allclose(tip[5, :24], full.strain, atol=1e-2 * noise)
-    assert tip[5, 24] == pytest.approx(operators.load_tip @ full.displacement, rel=1e-5)
-    assert tip[5, 25] == pytest.approx(full.output[0], rel=1e-5)
-    np.testing.assert_allclose(
-        flight[2, :24], solve_static(operators, 1.013, load_factor=3.0).strain, atol=4e-2 * noise
-    )
+    expected = [operators.load_tip @ full.displacement, full.output[0]]
+    np.testing.assert_allclose(tip[5, 24:26], expected, rtol=1e-5)
+    turn = solve_static(operators, 1.013, load_factor=3.0).strain
+    np.testing.assert_allclose(flight[2, :24], turn, atol=4e-2 * noise)
     modes = eigenmodes(operators, 1.013, (0.0, 0.0), 0.166, 0.141, 6)
-    np.testing.assert_allclose(structure.angular_frequency[:6] / (2.0 * np.pi), modes.frequency, rtol=2e-6)
+    np.testing.assert_allclose(wing(work).angular_frequency[:6] / (2.0 * np.pi), modes.frequency, rtol=2e-6)
 
 
-def test_root_compliance_turns_the_wing_as_a_rigid_body(work, rig):
-    compliance = 2e-5
-    changes = Changes(root_compliance=compliance)
-    trial = _trial(work, "tip 1")
-    before, _ = rig.respond(rig.structure(STATE, Changes()), Changes(), trial)
-    after, _ = rig.respond(rig.structure(STATE, changes), changes, trial)
-    arm = 1.778
-    added = after[:, 24] - before[:, 24]
-    np.testing.assert_allclose(added, compliance * trial.rows * arm**2, rtol=1e-4)
-    np.testing.assert_allclose(after[:, :24], before[:, :24], atol=1e-9)
+def test_root_compliance_turns_the_wing_as_a_rigid_body(work):
+    added = shown(work, "tip 1", root_compliance=2e-5) - shown(work, "tip 1")
+    np.testing.assert_allclose(added[:, 24], 2e-5 * rows(work, "tip 1") * TIP**2, rtol=1e-4)
+    np.testing.assert_allclose(added[:, :24], 0.0, atol=1e-9)
 
 
-def test_point_mass_lowers_the_frequency_as_rayleigh_says(rig):
-    mass, station = 2e-4, 1.5
-    plain = rig.structure(STATE, Changes())
-    heavy = rig.structure(STATE, Changes(mass=mass, mass_station=station))
-    basis = rig.store.basis()
-    place = np.array([np.interp(station, basis.stations, row) for row in basis.line[2].T])
-    motion = float(place @ plain.shapes[:, 0])
-    wanted = -0.5 * mass * motion**2
+def test_point_mass_lowers_the_frequency_as_rayleigh_says(work):
+    mass, station, plain, basis = 2e-4, 1.5, wing(work), work.rig.store.basis()
+    heavy = wing(work, mass=mass, mass_station=station)
+    motion = [np.interp(station, basis.stations, row) for row in basis.line[2].T] @ plain.shapes[:, 0]
     found = heavy.angular_frequency[0] / plain.angular_frequency[0] - 1.0
-    assert found == pytest.approx(wanted, rel=2e-2)
+    assert found == pytest.approx(-0.5 * mass * motion**2, rel=2e-2)
 
 
-def test_displaced_force_has_the_lever_of_its_place(work, rig):
+@pytest.mark.parametrize(
+    ("place", "shift", "lever"),
+    [
+        ("tip", {}, TIP),
+        ("tip", {"shift_span": -0.06}, TIP - 0.06),
+        ("tip", {"shift_chord": 0.02}, TIP),
+        ("middle", {"shift_span": 0.03}, 0.944),
+        ("corner", {"shift_span": 0.03, "shift_chord": -0.02}, 1.808),
+    ],
+)
+def test_displaced_force_has_the_lever_of_its_place(work, place, shift, lever):
     """The bending moment at the root, which the root's rotation shows."""
-    structure = rig.structure(STATE, Changes())
-    spring = rig.store.basis().flap_spring
-
-    def moment(place: str, changes: Changes) -> float:
-        return spring * float(structure.ports["root"] @ structure.solve(rig.load(place, changes)))
-
-    assert moment("tip", Changes()) == pytest.approx(1.778, rel=1e-4)
-    assert moment("tip", Changes(shift_span=-0.06)) == pytest.approx(1.718, rel=1e-4)
-    assert moment("tip", Changes(shift_chord=0.02)) == pytest.approx(1.778, rel=1e-4)
-    assert moment("middle", Changes(shift_span=0.03)) == pytest.approx(0.944, rel=1e-4)
-    assert moment("corner", Changes(shift_span=0.03, shift_chord=-0.02)) == pytest.approx(1.808, rel=1e-4)
+    turn = wing(work).ports["root"] @ wing(work).solve(work.rig.load(place, Changes(**shift)))
+    assert work.rig.store.basis().flap_spring * turn == pytest.approx(lever, rel=1e-4)
 
 
-def test_weight_and_washout_in_flight(work, rig):
-    basis, design = rig.store.basis(), rig.design
-    structure = rig.structure(STATE, Changes())
-    trial = _trial(work, "flight 1")
-    plain, _ = rig.respond(structure, Changes(), trial)
-    relieved, _ = rig.respond(structure, Changes(relief=0.2), trial)
-    weight = (structure.outputs @ structure.solve(basis.weight))[:24]
-    np.testing.assert_allclose((relieved - plain)[:, :24], 0.2 * np.outer(trial.rows, weight), atol=1e-12)
-    assert design.lift.inertia_relief
-    washed, _ = rig.respond(structure, Changes(washout=0.05, washout_exponent=1.0), trial)
-    lost = (plain - washed)[:, :24]
-    # The loss grows with the square of the load factor.
+def test_weight_and_washout_in_flight(work):
+    plain, structure = shown(work, "flight 1")[:, :24], wing(work)
+    weight = (structure.outputs @ structure.solve(work.rig.store.basis().weight))[:24]
+    relieved = shown(work, "flight 1", relief=0.2)[:, :24] - plain
+    np.testing.assert_allclose(relieved, 0.2 * np.outer(rows(work, "flight 1"), weight), atol=1e-12)
+    assert work.rig.design.lift.inertia_relief
+    lost = plain - shown(work, "flight 1", washout=0.05, washout_exponent=1.0)[:, :24]
+    # The loss grows with the square of the load factor, and outboard gauges lose a greater share.
     np.testing.assert_allclose(lost[2], 9.0 * lost[0], rtol=1e-9)
-    # Outboard gauges lose a greater share.
-    share = lost[2] / plain[2, :24]
+    share = lost[2] / plain[2]
     assert share[15] > share[0] > 0.0
 
 
-def test_turned_gauge_reads_the_full_model_along_the_turned_direction(work, rig):
-    angle = 0.2
-    fault = Fault("rotation", ("g05",), (angle,))
-    turned = rig.structure(STATE, Changes(faults=(fault,)))
-    across = rig.structure(STATE, Changes(faults=(Fault("rotation", ("g05",), (0.5 * np.pi,)),)))
-    back = rig.structure(STATE, Changes(faults=(Fault("rotation", ("g05",), (-angle,)),)))
-    plain = rig.structure(STATE, Changes())
-    load = rig.load("tip", Changes())
-    along, wide, one, two = (float(s.outputs[5] @ s.solve(load)) for s in (plain, across, turned, back))
-    # Mohr's circle: the mean of both turns has no shear in it; bending squeezes the skin sideways a little.
+def test_turned_gauge_reads_the_full_model_along_the_turned_direction(work):
+    """Mohr's circle: the mean of both turns has no shear; bending squeezes the skin sideways a little."""
+    angle, load, read = 0.2, work.rig.load("tip", Changes()), []
+    for turn in (0.0, 0.5 * np.pi, angle, -angle):
+        turned = wing(work, faults=(Fault("rotation", ("g05",), (turn,)),))
+        read.append(turned.outputs[5] @ turned.solve(load))
+    along, wide, one, two = read
+    assert along == pytest.approx(wing(work).outputs[5] @ wing(work).solve(load), rel=1e-12)
     mean = np.cos(angle) ** 2 * along + np.sin(angle) ** 2 * wide
     assert 0.5 * (one + two) == pytest.approx(mean, rel=1e-9)
     assert abs(wide) < 0.5 * abs(along)
 
 
-def test_friction_at_the_root_stiffens_small_swings_and_damps_large_ones(work, rig):
-    law = Law("root", FRICTION, (6.0, 0.0))
+def test_friction_at_the_root_stiffens_small_swings_and_damps_large_ones(work):
     chance = Chance(STATE, {trial.name: trial.release for trial in work.plan.trials})
-    signals = true_signals(rig, work.plan, chance, Changes(laws=(law,)))
-    trial = _trial(work, "release 40 mm up 3")
-    tip = signals[trial.name][:, trial.channels.index("tip")]
-    late = tip[900:]
+    signals = true_signals(work.rig, work.plan, chance, STICKING)
+    trial = next(trial for trial in work.plan.trials if trial.name == "release 40 mm up 3")
+    late = signals[trial.name][900:, trial.channels.index("tip")]
     up = np.flatnonzero((late[:-1] < 0.0) & (late[1:] >= 0.0))
     at = up + late[up] / (late[up] - late[up + 1])
     frequency = (len(at) - 1) / (at[-1] - at[0]) * 250.0
     # Stuck, the root's spring does not move: the wing swings as on a rigid root.
-    rigid = rig.structure(STATE, Changes(root_compliance=-0.999999 / rig.store.basis().flap_spring))
+    rigid = wing(work, root_compliance=-0.999999 / work.rig.store.basis().flap_spring)
     assert frequency == pytest.approx(rigid.angular_frequency[0] / (2.0 * np.pi), rel=1e-3)
-    free = rig.structure(STATE, Changes())
-    assert frequency > 1.01 * free.angular_frequency[0] / (2.0 * np.pi)
+    assert frequency > 1.01 * wing(work).angular_frequency[0] / (2.0 * np.pi)
 
 
-def test_steps_and_modes_are_fine_enough(work, rig, monkeypatch):
+def test_steps_and_modes_are_fine_enough(work, monkeypatch):
     """Finer steps and more modes change readings by less than a tenth of the noise."""
-    trial = _trial(work, "release 40 mm up 1")
-    law = Law("root", FRICTION, (6.0, 0.0))
-    changes = Changes(laws=(law,))
 
     def reading() -> np.ndarray:
-        structure = rig.structure(STATE, changes)
-        values, _ = rig.respond(structure, changes, trial, 0.04)
+        values = shown(work, "release 40 mm up 1", 0.04, laws=STICKING.laws)
         return values[:, [2, 10, 25]] / [5e-6, 5e-6, 1e-4]
 
     usual = reading()

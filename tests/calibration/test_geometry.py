@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import ExperimentDataError
-from calibration.geometry import (
-    published_lengths,
-    tailored_design,
-    tailored_geometry,
-)
+from calibration.geometry import published_lengths, tailored_design, tailored_geometry
 from fe.runtime.errors import InvalidDesignError
 from fe.wing.design import load_design
 from fe.wing.mesh import build_mesh

@@ -10,11 +10,7 @@ from calibration.dynamics.trials import average
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import read_lengths
 from calibration.paper.procedure import read_published_results
-from calibration.static.experiments import (
-    LOAD_STANDARD_DEVIATION,
-    published_measurements,
-    read_measurements,
-)
+from calibration.static.experiments import LOAD_STANDARD_DEVIATION, published_measurements, read_measurements
 from calibration.wing.lab_data import WEIGHED_MASS_FILE, published_data, read_lab_folder, read_weighed_mass
 from tests.refusals import Inputs, refused
 
@@ -90,6 +86,8 @@ def test_digitised_records_are_fitted_by_their_extremes(reference):
         (0.0280, 0.0573), rel=0.03
     )
     assert sum(name.startswith("ring_down_") for name in read.input_hashes) == 5
+    said = "ringdown_trial1_digitised.csv to ringdown_trial5_digitised.csv read"
+    assert read.origins[2].text == said
 
 
 def folder_with(root, above, *steps):

@@ -18,6 +18,7 @@ from reporting import netcdf
 from reporting.errors import DamagedFileError
 from reporting.groups import Group, Variable, write_groups
 from reporting.netcdf import read_groups
+from tests.refusals import refused
 
 SIZES = {"step": 4, "sensor": 3, "state": 2, "empty": 0}
 _TYPES = ("f8", "f4", "i8", "i1", "U5")
@@ -116,9 +117,8 @@ def test_what_is_no_netcdf_is_one_sentence(tmp_path, content):
     with pytest.raises(DamagedFileError, match="there is no file"):
         read_groups(tmp_path / "a.nc")
     (tmp_path / "a.nc").write_bytes(content)
-    with pytest.raises(DamagedFileError, match=r"a\.nc is damaged or no NetCDF file \(.+\)$") as caught:
+    with refused(DamagedFileError, r"a\.nc is damaged or no NetCDF file \(.+\)$"):
         read_groups(tmp_path / "a.nc")
-    assert "\n" not in str(caught.value)
 
 
 def spin(path: Path) -> object:
@@ -156,9 +156,8 @@ def test_no_end_a_crash_and_a_full_memory_are_one_sentence(path, monkeypatch, ca
     monkeypatch.setattr(netcdf, "WAITING", 2)
     monkeypatch.setattr(netcdf, "_groups", reading)
     begin = time.perf_counter()
-    with pytest.raises(DamagedFileError, match="HDF5 breaks down over it") as caught:
+    with refused(DamagedFileError, "HDF5 breaks down over it"):
         read_groups(path)
-    assert "\n" not in str(caught.value)
     assert time.perf_counter() - begin < 30.0
     assert capfd.readouterr() == ("", "")
     with pytest.raises(ProcessLookupError):

@@ -126,9 +126,6 @@ def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
         "Checking a wing that has a long name: done, 23.5 s",
     ]
     told = io.StringIO()
-    with (
-        pytest.raises(KeyError),
-        RichProgress(Console(file=told), lines=True).stage("Failing"),
-    ):
+    with pytest.raises(KeyError), RichProgress(Console(file=told), lines=True).stage("Failing"):
         raise KeyError
     assert told.getvalue() == "Failing ...\n"

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import uav_twin
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.reduced_model import ReducedModelSource
@@ -126,3 +127,11 @@ def check_same(first: Path, second: Path, *names: str) -> None:
     """Compare files of two folders to the last bit."""
     for name in names:
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+def check_resumed(whole: Path, loaded: LoadedScenario, part: Path, turns: int, *names: str) -> None:
+    """Fly a mission again, cut off after some turns, and resume it: `whole`, to the last bit."""
+    with cut_off_after(turns):
+        uav_twin.fly(loaded, part, report=False)
+    uav_twin.resume(part, report=False)
+    check_same(part, whole, "run.nc", "config.json", "summary.json", "journal.jsonl", *names)

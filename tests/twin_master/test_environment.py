@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tests.twin_master.runs import flight_of
+from tests.twin_master.runs import flight_of, text_of, written
 from twin_master.assets.resolution import asset_source
 from twin_master.environment import ScenarioEnvironment
 from twin_master.errors import MissionInputError
@@ -68,6 +68,20 @@ def test_wrong_use_is_refused(library_file):
     environment.close()
     with pytest.raises(MissionInputError, match="is closed"):
         environment.reset()
+
+
+def test_an_action_that_ends_the_mission_terminates_the_episode(tmp_path):
+    land = '[[action]]\nname = "land"\ncontrol = "2g"\ncost = 0.0\nends = true\n\n[observation]'
+    text = text_of("inspected_wing", ("[observation]", land), ('policy = "belief"', 'policy = "mode"'))
+    environment = ScenarioEnvironment(written(tmp_path, text), {"in_process": True})
+    environment.reset(seed=1)
+    assert not any(environment.step(0)[2:4])
+    _, reward, terminated, truncated, info = environment.step(5)
+    assert (terminated, truncated, info["ended"]) == (True, False, "the twin decided on `land`.")
+    assert reward != 0.0
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        environment.step(0)
+    environment.close()
 
 
 def test_without_gymnasium_there_is_a_sentence():

@@ -29,7 +29,7 @@ from fe.wing.design import SHIPPED_DESIGN
 from tests.command_line import call, command, refused, said
 from tests.kept import FE, ROOT, kept_folder
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, cut_off_after, edited, figures_of, text_of, written
+from tests.twin_master.runs import check_same, cut_off_after, edited, text_of, written
 from tests.wings import tip_stiffness
 from uav_twin import FmiAsset, assemble, load_calibration, load_design, reduced_model
 
@@ -254,47 +254,11 @@ def test_two_wings_are_two_fmus(wings, tmp_path):
     assert 1.0 < np.median(ratio) < stiff / soft * 1.01
 
 
-@pytest.fixture
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
-
-
-SHORT = ("steps = 50", "steps = 3")
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("no_report")
-def test_two_wings_are_two_flights(wings, tmp_path):
-    """Without a truth of its own in the scenario, each wing is flown as it was calibrated."""
-    scenario = written(tmp_path, re.sub(r"(?m)^parameters = .*$", "", text_of("level_turns", SHORT)))
-    predicted, true = {}, {}
-    for name, made in wings.items():
-        out = tmp_path / name
-        said("run", scenario, "--calibration", made.file, "--out", out, "-q")
-        check_same(out / "asset", made.out, "calibration.nc")
-        config = json.loads((out / "config.json").read_text(encoding="utf-8"))
-        assert config["inputs"]["design"] == made.result.design_hash
-        assert "calibration" in config["inputs"]
-        assert str(tmp_path) not in json.dumps(config)
-        with xr.open_datatree(out / "run.nc", engine="h5netcdf") as tree:
-            tree.load()
-        draws = tree["calibration"]["draw_value"].values
-        assert set(draws.tolist()) <= set(made.result.draws_of("young_modulus_factor").tolist())
-        predicted[name] = tree["predicted"]["quantity_mean"].values[0, 0]
-        width = tree["filtered"]["quantity_upper"].values[0] - tree["filtered"]["quantity_lower"].values[0]
-        assert np.all(width > 0.0)  # the samples' uncertainty is in the bands
-        true[name] = tree["truth"]["strain"].values[0]
-        mean = made.result.mean("young_modulus_factor")
-        assert figures_of(out)["young_modulus_factor_mean"] == pytest.approx(mean)
-    assert np.all(predicted["soft"] > predicted["stiff"])
-    assert np.all(true["soft"] > true["stiff"])
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_the_truth_of_the_scenario_stays_and_a_run_needs_nothing_but_its_folder(wings, tmp_path):
     """It is told where a wing is another one than the truth; the file of the calibration may be gone."""
-    true, scenario = [], written(tmp_path, text_of("level_turns", SHORT))
+    true, scenario = [], written(tmp_path, text_of("level_turns", ("steps = 50", "steps = 3")))
     for name, made in wings.items():
         file = Path(shutil.copy(made.file, tmp_path / "wing.nc"))
         given = ("run", scenario, "--calibration", file, "--out")

@@ -21,11 +21,6 @@ from twin_master.workflow import check_scenario
 from uav_twin import assemble, cli, load_design, load_scenario
 
 
-@pytest.fixture
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
-
-
 def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]:
     """Return every command with the words that call it."""
     found = [(words, command)]

@@ -257,33 +257,15 @@ def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
         assert not columns or max(map(len, rest)) <= 80
 
 
-GRID = (
-    "--grid",
-    "health.wear=0,0.3",
-    "--grid",
-    "clogging=0,0.6",
-    "--grid",
-    "speed=1000",
-    "--grid",
-    "pressure=100:140:2",
-)
+GRID = "--grid health.wear=0,0.3 --grid clogging=0,0.6 --grid speed=1000 --grid pressure=100:140:2"
 
 
 def test_from_a_script_to_a_library(tmp_path):
     fmu, out = tmp_path / "pump.fmu", tmp_path / "pump.nc"
     said("fmu", "build", "--script", "gear_pump", "--out", fmu)
     said("fmu", "check", fmu, "--cycles", "5")
-    sample = (
-        "library",
-        "sample",
-        "--fmu",
-        fmu,
-        "--binding",
-        binding_files()["gear_pump"],
-        *GRID,
-        "--out",
-        out,
-    )
+    given = "--fmu", fmu, "--binding", binding_files()["gear_pump"]
+    sample = "library", "sample", *given, *GRID.split(), "--out", out
     size = r"pump\.nc: 1 x 4 x 2 x 4 \(draws, states, controls, sensors\), 2 proc"
     assert re.search(size, said(*sample, "--workers", "2"))
     content = out.read_bytes()
@@ -402,16 +384,9 @@ def test_what_nothing_takes_is_a_warning_and_not_flown(scenario, system, tmp_pat
 
 def test_the_words_of_ssp_2_are_read(system, tmp_path):
     """The numbers of FMI 3, metadata and the version; what 1.0 has no word for is refused."""
-    meta, end = (
-        '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />',
-        "</ssd:SystemStructureDescription>",
-    )
-    words = {
-        'version="1.0" name=': 'version="2.0" name=',
-        "ssc:Real": "ssc:Float64",
-        "ssv:Real": "ssv:Float64",
-        end: f"{meta}{end}",
-    }
+    meta = '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />'
+    words = {'version="1.0" name=': 'version="2.0" name=', "</ssd:SystemS": f"{meta}</ssd:SystemS"}
+    words |= {"ssc:Real": "ssc:Float64", "ssv:Real": "ssv:Float64"}
     newer, tables = changed(system, tmp_path / "newer.ssp", **words), [tmp_path / "0.csv", tmp_path / "1.csv"]
     for file, table in zip((system, newer), tables, strict=True):
         said("ssp", "simulate", file, "--out", table, "--step-size", "0.25", "--in-process")

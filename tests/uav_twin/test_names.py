@@ -95,6 +95,8 @@ def test_the_command_names_it_too(tmp_path):
 
 def test_records_show_themselves_in_a_few_words(library_file):
     from calibration.wing.calibrate import WingCalibration
+    from discrepancy.document import Origin
+    from discrepancy.files.verdict import StoredVerdict
     from discrepancy.models.fmu import FmuModel
     from discrepancy.models.interface import Model
     from discrepancy.models.structures import WingModel
@@ -110,6 +112,7 @@ def test_records_show_themselves_in_a_few_words(library_file):
         (model, ("LumpedModel", "parameters=")),
         (verdict, ("nothing missing", "0.9")),
         (Investigation(campaign, model, (), verdict), ("Verdict(", model.name)),
+        (StoredVerdict(verdict, None, Origin("A rig", "A model", *[""] * 3, {})), ("Verdict(", "A rig")),
         (wing, (wing.asset, "samples=40")),
         (WingCalibration(wing, wing, "joint", *[None] * 4), ("Calibration(", "joint")),  # type: ignore[arg-type]
         (uav_twin.load_scenario("level_turns"), ("level_turns.toml",)),

@@ -11,7 +11,6 @@ import xarray as xr
 from fmpy.validation import validate_fmu
 
 from fe.full.factorisation import Factorisation
-from fe.reduction.reduced_basis import measured_errors
 from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_comparison import calculix_program
 from fmu_asset.archive.fmu_file import packed_design_hash
@@ -25,7 +24,7 @@ from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.watch.opening import begun_watch
-from uav_twin import assemble_structure, fly, load_calibration, reduced_structure, structure_files
+from uav_twin import fly, load_calibration, structure_files
 
 INPUTS = Inputs(__file__)
 
@@ -131,23 +130,6 @@ def matrices(tmp_path_factory: pytest.TempPathFactory) -> Path:
     places = ("PATCH", ends("patch")), ("SKIN", ends("skin")), ("CORNER", CORNER), ("CORNER", CORNER)
     tables = INPUTS.text("skin.toml", *((place, str(nodes)) for place, nodes in places))
     return write_structure(tmp_path_factory.mktemp("skin"), stiffened_skin, tables)
-
-
-@needs_calculix
-def test_the_reduced_model_is_calculixs_within_its_bound(matrices, tmp_path):
-    model = reduced_structure(matrices)
-    for e, loss in ((1.0, 0.0), (1.05, 0.55)):
-        strain, corner = calculix(tmp_path, e, loss)
-        found = model.static_response({"e": e, "z1": loss, "push": 1.0})
-        printed = 1e-6 * abs(corner) / LENGTH  # seven digits of each displacement
-        np.testing.assert_allclose(
-            found.strain, [*strain.values()], rtol=0.0, atol=found.strain_error_bound + printed
-        )
-        bound = 1e3 * found.displacement_error_bound
-        assert 1e3 * found.displacement[0] == pytest.approx(corner, abs=bound + 1e-6 * abs(corner))
-    errors = measured_errors(assemble_structure(matrices), model, 6)
-    assert errors.broken == 0
-    assert errors.frequency < 1e-4
 
 
 @needs_calculix

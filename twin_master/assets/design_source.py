@@ -30,7 +30,7 @@ from twin_master.assets.parameter import (
     check_calibration,
 )
 from twin_master.assets.structure_source import NamedStructure, StructureFmuSource, StructureSource
-from twin_master.errors import MissingObservationModelError, MissionInputError
+from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
@@ -252,7 +252,7 @@ class DesignSource(_Wing, StructureSource):
         if self.patch is not None:
             role = self._scenario.observation.role
             if role != "strain":
-                raise MissingObservationModelError(said("assets.patched_role", role=role))
+                raise MissionInputError(said("assets.patched_role", role=role))
             check_model_patch(self.patch, len(self.design.gauge), str(self.patch_path))
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reporting.arrays import Float
-from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
+from twin_master.errors import MissionInputError, check_names
 from twin_master.scenario.schema import Calibration
 from twin_master.seeds import generator, seed_sequence
 from twin_master.sentences import said
@@ -70,7 +70,7 @@ def draw_parameter(
 
     Raises
     ------
-    MissingObservationModelError
+    MissionInputError
         The scenario asks for the stiffness curve of a design and there is none.
     CalibrationError
         The measurements do not fit the model, or the calibration file cannot be read.
@@ -100,7 +100,7 @@ def draw_parameter(
         values = mean + deviation * ndtri(stratified(random, count))
         return ParameterDraws(name, values, mean, deviation, "normal distribution of the scenario")
     if calibration.curve == "design" and model is None:
-        raise MissingObservationModelError(said("assets.curve"))
+        raise MissionInputError(said("assets.curve"))
     return _draws_of_load_test(calibration, seed, model if calibration.curve == "design" else None)
 
 

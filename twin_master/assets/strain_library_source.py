@@ -18,8 +18,6 @@ from reporting.json_file import read_json
 from twin_master.assets.asset_source import LIBRARY_COPY, Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import (
-    InvalidStrainLibraryError,
-    MissingObservationModelError,
     MissionInputError,
     check_names,
 )
@@ -85,15 +83,15 @@ class StrainLibrary:
 
         Raises
         ------
-        InvalidStrainLibraryError
+        MissionInputError
             The state lies outside the levels.
         """
         strain = self.strain[:, control_index].reshape(*self.states.shape, -1)
         for factor, value in zip(self.states.factors, stiffness_loss, strict=True):
             known = factor.levels
             if not known[0] <= value <= known[-1]:
-                ends = known[0], known[-1]
-                raise InvalidStrainLibraryError(said("assets.covers", factor=factor, ends=ends, value=value))
+                why = said("assets.covers", factor=factor, ends=(known[0], known[-1]), value=value)
+                raise MissionInputError(why)
             weights = [np.interp(value, known, level) for level in np.eye(len(known))]
             strain = np.tensordot(weights, strain, axes=1)
         return strain
@@ -109,20 +107,20 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
 
     Raises
     ------
-    InvalidStrainLibraryError
+    MissionInputError
         If the file cannot be read, is no JSON, lacks an entry (it is named), or has values that are not in
         the published format.
     """
     path = Path(path)
     file = path / FILE_NAME if path.is_dir() else path
-    content = read_json(file, InvalidStrainLibraryError, what="strain library")
+    content = read_json(file, MissionInputError, what="strain library")
     try:
         return _arranged(content)
     except KeyError as error:
         why = said("assets.lacks", file=file, error=error, file_name=FILE_NAME)
-        raise InvalidStrainLibraryError(why) from error
+        raise MissionInputError(why) from error
     except (TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InvalidStrainLibraryError(said("assets.unread", file=file, error=error)) from error
+        raise MissionInputError(said("assets.unread", file=file, error=error)) from error
 
 
 def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
@@ -170,9 +168,7 @@ class StrainLibrarySection(AssetSection):
         Raises
         ------
         MissionInputError
-            No file is named.
-        InvalidStrainLibraryError, MissingObservationModelError
-            The library is missing, damaged or does not fit the scenario.
+            No file is named, or the library is missing, damaged or does not fit the scenario.
         """
         if self.file is None:
             where = REPOSITORY, FILE_NAME
@@ -195,9 +191,7 @@ class StrainLibraryBelief(BeliefSection):
         Raises
         ------
         MissionInputError
-            A strain library flies.
-        InvalidStrainLibraryError, MissingObservationModelError
-            The library is missing, damaged or does not fit the scenario.
+            A strain library flies, or the library is missing, damaged or does not fit the scenario.
         """
         if not scenario.asset.is_fmu:
             raise MissionInputError(said("assets.believed"))
@@ -214,10 +208,10 @@ class StrainLibrarySource(AssetSource):
         self.places = {} if path is None else {LIBRARY_COPY: path}
         self._library = library
         rows = [("control", scenario.control_names, library.controls)]
-        check_names("the scenario has the", "the strain library", rows, MissingObservationModelError)
+        check_names("the scenario has the", "the strain library", rows)
         self._control_index = [library.controls.index(name) for name in scenario.control_names]
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
-            raise MissingObservationModelError(said("assets.gauges", library=library, scenario=scenario))
+            raise MissionInputError(said("assets.gauges", library=library, scenario=scenario))
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return the library's own samples of its parameter."""
@@ -257,7 +251,7 @@ def _read(scenario: Scenario, path: Path) -> StrainLibrarySource:
 
     Raises
     ------
-    MissingObservationModelError
+    MissionInputError
         It is another one: asset and model would fly different turns.
     """
     for control in scenario.control if scenario.another_model else ():
@@ -268,5 +262,5 @@ def _read(scenario: Scenario, path: Path) -> StrainLibrarySource:
             continue
         if given is not None and abs(given - expected) > _TOLERANCE:
             factors = expected, given
-            raise MissingObservationModelError(said("assets.load_factor", control=control, factors=factors))
+            raise MissionInputError(said("assets.load_factor", control=control, factors=factors))
     return StrainLibrarySource(scenario, load_strain_library(path), path)

@@ -28,7 +28,7 @@ from twin_master.assets.reduced_model import (
     RecordedStructure,
     ReducedModelSource,
 )
-from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
+from twin_master.errors import MissionInputError, check_names
 from twin_master.scenario.asset import BeliefSection, FileSection
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import ROLE
@@ -188,7 +188,7 @@ class NamedStructure(AssetSource):
         return count
 
     def _check_observed(self) -> None:
-        """Refuse observations that the structure does not have; raises `MissingObservationModelError`.
+        """Refuse observations that the structure does not have; raises `MissionInputError`.
 
         Titles that are its sensors in another order raise `MissionInputError`: they would name the wrong
         ones.
@@ -209,12 +209,12 @@ class NamedStructure(AssetSource):
             most = StructureSettings.mode_count
             if max(modes.places) >= most:
                 number = max(modes.places) + 1
-                raise MissingObservationModelError(said("assets.modes", most=most, number=number))
+                raise MissionInputError(said("assets.modes", most=most, number=number))
         advice = self.advice["state"] or f"give it in a table [[{table}]]"
-        check_names("the scenario has the", where, [row], MissingObservationModelError, advice)
+        check_names("the scenario has the", where, [row], advice=advice)
         if observation.count != known[role]:
             both = {"has": known[role], "count": observation.count}
-            raise MissingObservationModelError(said("assets.sensors", where=where, role=role, **both))
+            raise MissionInputError(said("assets.sensors", where=where, role=role, **both))
         titles, own = [*observation.titles], names.get(role, [])
         if titles != own and sorted(titles) == sorted(own):
             raise MissionInputError(said("assets.titles", titles=titles, where=where, own=own))
@@ -229,8 +229,7 @@ class NamedStructure(AssetSource):
             design_hash=self.hash if believed else "",
         )  # fmt: skip
         rows = [("parameter", [calibration.parameter], known)]
-        error = MissingObservationModelError if believed else MissionInputError
-        check_names("the scenario calibrates the", self.where, rows, error, self.advice["parameter"])
+        check_names("the scenario calibrates the", self.where, rows, advice=self.advice["parameter"])
 
     def _check_ranges(self, parameters: Mapping[str, float]) -> None:
         """Refuse levels, controls and `parameters` outside the ranges; raises `MissionInputError`.
@@ -327,9 +326,8 @@ class StructureSource(NamedStructure, ReducedModelSource):
         Raises
         ------
         MissionInputError, FiniteElementError
-            A file cannot be read or is wrong, or the mesh does not hold what the structure names.
-        MissingObservationModelError
-            The scenario's states, controls, sensors or calibrated parameter are not those of the structure.
+            A file cannot be read or is wrong, or the mesh does not hold what the structure names; or the
+            scenario's states, controls, sensors or calibrated parameter are not those of the structure.
         """
         self.files()
         design, scenario = self.design, self._scenario
@@ -338,8 +336,7 @@ class StructureSource(NamedStructure, ReducedModelSource):
             ("state", scenario.state_names, [part.name for part in design.damage]),
             ("control input", scenario.control[0].values, [part.name for part in design.control]),
         )
-        advice, error = self.advice["state"], MissingObservationModelError
-        check_names("the scenario has the", self.where, rows, error, advice)
+        check_names("the scenario has the", self.where, rows, advice=self.advice["state"])
         self._check_observed()
         self._check_ranges({})
         self.check_model()

@@ -39,8 +39,11 @@ def watch(
 ) -> None:
     """Watch many real assets: observations in, a decision for each turn of each asset out, as a line of JSON.
 
-    Each asset has a folder DIR/GROUP/NAME, which is that of `uav-twin watch`. On a terminal a table shows the
-    worst assets in the place of decisions. Ctrl-C ends it in order; the command repeated goes on.
+    Each asset has a folder DIR/GROUP/NAME, which is that of `uav-twin watch`.
+
+    On a terminal a table shows the worst assets in the place of decisions.
+
+    Ctrl-C ends it in order; the command repeated goes on.
     """
     from twin_master.fleet.plan import load_fleet
     from twin_master.fleet.report import is_fleet, serve_fleet

@@ -18,7 +18,7 @@ from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
-from twin_master.errors import FleetError, RunFolderExistsError
+from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
 from twin_master.fleet.shard import Engine, Kit, Piece, ShardResult, flown, unflown, with_parameters
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store, sizes_of
@@ -101,7 +101,7 @@ def fly_fleet(
     FleetError
         An asset cannot fly: all such assets are in one list, and nothing was begun. Or the cluster cannot be
         used; what was flown is kept. Or the extra `fleet` is not installed.
-    RunFolderExistsError
+    RunFolderError
         The folder holds something else.
     NotResumableError
         The fleet there was begun with another version of the program.
@@ -158,12 +158,10 @@ def held_fleet(
 
     Raises
     ------
-    RunFolderExistsError
-        It holds something else.
+    RunFolderError
+        It holds something else, or another process holds it.
     NotResumableError
         It was begun by another version.
-    RunFolderError
-        Another process holds it.
     """
     config = {"kind": kind, "format": 1, "fleet": record}
     found = None if replace_old else folder_config(folder, kind)
@@ -175,7 +173,7 @@ def held_fleet(
         return
     if {key: found.get(key) for key in config} != json.loads(to_json(config)):
         otherwise = ", or give --replace" if kind == KIND else ""
-        raise RunFolderExistsError(said("fleet.another", folder=folder, otherwise=otherwise))
+        raise RunFolderError(said("fleet.another", folder=folder, otherwise=otherwise))
     check_versions(folder, found, record["seed"])
     ready()
     with held(lock_run_folder(folder)):
@@ -187,12 +185,12 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
 
     Raises
     ------
-    RunFolderExistsError
+    RunFolderError
         It holds no fleet.
     """
     found = folder_config(folder, *(kinds or (KIND,)))
     if found is None or "fleet" not in found:
-        raise RunFolderExistsError(
+        raise RunFolderError(
             f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."
         )
     return found

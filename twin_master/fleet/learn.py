@@ -70,7 +70,7 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
 
     Raises
     ------
-    RunFolderExistsError, FleetError
+    RunFolderError, FleetError
         There is no fleet, nothing has flown, or its transitions cannot be learnt.
     """
     folder, progress = Path(folder), progress or SilentProgress()
@@ -228,12 +228,13 @@ def _nodes(parts: list[_Seen]) -> _Nodes | None:
 
 def _noisier(model: GaussianSensorModel, factor: float, nodes: _Nodes | None = None) -> GaussianSensorModel:
     """Return a sensor model with a factor on its noise, and nodes in the place of its draws."""
-    return GaussianSensorModel(
+    return type(model)(
         model.value_per_draw if nodes is None else nodes.predicted,
         model.standard_deviation * factor,
         average="inside" if model.averages_inside else "outside",
         model_error=model.model_error,
         interval=model.interval,
+        **model.beside,
     )
 
 
@@ -296,7 +297,7 @@ def learn_from_fleet(
 
     Raises
     ------
-    RunFolderExistsError, FleetError
+    RunFolderError, FleetError
         There is no fleet, nothing has flown, or its transitions cannot be learnt.
     """
     record = learn_fleet(folder, progress=progress)

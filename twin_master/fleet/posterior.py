@@ -200,7 +200,7 @@ def shared(grids: Sequence[Grid]) -> Shared:
     grids : sequence of Grid
         Log likelihood of each group, of the same K = 1 or 2 probabilities.
     """
-    from scipy.special import betaln
+    from scipy.special import betaln, softmax
 
     count = len(grids[0].axes)
     axes = [tuple(np.linspace(axis[0], axis[-1], FINE) for axis in grid.axes) for grid in grids]
@@ -220,8 +220,7 @@ def shared(grids: Sequence[Grid]) -> Shared:
     priors = [[*(density(x) for x in own), np.ones((1, 1))][:2] for own in axes]
     evidence = [first @ seen @ second.T for (first, second), seen in zip(priors, likelihoods, strict=True)]
     total = np.sum([np.log(np.maximum(one, 1e-300)) for one in evidence], axis=0)
-    weight = np.exp(total - total.max())
-    weight /= weight.sum()
+    weight = softmax(total)
     groups = []
     for own, (first, second), seen, told in zip(axes, priors, likelihoods, evidence, strict=True):
         joint = seen * (first.T @ (weight / np.maximum(told, 1e-300)) @ second)

@@ -102,7 +102,7 @@ def open_fleet(folder: Path) -> "dict[str, xr.Dataset]":
 
     Raises
     ------
-    RunFolderExistsError, FleetError
+    RunFolderError, FleetError
         The folder holds no fleet.
     """
     names = [group["name"] for group in fleet_config(folder)["fleet"]["groups"]]

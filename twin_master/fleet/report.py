@@ -68,7 +68,7 @@ def write_fleet_report(folder: Path | str) -> Path:
 
     Raises
     ------
-    RunFolderExistsError
+    RunFolderError
         The folder holds no fleet.
     FileNotWrittenError
         The disk is full or the folder cannot be written.
@@ -81,7 +81,7 @@ def fleet_page(folder: Path, most: int) -> str:
 
     Raises
     ------
-    RunFolderExistsError
+    RunFolderError
         The folder holds no fleet.
     FleetError
         It is damaged.
@@ -277,7 +277,9 @@ def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
         style.band(axes, steps, low, top, style.PRESENT)
         style.band(axes, steps, quarter, three, style.PRESENT)
         axes.plot(steps, middle, color=style.PRESENT, label="median of the filtered means")
-        axes.plot(steps, np.median(true, axis=0), **style.TRUTH_LINE, label="median of the true states")
+        known = ~np.isnan(true).all(axis=0)  # of some, where assets have ended
+        median = np.nanmedian(true[:, known], axis=0)
+        axes.plot(steps[known], median, **style.TRUTH_LINE, label="median of the true states")
         axes.set_xlabel(scenario.mission.step_name)
         axes.set_ylabel(f"{factor.title} ({factor.unit})")
         style.panel_label(axes, "abcdefgh"[number % 8])

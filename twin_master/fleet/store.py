@@ -44,7 +44,7 @@ def sizes_of(scenario: Scenario) -> dict[str, int]:
     """Return the lengths of the dimensions."""
     return {
         "turn": scenario.mission.steps,
-        "sensor": scenario.observation.count,
+        "sensor": scenario.row_width,
         "factor": len(scenario.state),
         "notice_kind": len(NOTICE_KINDS),
         "level": int(np.prod([len(factor.levels) for factor in scenario.state])),
@@ -73,7 +73,7 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
     found: dict[str, Any] = {
         "status": np.where(failed, FAILED, np.where(short, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
-        "observed": flights.observed,
+        "observed": flights.row,
         "control_index": flights.control_index,
         "state": flights.state,
         "mean": mean,

@@ -145,7 +145,7 @@ class FleetWatch:
     ------
     FleetError, MissionInputError
         A group is flown and not watched, or has no recording; an address is wrong.
-    RunFolderExistsError, NotResumableError
+    RunFolderError, NotResumableError
         The folder holds something else, or was begun with another version.
 
     Attributes

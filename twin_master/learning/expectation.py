@@ -54,8 +54,8 @@ def expected_of(
     lower = upper = np.full_like(mean, np.nan)
     if quantiles:
         lower, upper = np.moveaxis(sensor_model.quantiles(joint, _LEVELS), -2, 0)
-    reward, noise = rewards.expectation(joint, observed), sensor_model.noise(joint)
-    return Expected(mean, deviation, lower, upper, noise, reward.mean, reward.standard_deviation)
+    noise = sensor_model.noise(joint)
+    return Expected(mean, deviation, lower, upper, noise, *rewards.expectation(joint, observed))
 
 
 @dataclass(frozen=True)
@@ -108,10 +108,10 @@ class LearntExpectation:
         seen : (G,) or None
             What the sensors say, SI.
         """
-        model, priors = self.learning.sensor_model, self.learning.priors
+        model, (name, values) = self.learning.sensor_model, self.learning.draws or ("", ())
         share = model.draw_weight
-        if (parameter := learnt.get(priors.parameter or "")) is not None:
-            draws = np.asarray(priors.draws, dtype=np.float64)
+        if (parameter := learnt.get(name)) is not None:
+            draws = np.asarray(values, dtype=np.float64)
             order = np.argsort(draws)
             at = parameter.mean + np.array([-1.0, 1.0]) * parameter.standard_deviation
             near = np.eye(len(draws))[:, order]
@@ -187,7 +187,7 @@ class LearntExpectation:
         rewards = self.rewards.expectation_of(weight, hypotheses.draw, controls, shown, shown_variance, seen)
         return Expected(
             mean + center, deviation, quantiles[:, 0] + center, quantiles[:, 1] + center, noise,
-            rewards.mean, rewards.standard_deviation,
+            *rewards,
         )  # fmt: skip
 
 

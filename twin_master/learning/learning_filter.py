@@ -23,6 +23,7 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
+from twin_master.scenario.tables import Learning
 
 INTERVAL = (0.05, 0.95)
 _POINTS = 801
@@ -129,32 +130,6 @@ _NORMAL = 1.6448536269514722
 """Half-width of the central 90 % of a normal distribution, in standard deviations."""
 
 
-@dataclass(frozen=True)
-class LearntPriors:
-    """What is learnt, with its prior.
-
-    Attributes
-    ----------
-    parameter : str or None
-        Name of the parameter of the draws; None averages over the draws anew in each turn.
-    draws : (E,) or None
-        Its values, for the posterior; the draws of the sensor model in their order.
-    noise_degrees : float
-        Degrees of freedom of the noise scale; 0 takes the assumed noise for known.
-    gain, offset : float or (G,)
-        Prior standard deviation of gain error [1] and offset [SI] of each sensor; 0 is not learnt.
-    sensor_unit : str
-        Unit of the offset.
-    """
-
-    parameter: str | None = None
-    draws: ArrayLike | None = None
-    noise_degrees: float = 0.0
-    gain: ArrayLike = 0.0
-    offset: ArrayLike = 0.0
-    sensor_unit: str = "1"
-
-
 class LearningFilter:
     """Exact filter over states and static hypotheses, with a conjugate regression for each gauge.
 
@@ -167,7 +142,11 @@ class LearningFilter:
         S states, U controls; its transitions are what the twin predicts and plans with.
     sensor_model : GaussianSensorModel
         Predictions (E, S, U, G), weights of the draws, and the noise that is assumed.
-    priors : LearntPriors
+    settings : Learning
+        The priors; of the transitions it is what is given here.
+    draws : (str, (E,)), optional
+        Name of the parameter of the draws, and its values in the order of the sensor model; without it the
+        draws are averaged anew in each turn.
     transitions : mapping of float to TransitionModel, optional
         Those of each factor on the probabilities to leave a state, equally probable at first; those of the
         model if left out.
@@ -180,26 +159,28 @@ class LearningFilter:
         self,
         model: GraphicalModel,
         sensor_model: GaussianSensorModel,
-        priors: LearntPriors,
+        settings: Learning,
+        draws: tuple[str, ArrayLike] | None = None,
         transitions: Mapping[float, TransitionModel] | None = None,
         name: str = "twin",
+        sensor_unit: str = "1",
     ) -> None:
         moves = transitions or {1.0: model.transition}
         self.model, self.sensor_model, self._name = model, sensor_model, name
-        self.priors, self._factors = priors, np.array([*moves])
-        draws, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
+        self.draws, self._factors, self._unit = draws, np.array([*moves]), sensor_unit
+        count, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
         blocks = zip(*(move.blocks for move in moves.values()), strict=True)
         self._transition = TransitionModel(tuple(map(np.concatenate, blocks)))  # one factor after the other
-        self._draw: Index = np.tile(np.arange(draws), factors)
-        self._first_control: Index = np.repeat(np.arange(factors), draws) * len(model.controls)
+        self._draw: Index = np.tile(np.arange(count), factors)
+        self._first_control: Index = np.repeat(np.arange(factors), count) * len(model.controls)
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(np.tile(sensor_model.draw_weight / factors, factors))
         self._inverse = 1.0 / sensor_model.independent_standard_deviation
         offset, gain = (
             np.broadcast_to(np.asarray(prior, np.float64), (sensors,)).copy()
-            for prior in (priors.offset, priors.gain)
+            for prior in (settings.gauge_offset, settings.gauge_gain)
         )
-        self._gauges = GaugeRegression(offset, gain, priors.noise_degrees)
+        self._gauges = GaugeRegression(offset, gain, settings.noise_degrees if settings.noise else 0.0)
 
     @property
     def prior(self) -> Mapping[str, Learnt]:
@@ -252,7 +233,7 @@ class LearningFilter:
             return forecast, np.zeros((hypotheses, sensors, 6)), np.zeros(sensors)
         log_before = before.arrays["log_belief"]
         forecast = log_forecast(self._transition, self._first_control + before.control_index, log_before)
-        if self.priors.parameter is None:
+        if self.draws is None:
             forecast = self._averaged_anew(forecast)
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
@@ -285,7 +266,7 @@ class LearningFilter:
         if not len(carried):
             return result
         rows = np.array([turn.arrays["log_belief"] for turn in carried])  # (n, K, S)
-        if self.priors.parameter is None and len(self._draw) > 1:
+        if self.draws is None and len(self._draw) > 1:
             rows = np.stack([self._averaged_anew(row) for row in rows])
         weight = np.exp(rows[-1]).sum(axis=1)
         held = np.flatnonzero(weight > 0.0)
@@ -308,9 +289,10 @@ class LearningFilter:
         weight = filtered.sum(axis=1)  # of each hypothesis
         result: dict[str, Learnt] = {}
         factors = self._factors
-        if self.priors.parameter is not None and self.priors.draws is not None:
+        if self.draws is not None:
+            name, values = self.draws
             own, prior = weight.reshape(len(factors), -1).sum(axis=0), self.sensor_model.draw_weight
-            result[self.priors.parameter] = posterior_of_draws(self.priors.draws, prior, own)
+            result[name] = posterior_of_draws(values, prior, own)
         if len(factors) > 1:
             own = weight.reshape(len(factors), -1).sum(axis=1)
             prior = np.full(len(factors), 1.0 / len(factors))
@@ -324,15 +306,16 @@ class LearningFilter:
         result: dict[str, Learnt] = {}
         scale2 = self._gauges.scale2(fitted, count)
         if degrees > 0.0:
-            shape, left = 0.5 * (degrees + count), weight @ (degrees + fitted[..., 5])
-            # The square is inverse gamma (shape, left / 2): its quantiles, and the moments of its root.
-            low, high = (np.sqrt(0.5 * left / gammaincinv(shape, level)) for level in INTERVAL[::-1])
-            mean = np.sqrt(0.5 * left) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
-            deviation = np.sqrt(np.maximum(0.5 * left / (shape - 1.0) - mean**2, 0.0))
+            shape, left = 0.5 * (degrees + count), 0.5 * (degrees + fitted[..., 5])
+            # The square is inverse gamma (shape, left) given a hypothesis: the moments of its root over all
+            # of them, and its quantiles as if they were one.
+            low, high = (np.sqrt(weight @ left / gammaincinv(shape, level)) for level in INTERVAL[::-1])
+            mean = weight @ np.sqrt(left) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
+            deviation = np.sqrt(np.maximum(weight @ left / (shape - 1.0) - mean**2, 0.0))
             for g, figures in enumerate(np.column_stack([mean, deviation, low, high]).tolist(), 1):
                 result[f"noise_scale[{g}]"] = Learnt(*figures)
         for column, prior, name, unit in (
-            (0, self._gauges.offset, "gauge_offset", self.priors.sensor_unit),
+            (0, self._gauges.offset, "gauge_offset", self._unit),
             (1, self._gauges.gain, "gauge_gain", "1"),
         ):
             mean = weight @ fitted[..., column]

@@ -303,7 +303,7 @@ def fly(
 
     Raises
     ------
-    MissionError, ImpossibleObservation, FmuError, FiniteElementError
+    MissionInputError, ImpossibleObservation, FmuError, FiniteElementError
         The mission cannot be flown on.
     """
     history = history or History(twin, scenario.observation.count)

@@ -4,7 +4,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.learning.words import Words
 from twin_master.mission.planning import planned
@@ -52,25 +52,68 @@ class Knowledge:
         S states, U controls.
     draws : ParameterDraws
         The calibrated parameter.
-    sensor_model : GaussianSensorModel
-        Predicted observations (E, S, U, G) and the assumed noise.
-    rewards : RewardModel
-        Rewards by state and control.
-    plan : PlannedPolicy
-        Value iteration, or the policy that was given.
+    predicted : (E, S, U, G)
+        Observations that are expected for each of its E draws, SI.
+    policy : (S, U), BeliefPolicy or None
+        To fly instead of planning; p(U | D), row-stochastic.
+    true : (E, S, U, G) or None
+        What is there at the sensors, for limits and rewards, where that is not what they show, SI.
+
+    Raises
+    ------
+    InvalidModelError, PlanningError
+        What follows is asked for, and shapes do not fit the scenario, or there is no plan.
     """
 
     scenario: Scenario
     model: GraphicalModel
     draws: ParameterDraws
-    sensor_model: GaussianSensorModel
-    rewards: RewardModel
-    plan: PlannedPolicy
+    predicted: Float
+    policy: Float | BeliefPolicy | None = None
+    true: Float | None = None
 
     def __repr__(self) -> str:
         return brief(
             self, mission=self.scenario.mission.name, model=self.model, sensor_model=self.sensor_model
         )
+
+    @cached_property
+    def sensor_model(self) -> GaussianSensorModel:
+        """Predicted observations and the assumed noise."""
+        section = self.scenario.observation
+        kind: Callable[..., GaussianSensorModel] = GaussianSensorModel
+        if section.modes is not None:
+            kind = IdentifiedSensorModel
+        elif self.scenario.readings:
+            kind = partial(InspectedSensorModel, **_readings(self.scenario, self.model))
+        within = self.model.states.within_interval
+        return kind(
+            self.predicted,
+            section.standard_deviation,
+            average=section.average_over_draws,
+            model_error=section.model_error,
+            interval=within(self.predicted.mean(axis=0)) if section.between_levels else None,
+        )
+
+    @cached_property
+    def rewards(self) -> RewardModel:
+        """Rewards by state and control."""
+        section, scenario = self.scenario.rewards, self.scenario
+        norm, chosen = section.normalise_error_by, section.health_sensors
+        return RewardModel(
+            self.sensor_model,
+            limit=section.health_limit,
+            control_reward=tuple(section.control[name] for name in scenario.control_names),
+            error_scale=section.error_scale,
+            control_normaliser=None if norm is None else tuple(c.values[norm] for c in scenario.control),
+            health_sensors=None if chosen == "all" else tuple(number - 1 for number in chosen),
+            true_per_draw=self.true,
+        )
+
+    @cached_property
+    def plan(self) -> PlannedPolicy:
+        """Value iteration, what the scenario asks for, or the policy that was given."""
+        return planned(self.scenario, self.model, self.sensor_model, self.rewards, self.policy)
 
     @property
     def planning_reward(self) -> Float:
@@ -91,17 +134,13 @@ class Knowledge:
         if learning is None:
             return None
         units = set(scenario.observation.sensor_units)
-        priors = LearntPriors(
-            parameter=scenario.calibration.parameter if learning.parameter else None,
-            draws=self.draws.values,
-            noise_degrees=learning.noise_degrees if learning.noise else 0.0,
-            gain=learning.gauge_gain,
-            offset=learning.gauge_offset,
-            sensor_unit=units.pop() if len(units) == 1 else "",
-        )
+        draws = (scenario.calibration.parameter, self.draws.values) if learning.parameter else None
         factors = learning.transition_factors
         moves = {factor: build_graphical_model(scenario, factor).transition for factor in factors}
-        return LearningFilter(self.model, self.sensor_model, priors, moves, scenario.mission.name)
+        return LearningFilter(
+            self.model, self.sensor_model, learning, draws, moves, scenario.mission.name,
+            sensor_unit=units.pop() if len(units) == 1 else "",
+        )  # fmt: skip
 
     @cached_property
     def estimator(self) -> Estimator:
@@ -222,53 +261,7 @@ def prepare_knowledge(
         ("truth.noise.standard_deviation", scenario.truth.noise.standard_deviation),
     ):
         check_noise(key, deviation, predicted, section.sensor_units)
-    return knowledge_of(scenario, model, draws, predicted, policy, true)
-
-
-def knowledge_of(
-    scenario: Scenario,
-    model: GraphicalModel,
-    draws: ParameterDraws,
-    predicted: Float,
-    policy: Float | BeliefPolicy | None = None,
-    true: Float | None = None,
-) -> Knowledge:
-    """Return what a twin knows that expects these observations (E, S, U, G), SI.
-
-    Parameters
-    ----------
-    scenario, policy
-        As of `prepare_knowledge`.
-    model : GraphicalModel
-        Of the scenario.
-    draws : ParameterDraws
-        The E draws that the observations are predicted for.
-    predicted : (E, S, U, G)
-        SI.
-    true : (E, S, U, G), optional
-        What is there at the sensors, for limits and rewards, where that is not what they show, SI.
-
-    Raises
-    ------
-    InvalidModelError
-        The shapes do not fit the scenario.
-    """
-    section = scenario.observation
-    kind = GaussianSensorModel if section.modes is None else IdentifiedSensorModel
-    within = model.states.within_interval if section.between_levels else None
-    sensor_model = (
-        partial(InspectedSensorModel, **_readings(scenario, model)) if scenario.readings else kind
-    )(
-        predicted,
-        section.standard_deviation,
-        average=section.average_over_draws,
-        model_error=section.model_error,
-        interval=within(predicted.mean(axis=0)) if within else None,
-    )
-    rewards = reward_model(scenario, sensor_model, true)
-    return Knowledge(
-        scenario, model, draws, sensor_model, rewards, planned(scenario, model, sensor_model, rewards, policy)
-    )
+    return Knowledge(scenario, model, draws, predicted, policy, true)
 
 
 def _readings(scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
@@ -325,23 +318,6 @@ def prepared_alone(scenario: Scenario, source: AssetSource, progress: Progress |
         return prepare_knowledge(scenario, source, scenario.mission.seed)
 
 
-def reward_model(scenario: Scenario, sensor_model: GaussianSensorModel, true: Float | None) -> RewardModel:
-    """Return the rewards of a scenario; what is there at the sensors as of `knowledge_of`."""
-    section = scenario.rewards
-    norm = section.normalise_error_by
-    return RewardModel(
-        sensor_model,
-        limit=section.health_limit,
-        control_reward=tuple(section.control[name] for name in scenario.control_names),
-        error_scale=section.error_scale,
-        control_normaliser=None if norm is None else tuple(c.values[norm] for c in scenario.control),
-        health_sensors=None
-        if section.health_sensors == "all"
-        else tuple(number - 1 for number in section.health_sensors),
-        true_per_draw=true,
-    )
-
-
 KNOWLEDGE_NAME, CALIBRATION_NAME = "twin.npz", "calibration.json"
 
 
@@ -357,9 +333,9 @@ def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    content, true = io.BytesIO(), knowledge.rewards.true_per_draw
+    content, true = io.BytesIO(), knowledge.true
     arrays: dict[str, Any] = {
-        "predicted": knowledge.sensor_model.value_per_draw,
+        "predicted": knowledge.predicted,
         "draws": knowledge.draws.values,
         "policy": knowledge.plan.policy,
     }
@@ -410,6 +386,8 @@ def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:
             calibration.parameter, draws, float(draws.mean()), float(draws.std()), calibration.source
         )
         model = build_graphical_model(scenario)
-        return knowledge_of(scenario, model, parameter, predicted, on_belief or policy, true)
+        found = Knowledge(scenario, model, parameter, predicted, on_belief or policy, true)
+        _ = found.plan  # what does not fit is said now
+        return found
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise RunFolderError(said("mission.knowledge", path=path, error=error)) from error

@@ -20,7 +20,7 @@ from twin_master.seeds import generator
 from twin_master.sentences import said
 
 SAMPLES = 300
-"""Readings that are drawn for each control."""
+"""Readings that are drawn for each control, about: as many in each state, or one in each of so many."""
 _GAIN = 1e-9
 """Bits that an exchange of two sensors gains at least."""
 
@@ -74,7 +74,8 @@ def drawn_readings(knowledge: Knowledge) -> tuple[Readings, ...]:
     found = []
     for control in range(len(knowledge.scenario.control) - len(knowledge.scenario.action)):
         deviation = sensors.independent_standard_deviation[:, control]
-        state = np.arange(SAMPLES) % states
+        some = np.arange(states) if states <= SAMPLES else draws.permutation(states)[:SAMPLES]
+        state = np.tile(some, round(SAMPLES / len(some)))
         shown = sensors.sampled(state, control, draws)[:, : sensors.sensor_count]
         # The draws move all sensors along one direction, as far as they depend on the parameter linearly.
         root = np.sqrt(sensors.draw_weight)[:, None, None] * spread[:, :, control]

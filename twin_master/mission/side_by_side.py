@@ -34,8 +34,8 @@ class Flights:
 
     Attributes
     ----------
-    observed : (B, T, G)
-        What the sensors said, SI; NaN where lost.
+    row : (B, T, G + I)
+        What came, as in `History`, SI; NaN where nothing did.
     control_index : (B, T)
         Control in force in each turn.
     state : (B, T, F)
@@ -52,7 +52,7 @@ class Flights:
         What each twin told its operator, each notice with its turn.
     """
 
-    observed: Float
+    row: Float
     control_index: Index
     state: Float
     filtered: Float
@@ -65,9 +65,9 @@ class Flights:
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
         """Return B missions before their first turn."""
         steps, size = knowledge.scenario.mission.steps, knowledge.model.states.size
-        sensors, factors = knowledge.scenario.observation.count, len(knowledge.scenario.state)
+        width, factors = knowledge.scenario.row_width, len(knowledge.scenario.state)
         return cls(
-            observed=np.full((count, steps, sensors), np.nan),
+            row=np.full((count, steps, width), np.nan),
             control_index=np.full((count, steps), -1, dtype=np.int64),
             state=np.full((count, steps, factors), np.nan),
             filtered=np.full((count, steps, size), np.nan),
@@ -80,7 +80,7 @@ class Flights:
     def put(self, twin: int, history: History) -> None:
         """Take in the turns of a twin."""
         turns = len(history.turns)
-        names = ["observed", "control_index", "filtered", "log_evidence"] if turns else []
+        names = ["row", "control_index", "filtered", "log_evidence"] if turns else []
         for name in names + ["state"] * history.simulated:
             getattr(self, name)[twin, :turns] = getattr(history, name)
         self.ended[twin], self.notices[twin] = history.ended, history.notices
@@ -185,7 +185,7 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
         # Of a failed twin: anything that can be gone on with.
         now.filtered[impossible], now.log_filtered[impossible] = model.prior, model.log_prior
         for array, row in (
-            (flights.observed, observed[:, : scenario.observation.count]),
+            (flights.row, observed),
             (flights.control_index, control),
             (flights.state, state),
             (flights.filtered, now.filtered),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fmu_asset.errors import FmuEndedError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, AssetReading
-from twin_master.errors import AssetOutputError, TwinMasterError
+from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.mission.turns import Happened, History, Reading
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin
@@ -161,17 +161,17 @@ def checked_values(scenario: Scenario, reading: AssetReading, step: int, control
 
     Raises
     ------
-    AssetOutputError
+    MissionInputError
         It has another number of values, or one that is not finite.
     """
     values = np.asarray(reading.values, dtype=np.float64)
     if values.shape != (scenario.observation.count,):
         came, wanted = str(values.shape), scenario.observation
-        raise AssetOutputError(said("mission.width", step=step, wanted=wanted, came=came))
+        raise MissionInputError(said("mission.width", step=step, wanted=wanted, came=came))
     if not np.all(np.isfinite(values)):
         bad = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
         what = f"`{scenario.observation.role}` {bad} under the control `{control}`"
-        raise AssetOutputError(said("mission.no_number", step=step, what=what))
+        raise MissionInputError(said("mission.no_number", step=step, what=what))
     return values
 
 
@@ -235,7 +235,7 @@ class Plant:
 
         Raises
         ------
-        AssetOutputError
+        MissionInputError
             The asset returned something that is no observation.
         """
         control = self._scenario.control[control_index]
@@ -257,7 +257,7 @@ class Plant:
     def _told(self, reading: AssetReading) -> Float:
         """Return the true state that an asset with damage of its own tells."""
         if reading.inner is None:
-            raise AssetOutputError(said("mission.no_damage", step=self.step))
+            raise MissionInputError(said("mission.no_damage", step=self.step))
         return np.array([reading.inner.state[name] for name in self._scenario.state_names])
 
     def save_state(self) -> bytes:

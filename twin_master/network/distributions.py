@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
-from twin_master.errors import InvalidDistributionError, InvalidModelError, TwinMasterError
+from twin_master.errors import InvalidModelError, TwinMasterError
 from twin_master.sentences import said
 
 ROW_SUM_TOLERANCE = 1e-12
@@ -25,12 +25,12 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
 
     Raises
     ------
-    InvalidDistributionError
+    InvalidModelError
         With the index of the first row that is no distribution.
     """
     matrix = np.array(rows, dtype=np.float64, order="C")
     if matrix.ndim == 0 or matrix.size == 0:
-        raise InvalidDistributionError(said("network.no_rows", name=name, shape=matrix.shape))
+        raise InvalidModelError(said("network.no_rows", name=name, shape=matrix.shape))
     for bad, reason in (
         (~np.isfinite(matrix).all(axis=-1), "holds a value that is not finite"),
         ((matrix < 0.0).any(axis=-1), "holds a negative probability"),
@@ -41,7 +41,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
             row = matrix[where]
             label = f"row {where[0] if len(where) == 1 else where}" if where else "the distribution"
             sizes, what = (row.sum(), row.min()), f"{name}: {label} {reason}"
-            raise InvalidDistributionError(said("network.no_distribution", what=what, sizes=sizes))
+            raise InvalidModelError(said("network.no_distribution", what=what, sizes=sizes))
     matrix.setflags(write=False)
     return matrix
 
@@ -51,11 +51,11 @@ def distribution(probabilities: ArrayLike, *, size: int, name: str) -> Float:
 
     Raises
     ------
-    InvalidDistributionError
+    InvalidModelError
         If it has another shape, or does not pass `stochastic_matrix`.
     """
     vector = stochastic_matrix(probabilities, name=name)
-    expect_shape(name, vector.shape, size, error=InvalidDistributionError)
+    expect_shape(name, vector.shape, size)
     return vector
 
 

@@ -210,7 +210,7 @@ class GraphicalModel:
 
         Raises
         ------
-        InvalidModelError, InvalidDistributionError
+        InvalidModelError
             If a factor, a level or a row of a table is no such thing, or a table of a factor is missing.
         """
         states = StateSpace(tuple(Factor(name, tuple(values)) for name, values in levels.items()))
@@ -239,7 +239,7 @@ class GraphicalModel:
 
         Raises
         ------
-        InvalidDistributionError, InvalidModelError
+        InvalidModelError
             If a row is no distribution, or the shape is another one.
         """
         policy = stochastic_matrix(rows, name="policy[state]")

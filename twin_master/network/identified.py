@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import logsumexp
 
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidObservationError
@@ -37,6 +38,20 @@ class IdentifiedSensorModel(GaussianSensorModel):
         InvalidObservationError
             The length is another one, a value is infinite, or the covariance is none.
         """
+        return np.asarray(self.log_likelihood_sequence(np.asarray(observation)[None], [control_index])[0])
+
+    def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
+        """Return log p(o_t | D_t, u_t) for a sequence of such rows: (T, S)."""
+        each = self.log_density_of_draws(observations, control_index)
+        return np.asarray(logsumexp(each, axis=2, b=self.draw_weight))
+
+    def log_density_of_draws(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
+        """Return log p(o_t | D_t, u_t, e) of such rows for each draw e: (T, S, E)."""
+        rows = zip(np.asarray(observations), np.asarray(control_index), strict=True)
+        shape = self.state_count, self.draw_count
+        return np.array([self._of_draws(row, control) for row, control in rows]).reshape(-1, *shape)
+
+    def _of_draws(self, observation: Float, control_index: int) -> Float:
         row, count = np.array(observation, dtype=np.float64), self.sensor_count
         values = self.checked(row[:count])
         covariance = np.zeros((count, count))
@@ -47,7 +62,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
         covariance += np.tril(covariance, -1).T
         seen = np.flatnonzero(~np.isnan(values))
         if not seen.size:
-            return np.zeros(self.state_count)
+            return np.zeros((self.state_count, self.draw_count))
         total = np.array(
             np.broadcast_to(covariance[np.ix_(seen, seen)], (self.state_count, seen.size, seen.size))
         )
@@ -62,10 +77,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
         residual = values[seen] - self.value_per_draw[:, :, control_index, seen]  # (E, S, G)
         white = np.linalg.solve(factor, residual.transpose(1, 2, 0))  # (S, G, E)
         scale = np.log(np.einsum("sgg->sg", factor)).sum(axis=1) + seen.size * LOG_ROOT_TWO_PI
-        with np.errstate(divide="ignore"):
-            exponent = np.log(self.draw_weight) - 0.5 * np.sum(white**2, axis=1)
-        largest = exponent.max(axis=1)
-        return np.asarray(largest + np.log(np.exp(exponent - largest[:, None]).sum(axis=1)) - scale)
+        return np.asarray(-0.5 * np.sum(white**2, axis=1) - scale[:, None])
 
 
 class InspectedSensorModel(GaussianSensorModel):
@@ -91,6 +103,11 @@ class InspectedSensorModel(GaussianSensorModel):
     ) -> None:
         super().__init__(*args, **keywords)
         self.reading, self.reading_deviation, self.asked_by = reading, reading_deviation, asked_by
+
+    @property
+    def beside(self) -> dict[str, Any]:
+        """Keywords beside those of `GaussianSensorModel`."""
+        return {name: getattr(self, name) for name in ("reading", "reading_deviation", "asked_by")}
 
     def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
         """Return one row drawn in each of N states (N,) under a control: (N, G + I), SI."""

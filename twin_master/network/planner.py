@@ -227,7 +227,7 @@ def value_iteration(
     ------
     PlanningError
         If shapes do not fit, a reward is not finite, the discount is outside [0, 1), or it did not converge.
-    InvalidDistributionError
+    InvalidModelError
         If a row of the transition does not sum to one.
     """
     if not isinstance(transition, TransitionModel):

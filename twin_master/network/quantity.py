@@ -65,7 +65,7 @@ class QuantityModel:
 
     Raises
     ------
-    InvalidModelError, InvalidDistributionError
+    InvalidModelError
         If the array has another rank, is empty or not finite, or the weights are no distribution.
     """
 

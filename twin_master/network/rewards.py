@@ -41,18 +41,13 @@ def _error_moments(observation: Float, shown: Float, variance: Float, scale: Flo
     return -(folded * unit).sum(axis=-1), (left * unit**2).sum(axis=-1)
 
 
-@dataclass(frozen=True)
-class RewardExpectation:
-    """Rewards under a belief.
-
-    Attributes
-    ----------
-    mean, standard_deviation : (..., 3)
-        Of the rewards in the order of `REWARD_NAMES`. The error reward is NaN where nothing was observed.
-    """
-
-    mean: Float
-    standard_deviation: Float
+def _mixed(weight: Float, mean: Float, within: Float) -> tuple[Float, Float]:
+    """Return mean and variance (B, R) of mixtures with weights (B, ...) of parts with moments (R, ...)."""
+    flat, means, variances = (part.reshape(len(part), -1) for part in (weight, mean, within))
+    whole, spread = flat @ means.T, flat @ variances.T
+    for row, own, center in zip(spread, flat, whole, strict=True):
+        row += (means - center[:, None]) ** 2 @ own
+    return whole, spread
 
 
 @dataclass(frozen=True)
@@ -116,8 +111,10 @@ class RewardModel:
         worth = np.multiply(control_weight, self.control_reward)
         return np.asarray(health_weight * self._health_moments[0] + worth)
 
-    def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> RewardExpectation:
-        """Return mean and standard deviation of each reward.
+    def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> tuple[Float, Float]:
+        """Return mean and standard deviation of each reward (..., 3), in the order of `REWARD_NAMES`.
+
+        The error reward is NaN where nothing was observed.
 
         Parameters
         ----------
@@ -135,17 +132,12 @@ class RewardModel:
         joint = quantity.weights(joint)
         lead = joint.shape[:-2]
         flat = joint.reshape(-1, quantity.state_count, quantity.control_count)
-        mean = np.full((len(flat), 3), np.nan)
-        variance = np.full((len(flat), 3), np.nan)
         health, health_variance = self._health_moments
-        mean[:, 0] = np.einsum("bsu,su->b", flat, health)
-        spread = health - mean[:, 0, None, None]  # (B, S, U), the largest array of a long mission
-        spread **= 2
-        spread += health_variance
-        variance[:, 0] = np.einsum("bsu,bsu->b", flat, spread)
-        control = flat.sum(axis=1)
-        mean[:, 1] = control @ self.control_reward
-        variance[:, 1] = np.einsum("bu,bu->b", control, (self.control_reward - mean[:, 1, None]) ** 2)
+        tables = np.stack([health, np.broadcast_to(self.control_reward, health.shape)])
+        within = np.stack([health_variance, np.zeros_like(health)])
+        mean, variance = (
+            np.pad(own, ((0, 0), (0, 1)), constant_values=np.nan) for own in _mixed(flat, tables, within)
+        )
         if observation is not None:
             observation = np.asarray(observation, dtype=np.float64)
             for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
@@ -156,7 +148,7 @@ class RewardModel:
                     share = quantity.draw_weight[:, None] * flat[row, state, chosen]
                     mean[row, 2] = (share * error).sum()
                     variance[row, 2] = (share * (error - mean[row, 2]) ** 2).sum()
-        return RewardExpectation(mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3))
+        return mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3)
 
     def expectation_of(
         self,
@@ -166,7 +158,7 @@ class RewardModel:
         shown: Float,
         variance: Float,
         observation: Float | None = None,
-    ) -> RewardExpectation:
+    ) -> tuple[Float, Float]:
         """Return mean and standard deviation (B, 3) under beliefs over hypotheses, states and controls.
 
         Parameters
@@ -187,9 +179,5 @@ class RewardModel:
         mean[0], mean[1] = self.health_per_draw[draw][:, :, controls], self.control_reward[controls]
         if observation is not None and not np.isnan(observation).all():
             mean[2], within[2] = _error_moments(observation, shown, variance, self._error_scale[controls])
-        whole = np.einsum("bksu,rksu->br", weight, mean)
-        spread = np.einsum("bksu,rksu->br", weight, within)
-        for b in range(len(weight)):
-            squared = (mean - whole[b, :, None, None, None]) ** 2
-            spread[b] += np.einsum("ksu,rksu->r", weight[b], squared)
-        return RewardExpectation(whole, np.sqrt(spread))
+        whole, spread = _mixed(weight, mean, within)
+        return whole, np.sqrt(spread)

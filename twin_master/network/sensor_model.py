@@ -78,7 +78,7 @@ class GaussianSensorModel(QuantityModel):
 
     Raises
     ------
-    InvalidModelError, InvalidDistributionError
+    InvalidModelError
         If shapes do not fit, a value is not finite, a standard deviation not positive or an error negative.
     """
 
@@ -136,6 +136,11 @@ class GaussianSensorModel(QuantityModel):
         part, self._function = separated(np.moveaxis(beside, 0, -1).reshape(-1, self.draw_count), size)
         self._part = part.reshape(*shape, len(self._function))
         self._shared = dict[int, tuple[Any, ...]]()  # by control, of the sensors that were there last
+
+    @property
+    def beside(self) -> dict[str, Any]:
+        """Keywords that a kind of sensors has beside those of all."""
+        return {}
 
     def checked(self, observation: ArrayLike) -> Float:
         """Return observations (..., G) in which NaN stands for a lost sensor.
@@ -214,7 +219,8 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
-        return self._densities(observations, control_index, self.draw_count)
+        values, told = self.apart(observations)
+        return self._densities(values, control_index, self.draw_count) + told[..., None]
 
     def _densities(self, observations: ArrayLike, control_index: ArrayLike, draws: int) -> Float:
         """Return log densities (T, S, E) of each draw, or of their average where `draws` is one."""

@@ -1,11 +1,11 @@
 """Transitions between states: one table, or the product of tables of factors that move independently.
 
 A table of S states has S² entries, the tables of its factors together a few hundred. What is small is kept as
-one table, whose loops are the shortest; what is not, as blocks of neighbouring factors, each applied along
-its own axis.
+one table, whose loops are the shortest; what is not, as the tables of the factors, each applied along its own
+axis.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from math import prod
@@ -22,8 +22,6 @@ from twin_master.sentences import said
 
 JOINT_NON_ZEROS = 512
 """Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
-JOINT_LEVELS = 64
-"""Joint levels of neighbours up to which they may share a table, which is multiplied with its zeros."""
 
 
 def predecessor_lists(blocks: Sequence[Float]) -> Lists:
@@ -78,7 +76,7 @@ class TransitionModel:
 
         Raises
         ------
-        InvalidDistributionError, InvalidModelError
+        InvalidModelError
             A table is none of transitions, or the controls have other states.
         """
         checked = [
@@ -91,7 +89,10 @@ class TransitionModel:
         shapes = {tuple(table.shape for table in row) for row in checked}
         if len(shapes) != 1 or not all(shapes) or any(s != s[:1] * 2 for row in shapes for s in row):
             raise InvalidModelError(said("network.squares", shapes=sorted(shapes)))
-        return cls(tuple(_grouped([np.stack(factor) for factor in zip(*checked, strict=True)])))
+        factors = [np.stack(factor) for factor in zip(*checked, strict=True)]
+        counts = [np.count_nonzero(factor, axis=(1, 2)) for factor in factors]
+        small = np.prod(counts, axis=0, dtype=np.float64).max() <= JOINT_NON_ZEROS
+        return cls((_joint(factors),) if small else tuple(factors))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -164,27 +165,6 @@ class TransitionModel:
 
 def _kronecker(arrays: Iterable[Float]) -> Float:
     return reduce(lambda first, second: np.asarray(np.kron(first, second)), arrays)
-
-
-def _grouped(factors: Sequence[Float]) -> Iterator[Float]:
-    """Yield blocks (U, L, L): all factors as one where that is small, else neighbours where it costs no more.
-
-    Applying a block costs its non-zeros for each of the other levels.
-    """
-    counts = [np.count_nonzero(factor, axis=(1, 2)) for factor in factors]
-    non_zeros_of_all = np.prod(counts, axis=0, dtype=np.float64).max()
-    if len(factors) == 1 or non_zeros_of_all <= JOINT_NON_ZEROS:
-        yield _joint(factors)
-        return
-    group, count = [factors[0]], counts[0] / factors[0].shape[1]
-    for factor, non_zeros in zip(factors[1:], counts[1:], strict=True):
-        own, levels = non_zeros / factor.shape[1], prod(item.shape[1] for item in [*group, factor])
-        if levels > JOINT_LEVELS or (count * own).max() > (count + own).max():
-            yield _joint(group)
-            group, count = [factor], own
-        else:
-            group, count = [*group, factor], count * own
-    yield _joint(group)
 
 
 def _joint(factors: Sequence[Float]) -> Float:

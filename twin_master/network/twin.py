@@ -157,7 +157,7 @@ class Twin:
 
     Raises
     ------
-    InvalidModelError, InvalidDistributionError
+    InvalidModelError
         The policy has another shape or is none, there is no such control, or the lag is negative.
     """
 

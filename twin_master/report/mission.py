@@ -119,12 +119,15 @@ def _zones(axes: Axes, run: Run, now: int, *, named: bool) -> None:
     axes.axvspan(now + 0.5, end + 0.8, color=style.PREDICTION, alpha=0.06, linewidth=0)
     axes.axvline(now, color=style.PRESENT, linewidth=0.8, zorder=0.5)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=True))
+    run.number_steps(axes.xaxis)
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.grid(axis="y")
     axes.yaxis.set_label_coords(-0.16, 0.5)
     if named:
         where, height = axes.get_xaxis_transform(), 1.24
-        axes.text(now, height, f"now: {now}", transform=where, ha="right", color=style.PRESENT)
+        axes.text(
+            now, height, f"now: {run.first_step + now}", transform=where, ha="right", color=style.PRESENT
+        )
         if now > 0.35 * end:
             axes.text(-0.8, height, "past", transform=where, ha="left", color=style.PAST)
         if run.horizon > _NARROW * end:
@@ -296,21 +299,20 @@ def _joint_figure(run: Run) -> Figure:
     )
     image = None
     for number, turn in enumerate(turns):
-        row, column = divmod(number, columns)
-        axes = grid[row][column]
+        axes = grid[number // columns][number % columns]
         image = _map(
             axes, run, run["filtered/probability"][turn], cmap=_PROBABILITY_COLORS, vmin=0.0, vmax=1.0
         )
-        axes.set_title(f"{run.step} {turn}", fontweight="normal", pad=3.0)
+        axes.set_title(f"{run.step} {run.first_step + turn}", fontweight="normal", pad=3.0)
         x, y = run.scales * run["filtered/mean"][turn]
         axes.plot(x, y, **_MEAN, linestyle="none", markeredgewidth=1.1, label="mean of the belief")
         if run.truth is not None:
             x, y = run.scales * run.truth[turn]
             for color, width in (("white", 2.6), (style.TRUTH, 1.2)):
                 axes.plot(x, y, **_RING, markeredgecolor=color, markeredgewidth=width, label="truth")
-        axes.tick_params(labelbottom=row == rows - 1, labelleft=column == 0)
-        axes.set_xlabel(run.factors[0].label if row == rows - 1 else "", labelpad=2.0)
-        axes.set_ylabel(run.factors[1].label if column == 0 else "", labelpad=2.0)
+        axes.set_xlabel(run.factors[0].label, labelpad=2.0)
+        axes.set_ylabel(run.factors[1].label, labelpad=2.0)
+        axes.label_outer()
     for spare in [axes for row in grid for axes in row][len(turns) :]:
         spare.remove()
     height = figure.get_figheight()
@@ -337,6 +339,7 @@ def _marginal_figure(run: Run) -> Figure:
         axes.set_ylabel(factor.label)
         style.panel_label(axes, "abcdefghijklmnopqrstuvwxyz"[index % 26], capital(factor.title))
         style.color_bar(figure, image, "probability", ax=axes, pad=0.02)
+        run.number_steps(axes.xaxis)
     axes.set_xlabel(run.step)
     return figure
 

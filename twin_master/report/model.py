@@ -253,14 +253,11 @@ class PredictiveCheck:
 
 def predictive_check(run: Run) -> PredictiveCheck:
     """Compare observations with their posterior predictive distribution."""
-    section, expected = run.scenario.observation, run["filtered/quantity_mean"]
-    total, learnt = run["filtered/quantity_standard_deviation"], run.get("filtered/noise_standard_deviation")
-    if learnt is None:
-        noise = np.asarray(section.standard_deviation)
-        total = np.hypot(np.hypot(total, noise), np.asarray(section.model_error) * expected)
-    else:
-        total = np.hypot(total, learnt)  # which has the error of the model
-    residual = (run.observed - expected) / total
+    noise = run.get("filtered/noise_standard_deviation")
+    if noise is None:  # of an earlier version
+        noise = np.asarray(run.scenario.observation.standard_deviation)
+    total = np.hypot(run["filtered/quantity_standard_deviation"], noise)
+    residual = (run.observed - run["filtered/quantity_mean"]) / total
     known = np.isfinite(residual)
     count, seen = known.sum(axis=0), residual[known]
     with np.errstate(invalid="ignore"):
@@ -294,6 +291,7 @@ def _residual_panel(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck
     axes.set_xlabel(run.step)
     axes.set_ylabel(run.sensors.word)
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
+    run.number_steps(axes.xaxis)
     axes.set_yticks(np.arange(1, count + 1, 4 if count > 8 else 1))
     style.panel_label(axes, "a", "Standardised residuals")
     style.color_bar(figure, image, "standard deviations", ax=axes, pad=0.015, fraction=0.03, extend="both")

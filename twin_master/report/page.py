@@ -194,9 +194,11 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 
 
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
-    now, last = course.default_now(run) if now is None else now, run.steps - 1
-    if not 0 <= now <= last:
-        raise RunFolderError(f"The present turn of the report must lie in 0..{last}, and {now} came.")
+    first, last = run.first_step, run.steps - 1
+    now = course.default_now(run) if now is None else now - first
+    if now not in range(run.steps):
+        ends = f"{first}..{first + last}"
+        raise RunFolderError(f"The present turn of the report must lie in {ends}, and {first + now} came.")
     units = ", ".join(
         dict.fromkeys("percent" if factor.unit == "%" else factor.unit for factor in run.factors)
     )
@@ -204,11 +206,11 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
         asked = run["filtered/decision_probability"][turn]
         chosen = int(np.argmax(asked))
         decided = WORDS.say(
-            "decided", run=run, now=turn, chosen=run.controls[chosen], probability=asked[chosen]
+            "decided", run=run, now=first + turn, chosen=run.controls[chosen], probability=asked[chosen]
         )
         past = "in hindsight" if turn == last else "as seen at the time"
         yield WORDS.figure(
-            "mission", course.mission_figure(run, turn), run=run, now=turn, units=units,
+            "mission", course.mission_figure(run, turn), run=run, now=first + turn, units=units,
             whole=name != MAIN_FIGURE, last=turn == last, past=past, decided=decided,
         )._replace(name=name)  # fmt: skip
     yield WORDS.figure("belief", course.belief_figure(run), run=run, units=units)
@@ -257,7 +259,7 @@ def _check_words(run: Run, check: tailored.PredictiveCheck) -> dict[str, str | b
     if len(check.transform):
         sensor = int(np.nanargmin(check.coverage))
         lowest = f"{small(sensors.titles[sensor])}, {100.0 * check.coverage[sensor]:.0f} %"
-    learnt = run.get("filtered/noise_standard_deviation") is not None
+    learnt = run.scenario.learning is not None
     return {"noise": told, "error": share if high else "", "lowest": lowest, "learnt": learnt}
 
 
@@ -284,7 +286,7 @@ def render_page(run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, R
         "figures": figures, "opening": opening_sentences(run), "another": _another_truth(run),
         "referred": any(figure["reference"] is not None for figure in run.summary.get("figures", ())),
         "share": 100.0 * lost.mean(), "ranges": lost_ranges(run),
-        "blind": turn_ranges(blind, run.step) if len(blind) else "",
+        "blind": turn_ranges(run.first_step + blind, run.step) if len(blind) else "",
         "learnt_asset": whole, "truth": any(learnt.truth is not None for learnt in whole),
         "plain": listing(f"{p:g} in {name}" for name, p in given.items() if isinstance(p, int | float)),
         "learnt_sensors": tailored.sensor_rows(run), "labels": [learnt.label for learnt in own],
@@ -340,7 +342,7 @@ def lost_ranges(run: Run) -> str:
     blind = lost.all(axis=1)
     together: dict[tuple[int, ...], list[str]] = {}
     for sensor in range(lost.shape[1]):
-        turns = tuple(np.flatnonzero(lost[:, sensor] & ~blind).tolist())
+        turns = tuple((run.first_step + np.flatnonzero(lost[:, sensor] & ~blind)).tolist())
         if turns:
             together.setdefault(turns, []).append(str(sensor + 1))
     word = run.sensors.word
@@ -349,5 +351,5 @@ def lost_ranges(run: Run) -> str:
         for turns, labels in together.items()
     ]
     if blind.any():
-        phrases.append(f"all {word}s at {turn_ranges(np.flatnonzero(blind), run.step)}")
+        phrases.append(f"all {word}s at {turn_ranges(run.first_step + np.flatnonzero(blind), run.step)}")
     return "; ".join(phrases)

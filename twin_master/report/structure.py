@@ -217,11 +217,12 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
     x, y = (weight @ np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.866]])).T
     mesh = Triangulation(x, y)
     colors = [_COLORS[number % len(_COLORS)] for number in range(count)]
+    cmap = ListedColormap(colors)
     figure, (row,) = style.panels(1, len(factors), 3.2, 0.4, 0.45, left=0.03, right=0.97)
     centre = weight[mesh.triangles].mean(axis=1)
     for place, (axes, name) in enumerate(zip(row, factors, strict=True)):
         chosen = policy.decide(centre @ triangle_of(model, place))
-        axes.tripcolor(mesh, facecolors=chosen, cmap=ListedColormap(colors), vmin=-0.5, vmax=count - 0.5)
+        axes.tripcolor(mesh, facecolors=chosen, edgecolors="face", cmap=cmap, vmin=-0.5, vmax=count - 0.5)
         for text, at in (("lowest", (0.0, -0.06)), ("highest", (1.0, -0.06)), ("not known", (0.5, 0.9))):
             axes.text(*at, text, ha="center", va="top" if at[1] < 0.0 else "bottom")
         axes.set_aspect("equal")

@@ -10,7 +10,7 @@ from typing import Any
 from reporting.toml_file import checked, read_toml
 from reporting.words import brief
 from scenarios import scenario_files
-from twin_master.errors import ScenarioError, UnknownScenarioError
+from twin_master.errors import ScenarioError
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
@@ -78,7 +78,7 @@ def find_scenario(name: str) -> Path:
 
     Raises
     ------
-    UnknownScenarioError
+    ScenarioError
         Neither a shipped scenario nor a file has this name.
     """
     shipped = scenario_files()
@@ -87,7 +87,7 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    raise UnknownScenarioError(said("scenario.unknown", name=name, shipped=", ".join(shipped)))
+    raise ScenarioError(said("scenario.unknown", name=name, shipped=", ".join(shipped)))
 
 
 def load_scenario(name_or_path: str | Path) -> LoadedScenario:
@@ -98,10 +98,9 @@ def load_scenario(name_or_path: str | Path) -> LoadedScenario:
 
     Raises
     ------
-    UnknownScenarioError
-        There is no such scenario.
     ScenarioError
-        The file cannot be read, is not TOML, or breaks the schema; the sentence names file and key.
+        There is no such scenario, or the file cannot be read, is not TOML, or breaks the schema; the sentence
+        names file and key.
     """
     path = find_scenario(str(name_or_path))
     table = read_toml(path, ScenarioError, what="scenario")

@@ -110,7 +110,7 @@ def _truth(scenario: Scenario, name: str) -> Float | None:
     if known is not None:
         return np.asarray(known, dtype=np.float64)
     if name == "transition_factor" and truth.kind == "random_growth":
-        return np.asarray(1.0)
+        return _true_factor(scenario)
     if truth.kind == "asset" or name not in ("noise_scale", "gauge_gain", "gauge_offset"):
         return None
     if name == "noise_scale":
@@ -125,6 +125,24 @@ def _truth(scenario: Scenario, name: str) -> Float | None:
         if fault.kind == "drift":
             healthy[fault.places(observation.count)] = np.nan
     return healthy
+
+
+def _true_factor(scenario: Scenario) -> Float | None:
+    """Return the one factor between the true and the assumed probabilities to worsen; None without one."""
+    if not scenario.truth.probability:
+        return np.asarray(1.0)
+    true, assumed = (
+        np.array(
+            [
+                entry[state] if isinstance(entry := table[control], dict) else entry
+                for control in scenario.control_names
+                for state in scenario.state_names
+            ]
+        )
+        for table in (scenario.truth.probability, scenario.transition.probability)
+    )
+    factor = true.sum() / max(assumed.sum(), np.finfo(float).tiny)
+    return np.asarray(factor) if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0) else None
 
 
 def printed_learnt(name: str, unit: str) -> tuple[float, str]:

@@ -149,8 +149,8 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]
         }
         words = {"lead": "step" if flown else "step horizon", "given": given}
         if name == "filtered":
-            values |= {} if learns is None else {"noise_standard_deviation": expected.noise}
             values |= {
+                "noise_standard_deviation": expected.noise,
                 "decision_probability": flight.decision_probability,
                 "log_evidence": flight.log_evidence,
                 "residual": (observed - expected.mean) / expected.noise,

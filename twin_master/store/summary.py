@@ -165,7 +165,7 @@ def summarise(
     received = np.isfinite(flight.observed)
     if not received.all():
         told.append(("lost", {}, [100.0 * float(1.0 - received.mean())]))
-        if blind := np.flatnonzero(~received.any(axis=1)).tolist():
+        if blind := (flight.first_turn + np.flatnonzero(~received.any(axis=1))).tolist():
             told.append(("blind", step, [", ".join(map(str, blind))]))
     if misfit is not None:
         worst = np.nanmax(np.abs(misfit), axis=(0, 1))

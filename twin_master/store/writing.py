@@ -130,13 +130,13 @@ def store_flight(
         atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
     if write_field is not None:
         write_field(folder / FIELD_NAME)
-    flown_controls = result.flight.control_index
+    flight, controls = result.flight, result.scenario.control_names
     heading = {
         "scenario": mission.name,
         "title": mission.title,
         "seed": mission.seed,
         "steps": steps,
-        "control": control_changes(result.scenario.control_names, flown_controls, mission.step_name),
+        "control": control_changes(controls, flight.control_index, mission.step_name, flight.first_turn),
         **flown,
         "asset_and_model_differ": origin.differ,
         **learnt_record(result.learnt),

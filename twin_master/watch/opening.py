@@ -239,7 +239,7 @@ def watch(
 
     Raises
     ------
-    RunFolderExistsError, NotResumableError
+    RunFolderError, NotResumableError
         The folder exists, or holds no such watch.
     MissionInputError
         There are no observations, they cannot be read, what is asked does not go together, or `teach` is

@@ -17,6 +17,7 @@ from calibration.dynamics.trials import (
     fit_trials,
     prepare,
     refine_by_extremes,
+    spectral_peaks,
     spectrum,
 )
 from calibration.errors import CalibrationError, ExperimentDataError
@@ -141,6 +142,12 @@ def test_any_two_separate_modes_are_recovered(first, second, ratios, share, phas
     assert [m.damping_ratio for m in fit.modes] == pytest.approx(ratios, rel=1e-4)
 
 
+def test_a_second_mode_that_is_soon_gone_is_found_in_the_beginning():
+    time = np.arange(0.0, 8.0, 1.0 / 200.0)
+    signal = ring_down(time, (5.65, 29.0), (0.01, 0.02), (0.01, 5e-4))
+    assert spectral_peaks(RingDownRecord(time, signal)) == pytest.approx((5.65, 29.0), rel=0.02)
+
+
 def test_the_spectrum_of_a_cosine():
     time = np.arange(0.0, 8.0, 1.0 / 200.0)
     frequency, amplitude = spectrum(RingDownRecord(time, 0.02 * np.cos(2.0 * np.pi * 10.0 * time)))
@@ -151,10 +158,7 @@ def test_the_spectrum_of_a_cosine():
 def test_the_digitised_records(reference):
     records = read_records(reference)
     assert len(records) == 5
-    trials = fit_trials(records)
-    assert average(trials, "frequency", 0).mean == pytest.approx(5.65, rel=0.005)
-    assert average(trials, "frequency", 1).mean == pytest.approx(29.9, rel=0.005)
-    assert average(trials, "damping_ratio", 0).mean == pytest.approx(0.028, rel=0.10)
+    trials = fit_trials(records)  # whose means test_lab_files.py holds
     # Trials repeat each other closely; mode 2 is seen by 8.1 ms columns of pixels.
     assert average(trials, "frequency", 0).standard_deviation < 0.002
     assert average(trials, "frequency", 1).standard_deviation < 0.1

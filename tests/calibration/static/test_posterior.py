@@ -156,21 +156,6 @@ def test_a_shared_zero_offset_equals_the_full_covariance(zero_offset):
     assert ours == pytest.approx(expected, abs=1e-8)
 
 
-def test_exact_displacements_on_a_line_give_the_conjugate_gaussian():
-    data = dataclasses.replace(DATA, displacement_standard_deviation=0.0)
-    prior = GaussianPrior()
-    gradient, intercept = 575.2, 101.8
-    information = 1.0 / prior.standard_deviation**2
-    information += np.sum((gradient * data.displacement / data.load_standard_deviation) ** 2)
-    pull = prior.mean / prior.standard_deviation**2
-    pull += np.sum(gradient * data.displacement * (data.load - intercept * data.displacement)) / (
-        data.load_standard_deviation**2
-    )
-    posterior = exact_posterior(data)
-    assert posterior.mean == pytest.approx(pull / information, abs=1e-10)
-    assert posterior.standard_deviation == pytest.approx(information**-0.5, rel=1e-8)
-
-
 def test_published_pairs():
     posterior = exact_posterior(DATA)
     assert posterior.mean == pytest.approx(1.00797, abs=1e-5)

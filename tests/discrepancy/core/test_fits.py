@@ -13,6 +13,7 @@ from discrepancy.errors import FitError
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.normal_equations import upper_factor
+from discrepancy.fits.predictive import residual_set
 
 from . import kit
 
@@ -130,6 +131,9 @@ def test_samples_that_do_not_count_change_nothing():
             p.residual(number, point, p.answer(number, point, Candidate())) for p in (problem, other)
         )
         np.testing.assert_allclose(first, second, atol=1e-9)
+    # nor are they counted as residuals of nought
+    for data, item in zip(problem.trials, residual_set(problem, kit.fitted(problem)).trials, strict=True):
+        np.testing.assert_array_equal(item.used, data.weight > 0.0)
 
 
 # ---------------------------------------------------------------- evidence and posterior

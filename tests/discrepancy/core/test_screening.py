@@ -28,10 +28,7 @@ def screened():
     problem = kit.closed_problem(seed=12, effect=0.12)
     none = kit.fitted(problem)
     screen = Screen(problem, none)
-    terms = (
-        Term(kit.offset_effect(deviation=10.0), "y1"),
-        Term(kit.drift_effect(deviation=10.0), "y1"),
-    )
+    terms = (Term(kit.offset_effect(deviation=10.0), "y1"), Term(kit.drift_effect(deviation=10.0), "y1"))
     return problem, none, screen, terms, [next(iter(screen.changes(term))) for term in terms]
 
 
@@ -80,6 +77,15 @@ def test_gain_is_what_a_fit_achieves(screened):
         prior = 0.5 * float(found.point.effect @ found.point.effect)
         assert none.objective - found.objective + prior == pytest.approx(change.gain, rel=0.02, abs=0.03)
         assert change.best[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
+
+
+def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
+    """At 7 Hz in both ring-downs, where the first mode has 3 Hz."""
+    line = 0.1 * np.cos(2.0 * np.pi * 7.0 * 0.01 * np.arange(200))
+    problem = kit.closed_problem(kinds=("ringdown",), samples=200, extra=lambda rows: line)
+    (mode,) = kit.chosen("unmodelled_mode")
+    change = next(Screen(problem, kit.fitted(problem)).changes(Term(mode, "y1")))
+    assert mode.parameters[0].prior.value(change.start[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
 
 
 def test_noise_unknown_to_the_record_counts_by_what_is_left():
@@ -277,10 +283,16 @@ def test_held_out_trials_move_nothing_that_is_shared():
     np.testing.assert_array_equal(adapted.point.shared, found.point.shared)
     assert any(np.any(u != 0.0) for u in adapted.point.local)
     # its own nuisances are at their optimum given the rest: the dense solution of one trial
+    shown = {item.trial.name: item for item in residual_set(problem, found, sensitivities=False).trials}
     for number, data in enumerate(there.trials):
         parts = there.linearise(number, start, Candidate())
-        columns, _ = there.columns(number, start, parts, Candidate())
-        local = data.standardised(columns[: data.unknowns.size]).reshape(data.unknowns.size, -1)
+        columns, index = there.columns(number, start, parts, Candidate())
+        local, shared = np.split(data.standardised(columns).reshape(len(columns), -1), [data.unknowns.size])
         residual = there.residual(number, start, parts.response).ravel()
-        exact = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local @ residual)
-        np.testing.assert_allclose(adapted.point.local[number], exact, atol=0.02)
+        taken = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local)
+        np.testing.assert_allclose(adapted.point.local[number], taken @ residual, atol=0.02)
+        # what is left varies by what is shared, less what they took
+        along = shared - shared @ local.T @ taken
+        more = np.sum(along * (found.covariance[np.ix_(index, index)] @ along), axis=0)
+        wanted = 1.0 + more - np.sum(local * taken, axis=0)
+        np.testing.assert_allclose(shown[data.trial.name].expected_variance.ravel(), wanted, atol=1e-9)

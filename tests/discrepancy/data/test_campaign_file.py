@@ -200,61 +200,48 @@ names = st.text(
 @st.composite
 def campaigns(draw):
     channel_names = draw(st.lists(names, min_size=1, max_size=3, unique=True))
-    interval = draw(st.floats(1e-5, 1.0))
-    channels = {}
-    for name in channel_names:
-        noise = draw(
-            st.one_of(
-                st.builds(NoiseRecord, positive, positive | st.just(math.inf)),
-                st.builds(NoiseRecord, positive, positive, source=st.just("repeats")),
-                arrays(float, st.integers(4, 12), elements=st.floats(-1.0, 1.0), unique=True).map(
-                    lambda samples: pre_trigger_record(samples, interval, "c", "f")
-                ),
-            )
+    interval, rest = draw(st.floats(1e-5, 1.0)), st.floats(-1.0, 1.0)
+    noise = (
+        st.builds(NoiseRecord, positive, positive | st.just(math.inf))
+        | st.builds(NoiseRecord, positive, positive, source=st.just("repeats"))
+        | arrays(float, st.integers(4, 12), elements=rest, unique=True).map(
+            lambda samples: pre_trigger_record(samples, interval, "c", "f")
         )
-        channels[name] = Channel(
-            name, draw(st.sampled_from(Quantity)), draw(names), noise,
-            draw(positive | st.sampled_from([0.0, math.inf])), draw(positive | st.sampled_from([0.0,
-            math.inf])), draw(st.none() | finite), draw(st.none() | finite),
-        )  # fmt: skip
+    )
+    size, place = positive | st.sampled_from([0.0, math.inf]), st.none() | finite
+    said = st.sampled_from(Quantity), names, noise, size, size, place, place
+    channels = {name: draw(st.builds(Channel, st.just(name), *said)) for name in channel_names}
     trials = []
     for index in range(draw(st.integers(1, 3))):
         kind = draw(st.sampled_from(TrialKind))
         dynamic = kind not in (TrialKind.STATIC, TrialKind.FLIGHT)
-        count = draw(st.integers(8, 20)) if dynamic else draw(st.integers(1, 5))
+        count = draw(st.integers(8, 20) if dynamic else st.integers(1, 5))
         # The first trial measures every channel: one that is measured nowhere is refused.
         chosen = draw(st.permutations(channel_names))[: None if index == 0 else draw(st.integers(1, 3))]
-        start = abs(draw(finite))
+        start, shape = abs(draw(finite)), (count, len(chosen))
         column = arrays(float, count, elements=finite)
-        zeros = np.zeros(count)
-        if dynamic:
-            time = draw(st.floats(1e-5, 1.0)) * np.arange(count)
-        else:
-            time = np.full(count, start)
-            if count > 1:  # the same row twice is refused
-                time = np.sort(draw(arrays(float, count, elements=finite, unique=True)))
-        trials.append(
-            Trial(
-                name=f"{index} {draw(names)}", kind=kind, channels=tuple(chosen),
-                values=draw(arrays(float, (count, len(chosen)), elements=finite)),
-                used=draw(arrays(bool, (count, len(chosen)))),
-                time=time,
-                force=draw(column) if kind in (TrialKind.STATIC, TrialKind.FORCED) else zeros,
-                load_factor=draw(column) if kind is TrialKind.FLIGHT else zeros,
-                load_place=draw(names | st.tuples(finite, finite)),
-                temperature=draw(st.just(zeros) | arrays(float, count, elements=st.floats(1e-2, 1e3))),
-                start=start,
-                run=draw(st.just("") | names),
-                health=draw(arrays(float, (count, 2), elements=st.floats(0.0, 1.0))),
-                health_deviation=draw(st.just(np.zeros((count, 2))) | arrays(float, (count, 2),
-                elements=positive)), release=draw(st.builds(Release, positive, positive, st.booleans(),
-                st.integers(1, 5), positive)) if kind is TrialKind.RINGDOWN
-                else None,
-                held_out=draw(st.booleans()),
-                hold=draw(st.sampled_from([None, *Hold])) if kind is TrialKind.FORCED else None,
-                noise_factor=draw(st.just(1.0) | positive),
+        time = draw(st.floats(1e-5, 1.0)) * np.arange(count) if dynamic else np.full(count, start)
+        if count > 1 and not dynamic:  # the same row twice is refused
+            time = np.sort(draw(arrays(float, count, elements=finite, unique=True)))
+        given = {
+            "values": arrays(float, shape, elements=finite), "used": arrays(bool, shape),
+            "load_place": names | st.tuples(finite, finite), "run": st.just("") | names,
+            "health": arrays(float, (count, 2), elements=st.floats(0.0, 1.0)), "held_out": st.booleans(),
+        }  # fmt: skip
+        given |= {"force": column} if kind in (TrialKind.STATIC, TrialKind.FORCED) else {}
+        given |= {"load_factor": column} if kind is TrialKind.FLIGHT else {}
+        given |= {"hold": st.sampled_from([None, *Hold])} if kind is TrialKind.FORCED else {}
+        if kind is TrialKind.RINGDOWN:
+            given["release"] = st.builds(
+                Release, positive, positive, st.booleans(), st.integers(1, 5), positive
             )
-        )  # fmt: skip
+        optional = {
+            "temperature": arrays(float, count, elements=st.floats(1e-2, 1e3)), "noise_factor": positive,
+            "health_deviation": arrays(float, (count, 2), elements=positive),
+        }  # fmt: skip
+        given = draw(st.fixed_dictionaries(given, optional=optional))
+        name = f"{index} {draw(names)}"
+        trials.append(Trial.plain(name, kind, tuple(chosen), time, start=start, **given))
     text = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
     read = dict.fromkeys(name for trial in trials for name in trial.input_names)
     return Campaign(
@@ -298,6 +285,9 @@ def test_what_cannot_be_written_says_so(tmp_path):
     )
     with pytest.raises(CampaignFileError, match="one sampling interval"):
         write_campaign(replace(campaign, channels={**campaign.channels, "tip": other}), tmp_path / "b")
+    warmer = (replace(campaign.trials[0], temperature=np.ones_like(campaign.trials[0].temperature)),)
+    with pytest.raises(CampaignFileError, match="reference_temperature"):
+        write_campaign(replace(campaign, trials=warmer, reference_temperature=None), tmp_path / "b")
     lost = Event("hit", ("nowhere",), time=0.1)
     with pytest.raises(CampaignFileError, match="'nowhere'"):
         write_campaign(replace(campaign, events=(lost,)), tmp_path / "b")
@@ -306,11 +296,13 @@ def test_what_cannot_be_written_says_so(tmp_path):
 def test_releases_and_events_that_are_none_are_refused_in_python_too(tmp_path):
     for make in (
         lambda: Release(0.0),
+        lambda: Release(0.02, -1.0),
+        lambda: Release(0.02, mode_count=0),
         lambda: Event("a b", time=0.0),
         lambda: Event("pi", time=0.0),
         lambda: Event("hit", time=1.0, until=1.0),
     ):
-        with pytest.raises(CampaignFileError):
+        with pytest.raises(ValueError, match=r"Release|Event"):
             make()
     plain = (TOML, 'displacement = 50, unit = "mm"', 'displacement = 50, unit = "1"')
     release = read_campaign(campaign_folder(tmp_path / "a", PLAIN, plain)).trials[1].release
@@ -326,41 +318,48 @@ def test_samples_at_rest_go_before_a_stated_deviation(tmp_path):
 # ---------------------------------------------------------------- noise from repeats
 
 
+W = Channel("w", Quantity.DISPLACEMENT, "x")
+
+
+def repeats(rows, used=None):
+    """Return a static trial for each row of readings."""
+    force, used = np.arange(float(rows.shape[1])), np.ones(rows.shape, dtype=bool) if used is None else used
+    return [
+        Trial.plain(
+            str(k),
+            TrialKind.STATIC,
+            ("w",),
+            0.0 * force,
+            force=force,
+            values=row[:, None],
+            used=mark[:, None],
+        )
+        for k, (row, mark) in enumerate(zip(rows, used, strict=True))
+    ]
+
+
 def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
-    rng = np.random.default_rng(4)
-    readings = rng.normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
-    trials = "".join(
-        f'[[trial]]\nname = "{k}"\nkind = "static"\nfile = "{k}.csv"\nrun = "{"A" if k < 3 else "B"}"\n'
-        for k in range(4)
-    )
-    toml = (
-        'format = 1\nname = "r"\n[[channel]]\nname = "w"\nquantity = "displacement"\nunit = "m"\n'
-        'output = "x"\n' + trials
-    )
-    tables = {
-        str(k): "force,w\n" + "".join(f"{5 * n},{value!r}\n" for n, value in enumerate(row))
-        for k, row in enumerate([*readings.tolist(), [100.0, 200.0, 300.0, 400.0]])
-    }
-    for name, text in (("campaign.toml", toml), *((f"{key}.csv", text) for key, text in tables.items())):
-        (tmp_path / name).write_text(text)
-    campaign = read_campaign(tmp_path)
-    record = campaign.channels["w"].noise
-    assert (record.source, record.degrees_of_freedom) == ("repeats", 8.0)  # the other run is no repeat
-    assert record.standard_deviation == pytest.approx(np.sqrt(np.mean(np.var(readings, axis=0, ddof=1))))
-    assert "taken from repeated trials (8 degrees" in campaign.remarks[0]
-    # With a free zero per trial, rows and trials are taken out: a two-way layout without interaction.
-    free = toml.replace('output = "x"', 'output = "x"\noffset_deviation = "free"')
-    (tmp_path / "campaign.toml").write_text(free)
-    record = read_campaign(tmp_path).channels["w"].noise
-    rest = readings - readings.mean(axis=0) - readings.mean(axis=1, keepdims=True) + readings.mean()
-    assert record.degrees_of_freedom == 6.0
-    assert record.standard_deviation == pytest.approx(np.sqrt(np.sum(rest**2) / 6))
-    # Without repeats nothing is known, and the campaign says so.
-    (tmp_path / "1.csv").write_text(tables["1"].replace("5,", "6,", 1))
-    (tmp_path / "2.csv").write_text(tables["2"].replace("5,", "7,", 1))
-    alone = read_campaign(tmp_path)
-    assert alone.channels["w"].noise is None
-    assert not alone.remarks  # the checks say it
+    """With a free zero per trial, rows and trials are taken out: a two-way layout without interaction.
+
+    Another run is no repeat; a noise of twice the record's counts half.
+    """
+    readings = np.random.default_rng(4).normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
+    rows = repeats(np.vstack((readings, [100.0, 200.0, 300.0, 400.0])))
+    *trials, other = (replace(row, noise_factor=2.0) for row in rows)
+    other = replace(other, run="B")
+    rest = 0.5 * (readings - readings.mean(axis=0))
+    for zero, freedom, left in ((0.0, 8.0, rest), (math.inf, 6.0, rest - rest.mean(axis=1, keepdims=True))):
+        channels = {"w": replace(W, offset_deviation=zero)}
+        campaign = Campaign("r", channels, (*trials, other), None, {}, "")
+        campaign = read_campaign(write_campaign(campaign, tmp_path / str(freedom)))
+        record = campaign.channels["w"].noise
+        assert (record.source, record.degrees_of_freedom) == ("repeats", freedom)
+        assert record.standard_deviation == pytest.approx(np.sqrt(np.sum(left**2) / freedom))
+        assert f"taken from repeated trials ({freedom:g} degrees" in campaign.remarks[0]
+    # Without repeats nothing is known; the checks say so.
+    alone = replace(campaign, channels={"w": W}, trials=(trials[0], other), remarks=())
+    alone = read_campaign(write_campaign(alone, tmp_path / "alone"))
+    assert (alone.channels["w"].noise, alone.remarks) == (None, ())
 
 
 @pytest.mark.parametrize("what", ["force", "load_factor", "temperature", "health", "noise_factor"])
@@ -371,23 +370,12 @@ def test_a_trial_under_something_else_is_no_repeat(what):
 
 
 def test_a_reading_that_is_left_out_is_in_no_repeat():
-    channel = Channel("w", Quantity.DISPLACEMENT, "x")
     rows, used = np.random.default_rng(1).standard_normal((3, 6)), np.ones((3, 6), dtype=bool)
     used[1, 2] = False
-
-    def deviation(rows, used):
-        trials = [
-            Trial.plain(
-                "t", TrialKind.STATIC, ("w",), np.zeros(row.size), force=np.arange(float(row.size)),
-                values=row[:, None], used=mark[:, None],
-            )
-            for row, mark in zip(rows, used, strict=True)
-        ]  # fmt: skip
-        found = repeat_record(channel, trials)
-        return found.standard_deviation, found.degrees_of_freedom
-
-    kept = np.delete(rows, 2, axis=1)
-    assert deviation(np.where(used, rows, 1e9), used) == pytest.approx(deviation(kept, kept < np.inf))
+    left_out = repeat_record(W, repeats(np.where(used, rows, 1e9), used))
+    without = repeat_record(W, repeats(np.delete(rows, 2, axis=1)))
+    assert left_out.standard_deviation == pytest.approx(without.standard_deviation)
+    assert left_out.degrees_of_freedom == without.degrees_of_freedom
 
 
 # ---------------------------------------------------------------- what is wrong

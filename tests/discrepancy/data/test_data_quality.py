@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from benchmarks.cantilever import Cantilever
 from discrepancy.campaign.protocol import Release
@@ -14,7 +15,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
-from discrepancy.checks.quality import check_data
+from discrepancy.checks.quality import check_data, clipped_run
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.sensing import observe
@@ -28,6 +29,7 @@ from fe.runtime.patch import (
     SensorGain,
     SensorRotation,
 )
+from tests.discrepancy.core import kit
 from tests.refusals import Inputs
 
 PLAN = ExamplePlan(
@@ -130,6 +132,19 @@ def test_other_factors_are_no_unit_slips(cantilever, campaign, factor):
         assert not kinds_of(check_against_model(released, cantilever))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_turns_at_nearly_one_load_are_no_slip(cantilever, campaign, seed):
+    """Between them there is noise over next to nothing."""
+    noise = np.random.default_rng(seed).normal(0.0, [5e-5, 2e-6, 1e-6, 5e-7], (20, 4))
+
+    def gentle(trial):
+        rows = trial.rows(np.repeat([trial.load_factor.argmax(), trial.load_factor.argmin()], [1, 19]))
+        load = rows.load_factor * (1.0 + 1e-4 * np.arange(20))
+        return replace(rows, load_factor=load, values=rows.values + noise)
+
+    assert not check_against_model(every(campaign, gentle, TrialKind.FLIGHT), cantilever)
+
+
 def test_slips_of_inputs(cantilever, campaign):
     def kilo(trial):
         return replace(trial, force=trial.force * 1e-3)
@@ -166,6 +181,14 @@ def test_signs(cantilever, campaign):
         return values
 
     assert not check_against_model(shown(campaign, cool, TrialKind.FLIGHT), cantilever)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_reading_that_passes_zero_at_once_has_a_sign(sign):
+    """In its second sample: y2 begins at a tenth of its amplitude, where two modes nearly cancel."""
+    problem = kit.closed_problem(seed=2, kinds=("ringdown",), samples=300)
+    faults = check_against_model(scaled(problem.campaign, "y2", sign), problem.model)
+    assert kinds_of(faults) == ({(FaultKind.SIGN, "y2")} if sign < 0.0 else set())
 
 
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
@@ -221,6 +244,12 @@ def test_clipped_and_dead_channels(campaign):
     assert "smallest value -0.0003" in faults[0].sentence
     saturated = check_data(shown(campaign, limited(-1.0, 0.01, 0), kind=TrialKind.STATIC))
     assert (FaultKind.CLIPPED, "x") in kinds_of(saturated)
+    for values, load, run in (
+        ((0, 1, 2, 3, 3, 3), (0, 1, 2, 3, 4, 5), 3),
+        ((0, 1, 2, 3, 3, 3), (0, 1, 2, 3, 3, 3), 0),  # repeats
+        ((1, 1, 2, 3, 3, 3), (0, 1, 2, 3, 4, 5), 0),  # few digits
+    ):
+        assert clipped_run(np.array(values), 3.0, np.array(load)) == run
     unplugged = check_data(shown(campaign, limited(1e-6, 1e-6, 2), name="loading"))
     assert kinds_of(unplugged) == {(FaultKind.DEAD, "g1")}
 
@@ -258,6 +287,15 @@ def test_noise_records_against_their_label_and_repeats(campaign):
         faults = check_data(Campaign("", {"x": channel}, trials, None, {}, ""))
         assert [fault.kind for fault in faults] == [FaultKind.NOISE_LABEL] * (stated != 1.0)
         assert all("repeated trials scatter" in fault.sentence for fault in faults)
+    # slow noise is smooth, and so is its record
+    time, (slow, rest) = 0.01 * np.arange(600), lfilter([1.0], [1.0, -0.9], rng.normal(size=(2, 600)))
+    values = (30.0 * np.cos(12.0 * time) * np.exp(-time) + slow)[:, None]
+    trials = (Trial.plain("ring", TrialKind.RINGDOWN, ("x",), time, values=values),)
+    for samples, faulty in ((rest, False), (3.0 * rest, True), (None, True)):
+        record = NoiseRecord(float(np.std(rest if samples is None else samples)), 599.0, samples, 0.01)
+        channel = Channel("x", Quantity.DISPLACEMENT, "x", record)
+        faults = check_data(Campaign("", {"x": channel}, trials, None, {}, ""))
+        assert [fault.kind for fault in faults] == [FaultKind.NOISE_LABEL] * faulty
 
 
 def test_outliers_are_found_and_left_out_unless_they_are_too_many(campaign):

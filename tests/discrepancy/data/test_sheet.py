@@ -3,6 +3,7 @@
 import csv
 import io
 import random
+import re
 import time
 from datetime import datetime, timedelta
 from datetime import time as clock
@@ -60,11 +61,9 @@ def test_what_is_passed_over_is_told(tmp_path):
 
 @pytest.mark.parametrize(("content", "sentence"), INPUTS.refused("sheets"))
 def test_what_cannot_be_read_is_one_sentence(tmp_path, content, sentence):
-    with pytest.raises(CampaignFileError) as caught:
+    with refused(CampaignFileError, re.escape(sentence)) as caught:
         sheet_of(tmp_path, content.encode())
-    assert sentence in str(caught.value)
     assert "odd.csv" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("content", "decimal"), INPUTS.refused("decimals"))

@@ -19,7 +19,15 @@ from discrepancy.judgement.consistency_gate import (
     score_tests,
 )
 from discrepancy.judgement.naming import name
-from discrepancy.judgement.proof import correlation_time, gap_closed, log_density, prove, score_gain, scores
+from discrepancy.judgement.proof import (
+    correlation_time,
+    gap_closed,
+    held_out_gate,
+    log_density,
+    prove,
+    score_gain,
+    scores,
+)
 from discrepancy.verdict import VerdictKind
 from tests.discrepancy.bench import Bench, with_noise
 from tests.discrepancy.core import kit
@@ -74,7 +82,9 @@ def test_a_closed_gap_is_one_and_an_open_gap_zero():
     """Half the error leaves a quarter of the gap."""
     bench = Bench(amplitudes=MANY, held_out=HELD)
     before = bench.fit(np.random.default_rng(5), extra=lacking(bench, 25.0))
-    proof = prove(before, bench.fit(np.random.default_rng(5)))
+    after = bench.fit(np.random.default_rng(5))
+    assert [held_out_gate(item).passed for item in (before, after)] == [False, True]
+    proof = prove(before, after)
     assert proof.held_out_before.chi_square_per_dof > 3.0
     assert proof.gap_closed == pytest.approx(1.0, abs=0.1)
     assert proof.gap_reason == ""
@@ -96,6 +106,7 @@ def test_no_gap_is_said_and_not_divided_by():
     assert isnan(proof.gap_closed)
     assert "show no gap before" in proof.gap_reason
     bare = with_noise(fitted, None)
+    assert held_out_gate(bare).passed is None
     proof = prove(bare, bare)
     assert isnan(proof.held_out_after.chi_square_per_dof)
     assert "No noise record" in proof.gap_reason
@@ -215,6 +226,18 @@ def test_statistic_is_the_fall_of_the_penalised_sum_of_squares():
     nothing = {0: np.zeros_like(problem.trials[0].weight)}
     assert score_tests(problem, found, {"own": {"offset": own}, "nothing": {"zero": nothing}}) == []
     assert score_tests(problem, found, {}) == []
+
+
+def test_p_value_beside_a_short_noise_record_is_that_of_the_f_test():
+    """Of the sums of squares without and with the directions, in deviations of the record."""
+    problem = kit.with_noise(kit.closed_problem(seed=3, effect=0.4), y1=NoiseRecord(0.02, 12.0))
+    found, _, _ = asked(problem)
+    columns = 0.02 * np.random.default_rng(5).standard_normal((2, 9, 1)) * [1.0, 0.0, 0.0]
+    (test,) = score_tests(problem, found, {"both": {"a": {0: columns[0]}, "b": {0: columns[1]}}})
+    known = 12.0 + problem.counts[0]
+    square, freedom = 12.0 + found.sums[0], known - found.spent[0] - 2
+    fall = test.statistic * square / known
+    assert test.p_value == pytest.approx(stats.f.sf(0.5 * fall / ((square - fall) / freedom), 2, freedom))
 
 
 @pytest.mark.parametrize("freedom", [pytest.param(inf, marks=pytest.mark.long), 30.0])

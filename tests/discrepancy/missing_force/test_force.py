@@ -149,7 +149,11 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
     said = force_sentence(told)
     assert said.startswith(f"A force of {told.rms:.3g} N (rms) is missing at rail, at most ")
     assert "Coulomb friction is" in said
-    assert len(missing_force_figure(missing).axes) == 6
+    axes = missing_force_figure(missing).axes
+    assert len(axes) == 6
+    at = int(np.argmax(np.abs(course.force)))  # drawn with two deviations about it
+    edge = course.time[at], course.force[at] + 2.0 * course.deviation[at]
+    assert np.isclose(axes[2].collections[0].get_paths()[0].vertices, edge).all(axis=1).any()
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.05])

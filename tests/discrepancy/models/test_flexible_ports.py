@@ -14,12 +14,10 @@ from discrepancy.campaign.protocol import Release
 from discrepancy.models.acting import Acting, Course, Load, Shown
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of
-from fe.compilation import compiled_kernel
-from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import ModelPatch, PowerDamping, Primitive
 from tests.discrepancy.rigs import laws
-from tests.fe.runtime.stepping import force_of, rates_of, simulate, states_of
+from tests.fe.runtime.stepping import force_of, rates_of, states_of
 
 FloatArray = NDArray[np.float64]
 
@@ -31,7 +29,7 @@ ROOT = 6000.0
 TIP = np.array([0.0, 0.0, 0.0, 1.0])
 ROWS = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
 """Of the tip and of the joint."""
-RELEASE = Release(displacement=0.02, deviation=0.0, at_rest=True, mode_count=1, time_zero_deviation=0.0)
+RELEASE = Release(displacement=0.02, deviation=0.01, at_rest=True, mode_count=1, time_zero_deviation=0.0)
 TIME, EARLY = np.linspace(0.0, 2.796, 700), np.linspace(0.0, 0.01, 101)
 A = 0.02 * 0.135
 """About the motion of the joint [m]."""
@@ -47,11 +45,11 @@ def chain(modes: int, beta: float) -> LinearSystem:
     return LinearSystem(mass, 0.3 * mass + beta * stiffness, stiffness, ports, modes, beta)
 
 
-def ringdown(beta: float, *items: Primitive, refinement: int = 1, time: FloatArray = TIME) -> Motion:
-    system = chain(3, beta)
+def ringdown(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **how: int) -> Motion:
+    system = chain(how.pop("modes", 3), beta)
     acts = laws_of(ModelPatch(items), list(system.ports))
-    acting = Acting(time, time, initial=np.zeros((0, 2)), release=(TIP, RELEASE))
-    return motion_of(system, acting, acts, refinement)
+    acting = Acting(time, time, initial=np.zeros((0, 2)), release=(row, RELEASE))
+    return motion_of(system, acting, acts, **how)
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
@@ -61,10 +59,10 @@ def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
 LAWS = laws("joint", ROOT, A, 15.0 * A)
 
 
-def test_the_modes_leave_out_nearly_all_of_the_joint() -> None:
-    system = chain(3, 0.0)
-    row = system.ports["joint"]
-    assert float(row @ system.residual(row)) > 0.7 * float(row @ system.flexibility(row))
+def test_what_held_the_joint_fades_with_the_lag_of_its_damping() -> None:
+    """Three modes leave it out; the fourth, which is next to overdamped beyond measure, is exact."""
+    few, exact = (values(ringdown(BETA, time=EARLY, row=ROWS[1], modes=n), ROWS) for n in (3, 4))
+    assert few == pytest.approx(exact, rel=1e-5)
 
 
 def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ...]) -> float:
@@ -85,8 +83,8 @@ def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ..
     return float(np.sign(push) * size)
 
 
-def integrated(items: tuple[Primitive, ...], time: FloatArray) -> FloatArray:
-    """Displacements (N, 2) of tip and joint after the release, by a general integrator; no mass there."""
+def integrated(items: tuple[Primitive, ...], time: FloatArray, at: int) -> FloatArray:
+    """Displacements (N, 2) of tip and joint, that has no mass, released `at` a node, by an integrator."""
     system, cuts = chain(3, BETA), np.cumsum([states_of(item) for item in items])
     stiffness, damping = system.stiffness, BETA * system.stiffness + 0.3 * system.mass
     inverse = np.linalg.inv(stiffness)
@@ -111,8 +109,8 @@ def integrated(items: tuple[Primitive, ...], time: FloatArray) -> FloatArray:
             limits = {"rtol": 1e-9, "atol": 1e-14, "max_step": 0.01}
             z = solve_ivp(lambda s, z: rates(z, x), (0.0, 1.0), z, **limits).y[:, -1]
         inner = force(x, z)
-        pull = (0.02 + inverse[3, 0] * inner) / inverse[3, 3]
-        return inverse[:, 3] * pull - inverse[:, 0] * inner, z
+        pull = (0.02 + inverse[at, 0] * inner) / inverse[at, at]
+        return inverse[:, at] * pull - inverse[:, 0] * inner, z
 
     def derivative(t: float, y: FloatArray) -> FloatArray:
         u, v, x, z = y[:3], y[3:6], y[6], y[7:]
@@ -124,7 +122,7 @@ def integrated(items: tuple[Primitive, ...], time: FloatArray) -> FloatArray:
             a[2] -= force_of(item, u[2], v[2], z)
         return np.concatenate((v, a, [speed], rates(z, speed)))
 
-    x = brentq(lambda x: held(x)[0][0] - x, 0.0, 3.0 * A, xtol=1e-14)
+    x = brentq(lambda x: held(x)[0][0] - x, 0.0, 3.0 * A if at else 0.03, xtol=1e-14)
     u, z = held(x)
     begin = np.concatenate((u[1:], np.zeros(3), [x], z))
     found = solve_ivp(derivative, (0.0, time[-1]), begin, t_eval=time, rtol=1e-6, atol=1e-9, max_step=2e-3)
@@ -132,12 +130,22 @@ def integrated(items: tuple[Primitive, ...], time: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ("name", "time"), [*((n, TIME[:250]) for n in LAWS), ("cubic", EARLY), ("play", EARLY)]
+    ("name", "time", "at"),
+    [
+        *((n, TIME[:250], 3) for n in LAWS),
+        ("cubic", EARLY, 3),
+        ("play", EARLY, 3),
+        ("crack", EARLY, 0),
+        ("viscous", EARLY, 0),
+    ],
 )
-def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray) -> None:
-    true = integrated(LAWS[name], time)
+def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray, at: int) -> None:
+    """Released at the tip, or at the joint itself."""
+    true = integrated(LAWS[name], time, at)
     effect, usual, fine = (
-        np.abs(values(ringdown(BETA, *items, time=time, refinement=n), ROWS) - true).max(axis=0)
+        np.abs(values(ringdown(BETA, *items, time=time, row=np.eye(4)[at], refinement=n), ROWS) - true).max(
+            axis=0
+        )
         for items, n in (((), 1), (LAWS[name], 1), (LAWS[name], 8))
     )
     assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
@@ -149,52 +157,6 @@ def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray)
 def test_without_lag_the_order_is_two(name: str) -> None:
     one, two, fine = (values(ringdown(0.0, *LAWS[name], refinement=n)) for n in (1, 2, 16))
     assert np.mean((one - fine) ** 2) > 9.0 * np.mean((two - fine) ** 2)
-
-
-K, R = 40.0, 1.0 / 60.0
-
-
-def rubbed(level: float = 1.5, p: float = 0.0, q: float = 0.0, r: float = R, **options: Any) -> Any:
-    """Motion of 1 kg on a spring K from 1 m, with damping at a port that has a flexibility r behind it."""
-    relaxation = options.pop("relaxation", 0.0)
-    system = ModalSystem(np.sqrt([K]), np.zeros((1, 1)), {"mass": np.ones(1)}, np.array([r]), relaxation)
-    acts = laws_of(ModelPatch((PowerDamping("mass", level, p, q, 6.0, 1.0),)), ["mass"])
-    start: dict[str, Any] = {"q": np.ones(1), "v": np.zeros(1), "force": np.zeros(801)}
-    return simulate(system, acts, **start, interval=0.005, kernel=compiled_kernel(), **options)
-
-
-def test_friction_that_holds_is_a_spring_of_the_flexibility() -> None:
-    # it sticks at the release, where the spring 1/R is without force: about that place, K + 1/R
-    moved, rest = rubbed(1e4, substeps=20), 0.6
-    wanted = rest + (1.0 - rest) * np.cos(10.0 * 0.005 * np.arange(801))
-    assert moved.q[:, 0] == pytest.approx(wanted, abs=2e-4)
-    assert moved.port_forces[:, 0] == pytest.approx((moved.q[:, 0] - 1.0) / R, abs=1e-9)
-
-
-def test_friction_that_slips_loses_the_area_of_its_loop() -> None:
-    # Jenkins: in a cycle from -X to X the loop takes 4 F (X - R F); the mass loses that energy
-    moved = rubbed(1.5, substeps=20)
-    x, v, force = moved.q[:, 0], moved.v[:, 0], moved.port_forces[:, 0]
-    turns = np.flatnonzero(np.diff(np.sign(v[1:]))) + 1
-    lost = -np.diff(0.5 * (K * x**2 + v**2 + R * force**2)[turns])
-    assert lost == pytest.approx(1.5 * (np.abs(np.diff(x[turns])) - 2.0 * R * 1.5), rel=0.02)
-    assert np.abs(force).max() <= 1.5 * (1.0 + 1e-12)
-
-
-def test_the_shape_family_is_continuous_at_dry_friction() -> None:
-    dry, nearly = (rubbed(p=p, q=p, relaxation=1e-3) for p in (0.0, 1e-5))
-    assert np.abs(dry.q - nearly.q).max() < 1e-3
-    sides = [rubbed(p=p, relaxation=1e-3).q for p in (0.49, 0.5, 0.51)]
-    assert np.abs(sides[2] - 2.0 * sides[1] + sides[0]).max() < 1e-3
-
-
-@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])
-def test_less_and_less_flexibility_tends_to_none(exponent: float) -> None:
-    # with large steps a port with little flexibility is one without (`port_flexibility`)
-    rigid, *others = (rubbed(p=exponent, r=r, substeps=40).q for r in (0.0, 1.2e-2, 6e-3, 3e-3, 2e-3))
-    errors = [np.abs(q - rigid).max() for q in others]
-    assert errors[2] < 0.6 * errors[0]
-    assert np.array_equal(others[-1], rigid)
 
 
 @pytest.mark.parametrize("name", ["cubic", "crack", "play", "micro-slip", "bouc-wen"])
@@ -213,9 +175,9 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
 @pytest.mark.parametrize("name", LAWS)
 def test_a_release_goes_on_from_its_static_state(name: str) -> None:
     assert np.abs(values(ringdown(BETA, *LAWS[name]))).max() <= 0.02 * 1.001  # no law adds energy
-    motion = ringdown(1e-3, *LAWS[name])
-    first = values(motion, ROWS)[0]
-    assert first[0] == pytest.approx(0.02, rel=1e-9)
+    motion = ringdown(1e-3, *LAWS[name], time=np.append(-0.01, TIME))
     system = motion.system
     at_rest = system.static(np.stack((0.0 * TIP, motion.holding)), motion.laws)[0][-1]
-    assert first[1] == pytest.approx(at_rest[0], rel=1e-4)
+    for first in values(motion, ROWS)[:2]:  # before and at the release
+        assert first[0] == pytest.approx(0.02, rel=1e-9)
+        assert first[1] == pytest.approx(at_rest[0], rel=1e-4)

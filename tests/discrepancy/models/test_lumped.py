@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import eigh
+from scipy.linalg import eigh, expm
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
@@ -31,6 +31,7 @@ JOINT = np.array([0.0, -1.0, 1.0])
 END = np.linalg.solve(STIFFNESS, [0, 0, 1])
 SQUARE, SHAPES = eigh(STIFFNESS, MASS)
 VISCOUS = MASS @ SHAPES @ np.diag(np.array([0.016, 0.012, 0.012]) * np.sqrt(SQUARE)) @ (MASS @ SHAPES).T
+MOTION = second_order(*(np.linalg.solve(MASS, part) for part in (STIFFNESS, VISCOUS)))
 DISPLACEMENTS = {f"x{k}": Quantity.DISPLACEMENT for k in (1, 2, 3)}
 X3, VELOCITY, ACCELERATION = (("x3", quantity) for quantity in Quantity.DISPLACEMENT.moving)
 
@@ -154,8 +155,10 @@ def test_initial_states_are_shares_of_the_release(chain: LumpedModel) -> None:
     wanted = 0.02 * (1.1 * END / END[2] + 0.05 * SHAPES[:, 1] / SHAPES[2, 1])
     np.testing.assert_allclose(start, wanted, atol=1e-12)
     later, initial = ringdown(release=Release(0.02, at_rest=False)), np.array([[0.0, 0.0], [0.3, -0.4]])
-    values = shown(chain, later, outputs=(X3, VELOCITY), initial=initial)
-    np.testing.assert_allclose(values[0], [0.3 * 0.02, -0.4 * 0.02 * np.sqrt(SQUARE[1])], rtol=1e-9)
+    values = shown(chain, later, outputs=(X3, VELOCITY), initial=initial, clock=(0.0, -0.02))
+    begin = 0.02 * np.outer([0.3, -0.4 * np.sqrt(SQUARE[1])], SHAPES[:, 1] / SHAPES[2, 1]).ravel()
+    wanted = [(expm(MOTION * t) @ begin)[[2, 5]] for t in later.time - 0.02]  # it moves before, too
+    np.testing.assert_allclose(values, wanted, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("laws", [(), (PowerDamping("joint", 0.2, 2.0, 0.0, 0.1, 1.0),)])
@@ -197,9 +200,8 @@ def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
     time = np.delete(time - time[0], slice(66, 73))  # and a gap
     force = np.append(0.0, np.random.default_rng(2).normal(size=len(time) - 1))
     into = np.append(np.zeros(5), 1.0 / MASS[2, 2])[:, None]
-    matrix = second_order(*(np.linalg.solve(MASS, part) for part in (STIFFNESS, VISCOUS)))
-    found = exact(matrix, into, time, force[:, None])
-    acceleration = found @ matrix[5] + force * into[5]
+    found = exact(MOTION, into, time, force[:, None])
+    acceleration = found @ MOTION[5] + force * into[5]
     expected = np.stack([found[:, 0], found[:, 5], acceleration], axis=1)
     measured = shown(chain, trial(TrialKind.FORCED, time, force=force), outputs=SEEN)
     np.testing.assert_allclose(measured, expected, atol=1e-9 * np.abs(expected).max())

@@ -99,9 +99,10 @@ def test_an_unknown_begin_takes_any_state() -> None:
     time, model = uneven(50, 0.01), rig("falling_body")
     read = {"channels": ("h",), "values": (3.0 - 2.0 * time)[:, None]}
     what = trial(time, begins=Start.UNKNOWN, **read)
-    sizes = model.initial_sizes(campaign(what, h=Channel("h", Quantity.DISPLACEMENT, "height", None)), what)
-    assert sizes.shape == (2,)
-    assert sizes[0] > 2.0
+    for quantity, height in ((Quantity.DISPLACEMENT, 3.0), (Quantity.VELOCITY, 3.0 * time[-1])):
+        given = campaign(what, h=Channel("h", quantity, "height", None))
+        largest = np.sqrt(2.0) * np.array([height, max(height / time[-1], 9.81 * time[-1])])
+        assert model.initial_sizes(given, what) == pytest.approx(largest, rel=1e-9)
     found = seen(model, what, HEIGHT, initial=np.sqrt(2.0) * np.array([[3.0, -2.0]]))  # mass-normalised
     np.testing.assert_allclose(found[:, 0], 3.0 - 2.0 * time - 0.5 * 9.81 * time**2, atol=1e-12)
 
@@ -223,16 +224,17 @@ def test_straight_lines_have_the_mean_effect_of_a_spline() -> None:
 def test_a_pendulum_follows_its_target_as_integrated(hold: str, measured: bool) -> None:
     model = model_of(INPUTS.text("pendulum.toml") + 'derivative_of = "measurement"\n' * measured)
     time = np.linspace(0.0, 1.5, 90) ** 1.1  # uneven
-    target, weight, servo = 1.5 * np.sin(2.0 * time) + 0.3, 1.1, 0.9
+    target, weight, servo, gain = 1.5 * np.sin(2.0 * time) + 0.3, 1.1, 0.9, 1.3
     what = trial(time, RecordedInput("target", Quantity.ANGLE, target, Hold(hold)))
     outputs = {"angle": Quantity.ANGLE, "torque": Quantity.TORQUE}
-    found = seen(model, what, outputs, parameters=np.array([weight, servo]), refinement=4)
+    found = seen(model, what, outputs, parameters=np.array([weight, servo, gain]), refinement=4)
 
     def terms(t: float, state: FloatArray, k: int) -> tuple[float, float]:
         """What is wanted, and the torque that the controller gives."""
         slope = 0.0 if measured else (target[k + 1] - target[k]) / (time[k + 1] - time[k])
         wanted = target[k] + slope * (t - time[k])
-        return wanted, servo * 40.0 * (wanted - state[0]) + 2.0 * (slope - state[1]) + 30.0 * state[2]
+        given = servo * (40.0 * (wanted - state[0]) + 30.0 * state[2]) + 2.0 * (slope - state[1])
+        return wanted, gain * given
 
     def rate(t: float, state: FloatArray, k: int) -> list[float]:
         wanted, torque = terms(t, state, k)

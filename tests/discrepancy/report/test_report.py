@@ -68,6 +68,8 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     assert text.index(headline(drag.verdict)) < text.index("Its size: ") < text.index(said)
     assert f"and {number(held.chi_square_per_dof)} after it" in text
     assert text.count(f"{percent(closed)} % of the gap") == 1
+    for name, factor in (("displacement", 1e3), ("leaf_strain", 1e6)):
+        assert f">{number(factor * held.rms[name])}<" in text
     # no name, no gap to close, no proof
     assert "The best hypothesis, which is no name, closes" in page_of(drag, kind=VerdictKind.GROUP)
     for changed, words in (
@@ -203,6 +205,12 @@ def test_what_can_be_decided(drag, able):
     for group in able.groups:
         assert group[0].replace("_", " ") in text
     assert " add " not in " ".join(needs(able, drag.campaign, FEW, ()))  # trials that its model cannot follow
+    unproved = needs(able, replace(drag.campaign, trials=drag.campaign.fitted), FEW, ())
+    assert [line for line in unproved if "nothing can be proved" in line] == unproved[-1:]
+    assert "nothing can be proved" not in text
+    quiet = {name: replace(item, noise=None) for name, item in drag.campaign.channels.items()}
+    *_, asked = needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
+    assert asked.startswith(f"Give a noise record for {', '.join(quiet)} (")
 
 
 def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag):

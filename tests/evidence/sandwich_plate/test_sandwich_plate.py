@@ -6,22 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evidence.sandwich_plate.__main__ import main, plate_checks
-from evidence.sandwich_plate.plate import (
-    FIELDS,
-    B,
-    Plate,
-    Surface,
-    U,
-    V,
-    W,
-    plane_stress,
-    tensor_mesh,
-)
-from evidence.sandwich_plate.plate_comparison import (
-    compare_with_plate,
-    gauges_at_edges,
-    wing_results,
-)
+from evidence.sandwich_plate.plate import FIELDS, B, Plate, Surface, U, V, W, plane_stress, tensor_mesh
+from evidence.sandwich_plate.plate_comparison import compare_with_plate, gauges_at_edges, wing_results
 from evidence.sandwich_plate.plate_frame import strip_stiffness
 from evidence.sandwich_plate.plate_known_answers import (
     FlatSandwich,

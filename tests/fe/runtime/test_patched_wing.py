@@ -149,14 +149,7 @@ def finer(both: Compared) -> AffineOperators:
     return assemble(both.design.changed(mesh={"span_size": 0.01}))
 
 
-@pytest.mark.parametrize(
-    ("start", "end", "loss"),
-    [
-        (0.2, 0.45, 0.4),
-        (0.75, 1.15, 0.3),
-        (0.5, 0.6, 0.5),
-    ],
-)
+@pytest.mark.parametrize(("start", "end", "loss"), [(0.2, 0.45, 0.4), (0.75, 1.15, 0.3), (0.5, 0.6, 0.5)])
 def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, start, end, loss):
     lines = finer.wing_mesh.span_lines
     start, end = (float(lines[np.abs(lines - place).argmin()]) for place in (start, end))

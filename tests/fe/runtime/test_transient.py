@@ -15,12 +15,7 @@ from tests.fe.runtime.stepping import exact, second_order
 from tests.wings import wing_integrator
 
 ALPHA, BETA = 1.0735, 7.3124e-4  # Kapteyn et al. 2021, fitted to the ring-down of the real wing
-HEALTHY = {
-    "servo_mass": 0.169,
-    "pitot_mass": 0.134,
-    "damping_alpha": ALPHA,
-    "damping_beta": BETA,
-}
+HEALTHY = {"servo_mass": 0.169, "pitot_mass": 0.134, "damping_alpha": ALPHA, "damping_beta": BETA}
 
 
 @pytest.fixture(scope="module")

@@ -62,6 +62,12 @@ def test_a_wrong_design_is_refused_with_one_sentence_that_names_the_place(conten
         parse_design(content, source="wing.toml")
 
 
+@pytest.mark.parametrize("beside", [{"span_start": 0.3}, {"chord_end": 0.3}])
+def test_regions_may_lie_beside_one_another_along_the_span_or_the_chord(content, beside):
+    content["defects"][1] |= beside
+    assert len(parse_design(content).defects) == 2
+
+
 def test_the_modulus_runs_straight_between_stations_and_steps_between_bands(shipped_design):
     stations = [{"station": s, "young_modulus": m} for s, m in ((0.0, 8e9), (0.5, 10e9), (1.0, 6e9))]
     skin = shipped_design.changed(skin={"stations": stations}).skin

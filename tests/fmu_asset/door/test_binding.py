@@ -25,6 +25,7 @@ from fmu_asset.worker.client import WorkerLimits
 from reporting.units import Meaning, meaning_of
 from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed, tables
+from tests.refusals import refused
 
 HERE = Path(__file__).parent
 GOOD = (HERE / "good.toml").read_text("utf-8")
@@ -55,9 +56,8 @@ def test_bad_files_are_one_sentence(tmp_path, case) -> None:
     assert case["old"] in GOOD
     path = tmp_path / "binding.toml"
     path.write_text(GOOD.replace(case["old"], case["new"]), encoding="utf-8")
-    with pytest.raises(BindingError, match=case["sentence"]) as caught:
+    with refused(BindingError, case["sentence"]) as caught:
         load_binding(path)
-    assert "\n" not in str(caught.value)
     assert "binding.toml" in str(caught.value)
 
 

@@ -5,6 +5,7 @@ Both sides hold the wing in the same few vectors; what can differ is the physics
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -38,6 +39,7 @@ from tests.fmu_asset.door.kinds import BINDINGS, KINDS
 from tests.fmu_asset.making import tables
 from tests.fmu_asset.ours import OurFmus, wing_arrays
 from tests.fmu_asset.slaves.slave import OK, Slave
+from tests.refusals import refused as no_line_end
 
 HERE, REFUSED = Path(__file__).parent, tables(__file__)
 SENSORS, WING = (
@@ -343,10 +345,8 @@ def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched) -> N
 def test_patches_that_mean_nothing_are_refused_in_one_sentence(row, model, tmp_path) -> None:
     given = row["text"].encode() if "text" in row else content(json.loads(row["effects"]))
     options = {"arrays": wing_arrays()} if "wing" in row else {}
-    with pytest.raises(PatchFileError) as caught:
+    with no_line_end(PatchFileError, re.escape(row["sentence"])):
         build_fmu(model, tmp_path / "wing.fmu", patch=parse_patch(given), **options)
-    assert row["sentence"] in str(caught.value)
-    assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 

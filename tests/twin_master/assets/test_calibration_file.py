@@ -17,11 +17,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.parameter import draw_parameter
-from twin_master.assets.resolution import (
-    Overrides,
-    asset_source,
-    resolve_scenario,
-)
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.run_folder import to_json
 from twin_master.scenario.schema import Calibration

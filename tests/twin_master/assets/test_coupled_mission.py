@@ -12,7 +12,7 @@ from fmu_asset.errors import FmuError, FmuFileError, SspError
 from reporting.progress import SilentProgress
 from scenarios import binding_files
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import check_same, cut_off_after, journal, table_of, text_of, written
+from tests.twin_master.runs import check_resumed, journal, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
@@ -111,10 +111,7 @@ def test_a_system_of_one_fmu_flies_as_the_fmu_alone(folder, direct, tmp_path):
 def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
     """The FMU cannot save its state: its inputs are replayed. What is flown lies in the run folder."""
     loaded = load_scenario(folder / f"{name}.toml")
-    with cut_off_after(11):
-        new_run(loaded, tmp_path / "part")
-    resume(tmp_path / "part")
-    check_same(tmp_path / "part", direct[name], "run.nc", "config.json", "summary.json", "journal.jsonl")
+    check_resumed(direct[name], loaded, tmp_path / "part", 11)
     ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
     flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
     assert rows(flown) == rows(direct[name])
@@ -244,10 +241,7 @@ def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path):
     whole = new_run(loaded, tmp_path / "whole").folder
     inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
     assert rows(inside) == rows(whole)
-    with cut_off_after(9):
-        new_run(loaded, tmp_path / "part")
-    resume(tmp_path / "part")
-    check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "journal.jsonl")
+    check_resumed(whole, loaded, tmp_path / "part", 9)
     received = np.genfromtxt(whole / "csv" / "observed.csv", delimiter=",", skip_header=1)[:, 6]
     assert np.flatnonzero(np.isnan(received)).tolist() == [20, 21, 22, 23]  # the sixth gauge is lost
     ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)

@@ -12,24 +12,20 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.optimize import brentq
-from scipy.stats import norm
 
 from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
 from scenarios import asset_scripts
-from tests.refusals import Inputs
+from tests.refusals import Inputs, refused
 from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, merged, table_of
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
-from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
+from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.library.grid import grid_of_scenario
 from twin_master.library.sampling import sample_library
-from twin_master.network.graphical_model import Factor, StateSpace, deterministic_policy
-from twin_master.network.inference import predict, smooth
-from twin_master.network.transition import TransitionModel
+from twin_master.network.inference import known_control
 from twin_master.scenario.reading import LoadedScenario
-from twin_master.store.writing import open_run
-from uav_twin import GraphicalModel, filter_sequence, fly, load_scenario, resume
+from uav_twin import fly, load_scenario, prepare_twin, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
 INPUTS = Inputs(__file__)
@@ -115,7 +111,7 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
 
 @pytest.mark.parametrize(("key", "entry", "words"), INPUTS.refused("library"))
 def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
-    with pytest.raises(InvalidObservationLibraryError, match=words):
+    with pytest.raises(MissionInputError, match=words):
         fly(changed(key, entry), tmp_path / "run", Overrides(library=made))
 
 
@@ -147,14 +143,11 @@ def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
         wrong.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
         cases[name] = "finite"
     for name, words in cases.items():
-        with pytest.raises(InvalidObservationLibraryError, match=words) as caught:
+        with refused(MissionInputError, words):
             load_observation_library(tmp_path / f"{name}.nc")
-        assert "\n" not in str(caught.value)
-    given: dict[str, Any] = {
-        "overrides": Overrides(strain_library=library_file),
-    }
-    with pytest.raises(InvalidObservationLibraryError, match="kind `strain_library`, and one FMU can be"):
-        grid_of_scenario(load_scenario("level_turns"), tmp_path, **given)
+    given = Overrides(strain_library=library_file)
+    with pytest.raises(MissionInputError, match="kind `strain_library`, and one FMU can be"):
+        grid_of_scenario(load_scenario("level_turns"), tmp_path, overrides=given)
 
 
 @pytest.mark.parametrize(("key", "entry", "words"), INPUTS.refused("pump"))
@@ -208,66 +201,25 @@ def move(control: str, before: int, after: int) -> float:
     return result
 
 
-@pytest.fixture(scope="module", params=["asset", "library"])
-def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    folder = tmp_path_factory.mktemp("pump")
-    overrides = Overrides(library=sampled(folder) if request.param == "library" else None)
-    return open_run(fly(small_pump(), folder / "run", overrides, report=False).folder)
-
-
-@pytest.fixture(scope="module")
-def shown(run: Any) -> list[Float]:
-    """What the equations say at each shift: states x draws x sensors."""
-    controls, draws = run["policy"]["control"].values, run["calibration"]["draw_value"].values
-    tables = {
-        index: np.array([[show(str(controls[index]), *state, e) for e in draws] for state in STATES])
-        for index in set(run["observed"]["control_index"].values.tolist())
-    }
-    return [tables[index] for index in run["observed"]["control_index"].values.tolist()]
-
-
-def test_filter_smoother_and_prediction_are_those_of_the_equations(run, shown):
-    """Tables of the equations and of the probabilities above, inferred as `network` does."""
-    observed, flown = run["observed"]["operation"].values, run["observed"]["control_index"].values
-    controls = [str(name) for name in run["policy"]["control"].values]
-    assert np.isnan(observed).sum() == 5  # one sensor once, and all of them once
-    assert len(set(flown)) > 1
-    likelihood = [  # a lost sensor says nothing
-        np.nanprod(norm.pdf(seen, table, NOISE), axis=2).mean(axis=1)
-        for seen, table in zip(observed, shown, strict=True)
-    ]
-    states = range(len(STATES))
-    matrix = np.array([[[move(name, a, b) for b in states] for a in states] for name in controls])
-    space = StateSpace((Factor("wear", WEAR), Factor("clogging", CLOGGING)))
-    model = GraphicalModel(space, tuple(controls), space.certain((0.0, 0.0)), TransitionModel((matrix,)))
-    filtered = filter_sequence(model, flown, np.log(likelihood))
-    policy = deterministic_policy(run["policy"]["control_index"].values, len(controls))
-    ahead = predict(model, filtered.filtered[-1], flown[-1], policy, run["predicted"].sizes["horizon"])
-    near = {"rtol": 1e-7, "atol": 1e-13}
-    for group, name, expected in (
-        ("filtered", "probability", filtered.filtered),
-        ("filtered", "log_evidence", filtered.log_evidence),
-        ("smoothed", "probability", smooth(model, flown, filtered.log_filtered)),
-    ):
-        np.testing.assert_allclose(run[group][name].values, expected, **near)
-    for name, expected in (
-        ("probability", ahead.predicted),
-        ("control_probability", ahead.control_probability),
-    ):
-        np.testing.assert_allclose(run["predicted"][name].values[-1], expected, **near)
-
-
-def test_rewards_are_those_of_the_sensors_that_have_a_limit(run, shown):
-    for t, values in enumerate(shown):
-        health = 1.0 - np.maximum(values[..., 2] / 50.0, values[..., 3] / 5.0)
-        seen, probability = run["observed"]["operation"].values[t], run["filtered"]["probability"].values[t]
-        reward = run["filtered"]["reward_mean"].values[t]
-        assert reward[0] == pytest.approx(probability @ health.mean(axis=1), rel=1e-8)
-        if np.isnan(seen).all():
-            assert np.isnan(reward[2])
-        else:
-            error = np.nanmean(-np.abs(seen - values) / NOISE, axis=2).mean(axis=1)
-            assert reward[2] == pytest.approx(probability @ error, rel=1e-7)
+@pytest.mark.parametrize("believed", ["asset", "library"])
+def test_what_the_twin_knows_is_what_the_equations_say(believed, tmp_path):
+    """What all sensors show by draw, state and control; moves; the worth of the sensors that have a limit."""
+    known = prepare_twin(
+        small_pump(), Overrides(library=sampled(tmp_path) if believed == "library" else None)
+    )
+    controls, draws, states = known.model.controls, known.draws.values, range(len(STATES))
+    shown = np.array([[[show(u, *state, e) for u in controls] for state in STATES] for e in draws])
+    np.testing.assert_allclose(known.sensor_model.value_per_draw, shown, rtol=1e-7)
+    np.testing.assert_array_equal(known.sensor_model.standard_deviation, NOISE)
+    matrix = [[[move(u, a, b) for b in states] for a in states] for u in controls]
+    np.testing.assert_allclose(known.model.transition.matrix, matrix, atol=1e-15)
+    health = 1.0 - np.maximum(shown[..., 2] / 50.0, shown[..., 3] / 5.0)
+    np.testing.assert_allclose(known.rewards.health_per_draw, health, rtol=1e-7)
+    seen = shown[0, 0, 1] + [np.nan, 0.2, 0.3, -0.1]  # a lost sensor says nothing
+    believes = known_control(np.eye(len(STATES))[4], 1, len(controls))
+    error = np.nanmean(-np.abs(seen - shown[:, 4, 1]) / NOISE, axis=1).mean()
+    found, _ = known.rewards.expectation(believes, seen)
+    assert (found[0], found[2]) == pytest.approx((health[:, 4, 1].mean(), error), rel=1e-7)
 
 
 @pytest.mark.long
@@ -278,5 +230,5 @@ def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path):
     names = [f"csv/{file.name}" for file in (tmp_path / "asked" / "csv").iterdir()]
     check_same(tmp_path / "sampled", tmp_path / "asked", *names)
     # With another seed the draws are others, inside the sampled range only for some.
-    with pytest.raises(InvalidObservationLibraryError, match="scenario and seed"):
+    with pytest.raises(MissionInputError, match="scenario and seed"):
         fly(small_pump(), tmp_path / "other", Overrides(library=library.library, seed=3))

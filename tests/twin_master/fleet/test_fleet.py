@@ -1,6 +1,7 @@
 """Fleets: plan, shards, store, what goes on after a kill, and what is refused."""
 
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -14,8 +15,9 @@ from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, edited, flight_of, text_of, written
 from twin_master.assets.resolution import Overrides
-from twin_master.errors import FleetError, NotResumableError, RunFolderExistsError
+from twin_master.errors import FleetError, NotResumableError, RunFolderError
 from twin_master.fleet import flight
+from twin_master.fleet.command import engine_of
 from twin_master.fleet.flight import group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Estimated, group_figures
@@ -95,7 +97,7 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
 def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
     fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
     fly_fleet(fleet, folder)
-    with pytest.raises(RunFolderExistsError, match="another fleet"):
+    with pytest.raises(RunFolderError, match="another fleet"):
         fly_fleet(other, folder)
     record = json.loads((folder / "config.json").read_text())
     record["provenance"]["versions"]["numpy"] = "0.1"
@@ -104,11 +106,11 @@ def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
         fly_fleet(fleet, folder)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").touch()
-    with pytest.raises(RunFolderExistsError, match="there is no folder"):
+    with pytest.raises(RunFolderError, match="there is no folder"):
         open_fleet(tmp_path / "nowhere")
-    with pytest.raises(RunFolderExistsError, match="not the folder of a fleet"):
+    with pytest.raises(RunFolderError, match="not the folder of a fleet"):
         open_fleet(tmp_path / "other")
-    with pytest.raises(RunFolderExistsError, match="not touched"):
+    with pytest.raises(RunFolderError, match="not touched"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(other, folder, replace_old=True).twins == 3
 
@@ -220,6 +222,12 @@ def test_the_command_line(library_file, tmp_path):
     (notices,) = (tmp_path / "b" / "fleet.zarr").glob("*/notices")
     shutil.rmtree(notices)
     assert "lacks notices: fly the fleet again" in refused("compare", tmp_path / "a", tmp_path / "b")
+
+
+def test_all_processors_fly_unless_the_user_says_how_many():
+    cores = len(os.sched_getaffinity(0))
+    assert [engine_of(workers, None).workers for workers in (None, 0, 3)] == [cores, 0, 3]
+    assert engine_of(None, "tcp://127.0.0.1:9") == Engine(cluster="tcp://127.0.0.1:9")
 
 
 def test_without_the_extra_or_a_scheduler_nothing_is_begun(library_file, tmp_path, monkeypatch):

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from tests.twin_master.network.decision_oracles import enumerate_trajectories
+from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import group_folder
-from twin_master.fleet.learn import learn_fleet
+from twin_master.fleet.learn import _noisier, learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
 from twin_master.fleet.reading import attention
@@ -28,6 +29,8 @@ from uav_twin import (
     open_fleet,
 )
 
+EACH = {"2g": 0.07, "3g": 0.2}
+
 
 def tiny(
     probability: object, levels: int = 3, name: str = "growing_damage", success: float = 1.0
@@ -44,46 +47,40 @@ def tiny(
 
 
 @pytest.mark.parametrize(
-    "probability", [{"2g": 0.07, "3g": 0.2}, {"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}}]
+    ("probability", "name", "success"),
+    [
+        (EACH, "growing_damage", 1.0),
+        ({"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}}, "growing_damage", 1.0),
+        (EACH, "inspected_wing", 1.0),
+        (EACH, "inspected_wing", 0.7),
+    ],
 )
-def test_evidence_of_a_twin_is_that_of_all_paths(probability):
-    scenario = tiny(probability)
-    worsening = Worsening.of(scenario)
-    assert len(worsening.names) == (2 if "z1" not in str(probability) else 4)
+def test_evidence_of_a_twin_is_that_of_all_paths(probability, name, success):
+    """Also of one that is repaired."""
+    scenario = tiny(probability, name=name, success=success)
+    worsening, controls = Worsening.of(scenario), len(scenario.control)
+    assert len(worsening.names) == (controls if probability is EACH else 4)
     generator = np.random.default_rng(4)
     likelihood = generator.random((2, 4, 9))
-    control = generator.integers(0, 2, (2, 4))
+    control = generator.permuted(np.tile(np.arange(4 + controls) % controls, (2, 1)), axis=1)[:, :4]
     points = np.array([worsening.assumed, 0.5 * worsening.assumed + 0.3])
     found = transition_evidence(worsening, points, likelihood, control)
     for row, point in enumerate(points):
         given: dict[str, object] = {}
-        for name, value in zip(worsening.names, point.tolist(), strict=True):
-            own, _, factor = name.partition(", ")
+        for place, value in zip(worsening.names, point.tolist(), strict=True):
+            own, _, factor = place.partition(", ")
             if factor:
                 given.setdefault(own, {})[factor] = value  # type: ignore[index]
             else:
                 given[own] = value
-        model = build_graphical_model(tiny(given))
+        model = build_graphical_model(tiny(given, name=name, success=success))
         for twin in range(2):
             *_, expected = enumerate_trajectories(model, control[twin], np.log(likelihood[twin]))
             assert found[twin, row] == pytest.approx(expected.sum(), abs=1e-12)
 
 
-@pytest.mark.parametrize("success", [1.0, 0.7])
-def test_evidence_of_a_twin_that_is_repaired_is_that_of_all_paths(success):
-    scenario = tiny({"2g": 0.07, "3g": 0.2}, name="inspected_wing", success=success)
-    model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
-    generator = np.random.default_rng(6)
-    likelihood = generator.random((3, 4, 9))
-    control = generator.permuted(np.tile(np.arange(5), (3, 1)), axis=1)[:, :4]
-    found = transition_evidence(worsening, worsening.assumed[None], likelihood, control)[:, 0]
-    for twin, own in enumerate(control):
-        *_, expected = enumerate_trajectories(model, own, np.log(likelihood[twin]))
-        assert found[twin] == pytest.approx(expected.sum(), abs=1e-12)
-
-
 def test_evidence_is_that_of_the_filter():
-    scenario = tiny({"2g": 0.07, "3g": 0.2}, levels=5)
+    scenario = tiny(EACH, levels=5)
     model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
     generator = np.random.default_rng(5)
     values = 1e-3 * (1.0 + generator.random((3, 25, 2, 24)))
@@ -231,6 +228,33 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
     found = scenario.observation.standard_deviation
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
+
+
+def test_nothing_is_learnt_of_the_control_that_was_flown_last(library_file, tmp_path):
+    """A turn of 3g, and one of 2g that nothing follows."""
+    text = text_of("growing_damage", ("steps = 50", "steps = 2"), ('"2g" = -0.1, "3g"', '"2g" = 9.0, "3g"'))
+    fleet = ensemble(str(written(tmp_path, text)), range(2), Overrides(strain_library=library_file))
+    (record,) = learn_fleet(fly_fleet(fleet, tmp_path / "fleet").folder)["groups"].values()
+    flown = {control: rate["flown"] for control, rate in record["probability"].items()}
+    assert flown == {"2g": False, "3g": True}
+
+
+def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
+    """Readings of inspections, too: without them damage that is found and repaired would not have been."""
+    text = text_of("inspected_wing", ("steps = 120", "steps = 5"), ('policy = "belief"', 'policy = "qmdp"'))
+    path = written(tmp_path, text, ('first_control = "3g"', 'first_control = "inspect"'))
+    fleet = ensemble(str(path), range(3))
+    folder = fly_fleet(fleet, tmp_path / "fleet").folder
+    (stored,) = open_fleet(folder).values()
+    (group,) = fleet.groups
+    known = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
+    rows, control = stored["observed"].values, stored["control_index"].values.astype(int)
+    assert np.isfinite(rows[:, 0, 24:]).all()
+    worsening = Worsening.of(known.scenario)
+    model = _noisier(known.sensor_model, 1.0)  # as the lessons are learnt with
+    scaled, common = scaled_likelihood(model, rows.astype(float), control)
+    found = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
+    np.testing.assert_allclose(found, stored["log_evidence"].values.sum(axis=1), rtol=1e-5)
 
 
 def test_what_was_learnt_must_fit(grown, tmp_path):

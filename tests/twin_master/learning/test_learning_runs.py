@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,8 @@ from reporting.page import ReportFigure
 from scenarios import scenario_files
 from tests.command_line import said
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, figures_of, journal, text_of, written
+from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
 from twin_master.errors import TwinMasterError
-from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import gap_of
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.model import learnt_figure, sensor_rows
@@ -26,9 +24,10 @@ from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
+from twin_master.store.mission_result import MissionResult
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
-from uav_twin import ExactFilter, load_scenario, prepare_twin, resume
+from uav_twin import ExactFilter, load_scenario, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -111,6 +110,15 @@ def test_the_truth_stands_where_the_scenario_tells_it(run):
     np.testing.assert_allclose(truth["noise_scale"], 150 / 125)
     np.testing.assert_array_equal(truth["gauge_gain"], 0.0)
     assert "transition_factor" not in truth  # scripted damage has no probability
+
+
+@pytest.mark.parametrize(("faster", "truth"), [({"2g": 0.1, "3g": 0.2}, 2.0), ({"2g": 0.1, "3g": 0.1}, None)])
+def test_the_true_factor_is_that_of_the_true_probabilities(faster, truth):
+    learning = {"parameter": False, "noise": False, "transition_factors": [1.0, 2.0]}
+    changes = {"learning": learning, "truth": {"probability": faster}, "mission": {"steps": 2}}
+    known, source = of_wing(changed_scenario("growing_damage", changes | {"notice": False}).scenario)
+    (factor,) = MissionResult(known.scenario, known, flight_of(known, source), known.truth(3)).learnt
+    assert (factor.name, factor.truth) == ("transition_factor", truth)
 
 
 def test_the_summary_says_what_was_learnt_and_what_was_believed_before(scenario, folder, learnt, summary):
@@ -330,13 +338,3 @@ def test_the_report_has_the_alarm(noticed):
     assert decided["key"] == "decided_by"
     assert f"what decides its control is: {decided['value']}" in text
     assert "gauge 12 shows 1e+14 microstrain" in text
-
-
-def test_a_run_that_was_cut_off_ends_the_same(noticed):
-    cut = Path(shutil.copytree(noticed, noticed.parent / "cut"))
-    lines = (cut / JOURNAL_NAME).read_text().splitlines(keepends=True)
-    (cut / JOURNAL_NAME).write_text("".join(lines[:6]))
-    for name in ("run.nc", "summary.json"):
-        (cut / name).unlink()
-    resume(cut, report=False)
-    check_same(cut, noticed, "run.nc", "summary.json")

@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import switching
-from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.switching import at_first, one_turn_later
 from twin_master.learning.words import Words
 from twin_master.mission.journal import line_of, turn_record
@@ -22,7 +22,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import Reading, Turn
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.twin import TwinTurn
-from twin_master.scenario.tables import Noticing
+from twin_master.scenario.tables import Learning, Noticing
 from uav_twin import (
     Carried,
     Estimate,
@@ -224,8 +224,11 @@ def test_false_alarms_are_rarer_than_the_threshold_says(width):
 def twins() -> dict[str, Twin]:
     """Return twins of two gauges that do not learn, learn, and give notice beside either."""
     model, sensors = small(2)
-    priors = LearntPriors("e", DRAWS, noise_degrees=10.0, gain=0.1, offset=1.0)
-    inner = {"exact": ExactFilter(model, sensors), "learning": LearningFilter(model, sensors, priors)}
+    priors = Learning(noise_degrees=10.0, gauge_gain=0.1, gauge_offset=1.0)
+    inner = {
+        "exact": ExactFilter(model, sensors),
+        "learning": LearningFilter(model, sensors, priors, ("e", DRAWS)),
+    }
     own = inner | {f"watchful {name}": WatchfulEstimator(e, sensors, DRAWS) for name, e in inner.items()}
     return {name: Twin(name, model, sensors, np.ones((3, 1)), estimator=e) for name, e in own.items()}
 

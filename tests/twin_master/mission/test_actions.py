@@ -19,7 +19,7 @@ from tests.twin_master.runs import edited, flight_of, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
-from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     decision_problem,
@@ -29,19 +29,14 @@ from twin_master.mission.planning import (
     read_policy,
     risk_of,
 )
-from twin_master.mission.preparation import (
-    Knowledge,
-    keep_knowledge,
-    kept_knowledge,
-    knowledge_of,
-)
+from twin_master.mission.preparation import Knowledge, keep_knowledge, kept_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.tables import Noticing
+from twin_master.scenario.tables import Learning, Noticing
 from twin_master.store.writing import open_run
 from uav_twin import Carried, ExactFilter, WatchfulEstimator, reduced_model
 
@@ -73,7 +68,7 @@ def known_of(written: Scenario) -> Knowledge:
 def following(known: Knowledge, policy: BeliefPolicy, written: Scenario | None = None) -> Knowledge:
     """Return the same knowledge with a policy on the belief."""
     per_draw = known.sensor_model.value_per_draw
-    return knowledge_of(written or known.scenario, known.model, known.draws, per_draw, policy)
+    return Knowledge(written or known.scenario, known.model, known.draws, per_draw, policy)
 
 
 def side_by_side(known: Knowledge, seeds: int) -> Flights:
@@ -125,7 +120,7 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
     known = knowledge()
     model, sensors = known.model, known.sensor_model
     exact = ExactFilter(model, sensors, "x")
-    others: list[Estimator] = [LearningFilter(model, sensors, LearntPriors())]
+    others: list[Estimator] = [LearningFilter(model, sensors, Learning(noise=False))]
     if not gauges:  # then no hypothesis about them is told from another, however probable it is
         wary = Noticing(prior=0.3)
         others.append(WatchfulEstimator(exact, sensors, known.draws.values, wary))

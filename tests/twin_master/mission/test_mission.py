@@ -8,18 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.seeds import fly_seeds
 from reporting.errors import DiskFullError
 from tests.twin_master.runs import flight_of, journal, of_library, table_of
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
-from twin_master.errors import AssetOutputError, NotResumableError
+from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission import loop
-from twin_master.mission.journal import (
-    JOURNAL_NAME,
-    JournalFile,
-    line_of,
-)
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
 from twin_master.mission.loop import fly, kept_in, taken_up
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Plant, SensorStatus, Truth
@@ -41,7 +36,7 @@ def paper(library_file: Path) -> Known:
     return of_library("paper_level_turns", library_file, 1)
 
 
-@pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges"])
+@pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"])
 def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
     knowledge, source = of_library(name, library_file)
 
@@ -61,8 +56,10 @@ def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
         assert rest.resumed_at == turns
         assert (tmp_path / JOURNAL_NAME).read_bytes() == content
         assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
+        assert rest.notices == whole.notices
         for array in ARRAYS:
             np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
+    assert whole.notices or name != "failing_gauges"
 
 
 def test_timing_of_a_turn(paper):
@@ -101,23 +98,18 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
     def short(_control: object, _health: object) -> AssetReading:
         return AssetReading(np.zeros(3))
 
-    with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
+    with pytest.raises(MissionInputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
         flight_of(*paper, kept.append, asset=StatelessAsset(broken))
-    with pytest.raises(AssetOutputError, match="expects 24 values"):
+    with pytest.raises(MissionInputError, match="expects 24 values"):
         flight_of(*paper, asset=StatelessAsset(short))
 
 
-def test_study_on_the_published_library(published_library):
-    """Policy and reliability of the reference twin; the bars are those of 300 missions, widened for 60."""
-    knowledge, source = of_library("paper_level_turns", published_library, 0)
+def test_the_policy_on_the_published_library(published_library):
+    knowledge, _ = of_library("paper_level_turns", published_library, 0)
     z1 = knowledge.model.states.coordinates[:, 0]
     np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
     margin = (knowledge.plan.action_value[:, 1] - knowledge.plan.action_value[:, 0]).reshape(5, 5)
     np.testing.assert_allclose(margin[2:4], np.repeat([[0.007], [-0.059]], 5, axis=1), atol=5e-4)
-    study = fly_seeds(knowledge.scenario, source, range(60))
-    assert study.within.value >= 0.95
-    assert study.early.value <= 0.2
-    assert np.all([study.rms[0].value <= 0.045, study.rms[1].value <= 0.13])
 
 
 def truth_of(scenario: Scenario | str, seed: int = 1) -> Truth:
@@ -132,23 +124,6 @@ def test_the_papers_history():
     z1 = [0] * 10 + list(range(2, 21, 2)) + [40] * 10 + [60] * 20
     z2 = [0] * 5 + list(range(22, 41, 2)) + [40] * 10 + [60] * 25
     np.testing.assert_array_equal(history, np.array([z1, z2]).T / 100.0)
-
-
-def test_random_growth_follows_the_transitions_of_the_control():
-    scenario = load_scenario("growing_damage").scenario
-    model, worse = build_graphical_model(scenario), np.zeros((2, 2))
-    for seed in range(60):
-        truth = Truth(scenario, model, seed)
-        for control in (0, 1):
-            state = truth.state(0, None, None)
-            for step in range(1, 50):
-                new = truth.state(step, state, control)
-                assert np.all((new == state) | np.isclose(new, state + 0.2))
-                worse[control] += [np.sum((new > state)[state < 0.79]), np.sum(state < 0.79)]
-                state = new
-    rate = worse[:, 0] / worse[:, 1]
-    error = np.sqrt(rate * (1 - rate) / worse[:, 1])
-    assert np.all(np.abs(rate - [0.05, 0.10]) < 4 * error)
 
 
 def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn():

@@ -17,8 +17,10 @@ from scenarios import structure_files
 from tests.command_line import refused, said
 from tests.twin_master.runs import of_wing
 from twin_master.errors import MissionInputError
+from twin_master.mission import sensor_design
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations
+from twin_master.plan_command import _without
 
 
 @cache
@@ -38,6 +40,16 @@ def test_the_information_of_a_sensor_is_that_of_an_integral():
 
     exact = quad(entropy, -9.0, 12.0, limit=200)[0] - 0.5 * np.log2(2.0 * np.pi * np.e)
     assert readings.information([0]) == pytest.approx(exact, abs=0.01)
+
+
+@pytest.mark.parametrize("samples", [7, 30])
+def test_readings_are_drawn_in_states_that_are_all_alike_probable(samples, monkeypatch):
+    monkeypatch.setattr(sensor_design, "SAMPLES", samples)
+    for readings in drawn_readings(knowledge()):
+        times = np.bincount(readings.state, minlength=25)
+        assert times.max() == 1
+        assert times.sum() == min(samples, 25)
+        assert len({*(readings.state // 5)}) > 2  # not only where the first region is sound
 
 
 def test_what_moves_all_sensors_together_is_a_covariance():
@@ -79,6 +91,16 @@ def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_tol
     assert max(far for (name, _), far in apart.items() if name == "z2") < 1.0
     fewer = separations(known, readings, [16, 23])
     assert all(fewer[place] <= far + 1e-9 for place, far in apart.items())
+
+
+def test_a_gauge_that_is_taken_away_tells_nothing_whatever_its_unit():
+    known, size = knowledge(), 1e12
+    observation = known.scenario.observation.model_copy(update={"standard_deviation": size * 125e-6})
+    large = known.scenario.model_copy(update={"observation": observation})
+    values = size * known.sensor_model.value_per_draw
+    model = _without(Knowledge(large, known.model, known.draws, values), ["24"]).sensor_model
+    seen = np.where(np.arange(24) == 23, values[0, 0, 1], np.nan)
+    assert np.ptp(model.log_likelihood(seen, 1)) < 1e-6
 
 
 def test_the_command_chooses_draws_and_names_what_is_not_separated(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from fmu_asset.errors import FmuEndedError
 from tests.twin_master.runs import of_library
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
-from twin_master.errors import AssetOutputError
+from twin_master.errors import MissionInputError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import ENDED, FLOWN, in_credible_set, outcomes_of
 from twin_master.mission.loop import fly
@@ -20,7 +20,7 @@ from twin_master.mission.truth import DamageGrowth
 from twin_master.network.transition import TransitionModel
 from uav_twin import GraphicalModel, load_scenario
 
-ARRAYS = ("observed", "control_index", "state", "filtered", "log_evidence")
+ARRAYS = ("row", "control_index", "state", "filtered", "log_evidence")
 
 
 def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[Knowledge, StatelessAsset]:
@@ -87,7 +87,7 @@ def test_an_asset_that_fails_does_not_touch_the_others(driven, library_file):
     truths = [knowledge.truth(seed) for seed in range(6)]
     whole = fly_side_by_side(knowledge, truths, [asset] * 6)
     assert same(whole, fly_side_by_side(knowledge, truths, [driven(asset) for _ in truths]))
-    soft = until_soft(asset, AssetOutputError("too soft"))
+    soft = until_soft(asset, MissionInputError("too soft"))
     found = fly_side_by_side(knowledge, truths, [driven(soft) for _ in truths])
     softened = whole.state[:, :, 0] >= 0.4 - 1e-9
     assert [text != "" for text in found.failure] == softened.any(axis=1).tolist()

@@ -11,22 +11,20 @@ from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpa
 from twin_master.network.transition import TransitionModel
 
 
-def random_model(rng, shape=(2, 2), controls=2, zeros=0.4, sparse_prior=True):
-    """A model with random dense-with-holes transitions."""
-    size = int(np.prod(shape))
-    matrix = rng.dirichlet(np.ones(size), (controls, size))
-    matrix[rng.random(matrix.shape) < zeros] = 0.0
-    for control in range(controls):
-        for state in range(size):
-            matrix[control, state, rng.integers(size)] += 0.1
-    matrix /= matrix.sum(axis=2, keepdims=True)
+def random_model(rng, shape=(2, 2), zeros=0.4, product=False):
+    """A model with random dense-with-holes transitions under two controls: a table of all states, or one
+    for each factor."""
+    size, tables = int(np.prod(shape)), []
+    for count in shape if product else (size,):
+        table = rng.dirichlet(np.ones(count), (2, count))
+        table[rng.random(table.shape) < zeros] = 0.0
+        table[:, np.arange(count), rng.integers(count, size=count)] += 0.1
+        tables.append(table / table.sum(axis=2, keepdims=True))
     prior = rng.dirichlet(np.ones(size))
-    if sparse_prior:
-        prior[rng.random(size) < zeros] = 0.0
-        prior[rng.integers(size)] += 0.1
-        prior /= prior.sum()
+    prior[rng.random(size) < zeros] = 0.0
+    prior[rng.integers(size)] += 0.1
     space = StateSpace(tuple(Factor(f"f{i}", tuple(map(float, range(n)))) for i, n in enumerate(shape)))
-    return GraphicalModel(space, tuple(f"u{i}" for i in range(controls)), prior, TransitionModel((matrix,)))
+    return GraphicalModel(space, ("u0", "u1"), prior / prior.sum(), TransitionModel(tuple(tables)))
 
 
 def enumerate_trajectories(model, control, log_likelihood):

@@ -37,9 +37,9 @@ def infer(model, control, log_likelihood):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_filter_smoother_and_evidence_equal_enumeration(seed):
-    """Transitions with zeros; steps that show nothing, or rule states out; every trajectory."""
+    """Transitions with zeros, products too; steps that show nothing, or rule states out; every trajectory."""
     rng = np.random.default_rng(seed)
-    model = random_model(rng, (2, 2) if seed % 2 else (5,), zeros=0.4 * (seed != 3))
+    model = random_model(rng, (2, 2) if seed % 2 else (5,), 0.4 * (seed != 3), product=seed % 4 == 1)
     steps = 5
     control = rng.integers(0, 2, steps)
     log_likelihood = rng.normal(size=(steps, model.states.size)) * 4
@@ -55,15 +55,16 @@ def test_filter_smoother_and_evidence_equal_enumeration(seed):
     np.testing.assert_array_equal(np.exp(filtered.log_filtered) == 0, oracle[1] == 0)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_prediction_equals_enumeration(seed):
+@pytest.mark.parametrize("product", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_prediction_equals_enumeration(seed, product):
     """The control node is marginalised: every trajectory of states and controls is summed."""
     rng = np.random.default_rng(seed)
-    model = random_model(rng, shape=(3,))
-    policy = model.policy(rng.dirichlet(np.ones(2), 3) if seed % 2 else np.eye(2)[rng.integers(0, 2, 3)])
-    belief = rng.dirichlet(np.ones(3))
-    predicted = predict(model, belief, seed % 2, policy, 4)
-    oracle = enumerate_prediction(model, belief, seed % 2, policy, 4)
+    model = random_model(rng, product=product)
+    policy = model.policy(rng.dirichlet(np.ones(2), 4) if seed % 2 else np.eye(2)[rng.integers(0, 2, 4)])
+    belief = rng.dirichlet(np.ones(4))
+    predicted = predict(model, belief, seed % 2, policy, 3)
+    oracle = enumerate_prediction(model, belief, seed % 2, policy, 3)
     np.testing.assert_allclose(predicted.joint, oracle, **EXACT)
     np.testing.assert_allclose(predicted.predicted, oracle.sum(axis=2), **EXACT)
     np.testing.assert_allclose(predicted.control_probability, oracle.sum(axis=1), **EXACT)
@@ -91,11 +92,15 @@ def test_smoothing_and_prediction_equal_variable_elimination(seed):
     scale=st.sampled_from([1.0, 300.0, 1e4, 1e6]),
     steps=st.integers(1, 40),
     shift=st.sampled_from([0.0, -1e5, 1e5]),
+    product=st.booleans(),
 )
-def test_extreme_likelihoods_equal_arbitrary_precision(seed, scale, steps, shift):
+def test_extreme_likelihoods_equal_arbitrary_precision(seed, scale, steps, shift, product):
     """Differences of thousands of nats and more: entries that are zero in double precision come back."""
     rng = np.random.default_rng(seed)
-    model = random_model(rng, shape=(2, 3), zeros=0.6)
+    model = random_model(rng, shape=(2, 3), zeros=0.6, product=product)
+    assert model.transition.is_product is product
+    value, matrix = rng.normal(size=6), model.transition.matrix[1]
+    np.testing.assert_allclose(model.transition.expected(1, value), matrix @ value, atol=1e-14)
     control = rng.integers(0, 2, steps)
     log_likelihood = rng.normal(size=(steps, 6)) * scale + shift
     filtered, smoothed = infer(model, control, log_likelihood)

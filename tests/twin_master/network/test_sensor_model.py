@@ -107,6 +107,7 @@ def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
     np.testing.assert_allclose(model.log_density_of_draws(observation[None], [1])[0], each, **close)
     identified = IdentifiedSensorModel(values, deviation, weight, interval=interval)
     np.testing.assert_allclose(identified.log_likelihood(observation, 1), expected, **close)
+    np.testing.assert_allclose(identified.log_density_of_draws(observation[None], [1])[0], each, **close)
     total = np.sqrt(np.einsum("sugg->sug", covariance))
     np.testing.assert_allclose(model.total_standard_deviation, total)
     printed = GaussianSensorModel(values, deviation, weight, "inside", interval=interval)

@@ -126,6 +126,8 @@ def test_belief_maps_show_the_joint_belief(run):
         mesh = axes.collections[0].get_array().reshape(5, 5)
         assert_array_equal(mesh, run["filtered/probability"][turn].reshape(5, 5).T)
         assert f"turn {turn}" in axes.get_title(loc="left")
+    named = [(bool(axes.get_xlabel()), bool(axes.get_ylabel())) for axes in figure.axes[:8]]
+    assert named == [(lowest, first) for lowest in (False, True) for first in (True, *(False,) * 3)]
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -172,15 +174,17 @@ def test_predictive_check_by_hand(run):
 
 
 @pytest.mark.parametrize("error", [0.03, [0.01 * (gauge % 3) for gauge in range(24)]])
-def test_a_model_error_counts_in_the_predictive_check(run, error):
+def test_all_that_the_twin_leaves_unsaid_counts_in_the_predictive_check(run, error):
     without, doubting = predictive_check(run), rescripted(run, observation={"model_error": error})
-    check = predictive_check(doubting)
-    variance = 125e-6**2 + run["filtered/quantity_standard_deviation"] ** 2
-    wider = variance + (np.asarray(error) * run["filtered/quantity_mean"]) ** 2
-    assert_allclose(check.residual, without.residual * np.sqrt(variance / wider))
+    unsaid = np.hypot(125e-6, np.asarray(error) * run["filtered/quantity_mean"])
+    check = predictive_check(altered(doubting, filtered__noise_standard_deviation=unsaid))
+    known = run["filtered/quantity_standard_deviation"] ** 2
+    assert_allclose(check.residual, without.residual * np.sqrt((125e-6**2 + known) / (unsaid**2 + known)))
     share = "3 %" if isinstance(error, float) else "0 to 2 %"
     assert report._check_words(doubting, check)["error"] == share
     assert report._check_words(run, without)["error"] == ""
+    old = altered(run, filtered__noise_standard_deviation=None)  # as earlier versions wrote it
+    assert_allclose(predictive_check(old).residual, without.residual)
 
 
 def test_calibration_shows_draws_posterior_and_measurements(run):

@@ -15,7 +15,7 @@ from tests.refusals import Inputs, refused
 from tests.twin_master.runs import table_of, text_of, written
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, FlownAndBelieved, StatelessAsset
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.errors import ScenarioError, TwinMasterError, UnknownScenarioError
+from twin_master.errors import ScenarioError, TwinMasterError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.graphical_model import worsening_table
 from twin_master.scenario.asset import AssetSection
@@ -63,7 +63,7 @@ def test_files_that_are_none_or_name_what_is_not_there(tmp_path):
     ):
         with pytest.raises(ScenarioError, match=sentence):
             load_scenario(written(tmp_path, text))
-    with pytest.raises(UnknownScenarioError, match="level_turns"):
+    with pytest.raises(ScenarioError, match="level_turns"):
         load_scenario("level_turn")
 
 

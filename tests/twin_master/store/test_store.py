@@ -59,6 +59,9 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
     np.testing.assert_allclose(filtered["quantity_mean"][0], result.knowledge.sensor_model.mean[0, 1])
     deviation = result.knowledge.sensor_model.value_per_draw[:, 0, 1].std(axis=0)
     np.testing.assert_allclose(filtered["quantity_standard_deviation"][0], deviation)
+    noise = result.knowledge.sensor_model.total_standard_deviation  # with the place between the levels
+    np.testing.assert_allclose(filtered["noise_standard_deviation"][0], noise[0, 1])
+    assert noise.max() > 1.1 * noise.min()
     assert np.all(filtered["quantity_lower"] <= filtered["quantity_mean"])
     assert np.all(filtered["quantity_mean"] <= filtered["quantity_upper"])
     assert np.isnan(filtered["reward_mean"].sel(reward="error").values[36:38]).all()

@@ -412,6 +412,20 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     assert last_line(folder) == last_line(whole)
 
 
+def test_a_turn_without_observation_has_its_number_in_a_report_of_the_last_ones(scenario, mission, tmp_path):
+    rows = mission.observed[:10].copy()
+    rows[8] = np.nan
+    controls = ["3g"] * 8 + ["2g"] * 2
+    messages = [
+        {"turn": turn, "strain": row.tolist(), "control": control}
+        for turn, (row, control) in enumerate(zip(rows, controls, strict=True))
+    ]
+    uav_twin.watch(scenario, messages, tmp_path / "watch", last=4, report=False)
+    assert figures_of(tmp_path / "watch")["blind_steps"] == "8"
+    summary = json.loads((tmp_path / "watch" / "summary.json").read_text())
+    assert summary["control"] == "left 3g for 2g at turn 8"
+
+
 def test_a_slip_of_the_pen_is_passed_over_on_request_and_no_run_replaced_by_its_watch(
     scenario, recorded, whole, tmp_path
 ):
