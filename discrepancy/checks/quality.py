@@ -301,7 +301,8 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     )
     scatter = min(rough, default=np.inf)
     # Only downwards: a fast mode may well be rougher than the noise, but nothing is smoother than its noise.
-    if 0.0 < scatter < stated / _NOISE_FACTOR:
+    told = stated if record.samples is None or len(record.samples) < 50 else roughness(record.samples)
+    if 0.0 < scatter < told / _NOISE_FACTOR:
         what = "neighbouring samples scatter"
     if (found := repeat_record(channel, campaign.trials)) is not None:
         ratio = (found.standard_deviation / stated) ** 2

@@ -55,9 +55,7 @@ class Marginal:
         self._problem = problem
         shared = problem.shared
         self.free = np.flatnonzero(shared.scale[: shared.count] > 0.0)
-        mean, scale = shared.centre[self.free], shared.scale[self.free]
-        self.low = (shared.low[self.free] - mean) / scale
-        self.high = (shared.high[self.free] - mean) / scale
+        self.low, self.high = shared.ends[:, self.free]
         self._near = problem.start(NOTHING)
         self.refused: list[tuple[FloatArray, str]] = []
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from benchmarks.cantilever import Cantilever
 from discrepancy.campaign.protocol import Release
@@ -286,6 +287,15 @@ def test_noise_records_against_their_label_and_repeats(campaign):
         faults = check_data(Campaign("", {"x": channel}, trials, None, {}, ""))
         assert [fault.kind for fault in faults] == [FaultKind.NOISE_LABEL] * (stated != 1.0)
         assert all("repeated trials scatter" in fault.sentence for fault in faults)
+    # slow noise is smooth, and so is its record
+    time, (slow, rest) = 0.01 * np.arange(600), lfilter([1.0], [1.0, -0.9], rng.normal(size=(2, 600)))
+    values = (30.0 * np.cos(12.0 * time) * np.exp(-time) + slow)[:, None]
+    trials = (Trial.plain("ring", TrialKind.RINGDOWN, ("x",), time, values=values),)
+    for samples, faulty in ((rest, False), (3.0 * rest, True), (None, True)):
+        record = NoiseRecord(float(np.std(rest if samples is None else samples)), 599.0, samples, 0.01)
+        channel = Channel("x", Quantity.DISPLACEMENT, "x", record)
+        faults = check_data(Campaign("", {"x": channel}, trials, None, {}, ""))
+        assert [fault.kind for fault in faults] == [FaultKind.NOISE_LABEL] * faulty
 
 
 def test_outliers_are_found_and_left_out_unless_they_are_too_many(campaign):
