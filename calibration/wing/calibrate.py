@@ -164,7 +164,6 @@ def calibrate(
     priors = (*wing_priors(model.validity), *(length.prior for length in lab.lengths))
     prior = prior_samples(priors, SAMPLE_COUNT, seed)
     prior = np.column_stack([prior, table.outputs(prior)])
-
     provenance = collect_provenance(
         seed,
         input_hashes={**lab.input_hashes, "design": drawn.hash},
