@@ -155,6 +155,7 @@ def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp
         assert read[inspected] == pytest.approx(truth["state"].sel(region=name).values[inspected], abs=0.4)
     assert "learnt" in run
     assert "notice" in run
+    assert "belief predicted" in run["filtered"]["decision_probability"].attrs["long_name"]
 
 
 def test_missions_side_by_side_are_those_alone_with_readings_and_repairs():
