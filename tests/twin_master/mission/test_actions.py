@@ -22,7 +22,6 @@ from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
-    decision_problem,
     expected_plan,
     policy_file,
     promised,
@@ -184,7 +183,7 @@ def test_an_action_that_ends_ends_the_mission():
 @cache
 def planned() -> tuple[Any, Any]:
     known = knowledge()
-    problem = decision_problem(known.scenario, known.model, known.sensor_model, known.rewards)
+    problem = known.problem
     return problem, expected_plan(known.scenario, problem, known.rewards)[0]
 
 
