@@ -254,9 +254,8 @@ def watch(
         )  # fmt: skip
         _write("", flush=True)
         counts = watches[0].intake.counts
-        refused = f", {counted(counts.rejected, 'message')} refused, see rejected.jsonl" * bool(
-            counts.rejected
-        )
+        refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
+        refused *= counts.rejected > 0
         typer.echo(f"Watch: {folder}, {counted(counts.received, 'message')}{refused}.", err=True)
         if not no_report and (folder / REPORT_NAME).is_file():
             typer.echo(f"Report: {folder / REPORT_NAME}", err=True)

@@ -164,6 +164,7 @@ def calibrate(
     priors = (*wing_priors(model.validity), *(length.prior for length in lab.lengths))
     prior = prior_samples(priors, SAMPLE_COUNT, seed)
     prior = np.column_stack([prior, table.outputs(prior)])
+
     provenance = collect_provenance(
         seed,
         input_hashes={**lab.input_hashes, "design": drawn.hash},
@@ -172,14 +173,13 @@ def calibrate(
     ).as_dict()
 
     def record(way: Procedure, state: Float) -> Calibration:
-        lengths = _lengths(lab.lengths, len(state), seed)
         found = Calibration(
             asset=name,
             model=tailored.name,
             model_hash=tailored.hash,
             procedure=way,
             priors=priors,
-            samples=np.column_stack([state, lengths, table.outputs(state)]),
+            samples=np.column_stack([state, _lengths(lab.lengths, len(state), seed), table.outputs(state)]),
             prior_samples=prior,
             explained=None,
             findings=(),
