@@ -132,16 +132,14 @@ def assert_held(effect, values):
 
 
 @pytest.mark.parametrize("slip_ratio", [pytest.param(0.3, marks=pytest.mark.long), 1.5])
-def test_a_joint_that_slips_is_named_with_many_elements(slip_ratio):
-    """A joint of 400 elements; with few of its own the model would take their dents for knowledge."""
+def test_a_joint_that_slips_is_named_though_it_has_more_elements(slip_ratio):
+    """A joint of 400 elements; with too few of its own the model would take their dents for knowledge."""
     values = {"stiffness_share": 0.3, "slip_ratio": slip_ratio}
     (joint,) = SMALL.patch("joint_micro_slip", values, "joint")
     verdict, _, _ = name(SMALL.problem(5, ModelPatch((replace(joint, element_count=400),))), HYSTERESIS)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     (effect,) = verdict.effects
     assert effect.identifier == "joint_micro_slip"
-    (found,) = effect.patch
-    assert found.element_count == SEARCH.fine_joint
     assert_held(effect, values)
 
 
