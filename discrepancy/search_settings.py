@@ -149,10 +149,7 @@ class SearchSettings:
     finest: int = 8
     """How many times smaller than the model's own the time steps may become for it."""
     refitted: int = 3
-    """Candidates that are fitted again with smaller steps or more elements."""
-    fine_joint: int = 96
-    """Elements of joints that slip in what is named. Fewer serve the search; but along the ridge of slip
-    force and stiffness the misfit of few elements has dents of its own, which would count as knowledge."""
+    """Candidates that are fitted again with smaller steps."""
 
     @property
     def largest_set(self) -> int:

@@ -123,7 +123,6 @@ SCALES: dict[str, Callable[[Here], float]] = {
     "pi": lambda here: pi,
     "root_station": partial(_station, 0),
     "tip_station": partial(_station, 1),
-    "joint_elements": lambda here: here.setting.joint_elements,
     "largest_reading": _largest_reading,
     "largest_release": _largest_release,
     "number": lambda here: here.target.number,

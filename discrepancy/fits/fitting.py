@@ -278,21 +278,9 @@ def _finished(problem: Problem, candidate: Candidate, state: State, converged: b
 
 def _ahead(problem: Problem, candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
     """Return the point a share of a step ahead."""
-    effect = [
-        item.prior.stepped(u, du) if item.magnitude else u + du
-        for item, u, du in zip(
-            candidate.parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True
-        )
-    ]
-    return _bounded(
-        problem,
-        replace(
-            point,
-            shared=point.shared + share * step.shared,
-            local=tuple(u + share * du for u, du in zip(point.local, step.local, strict=True)),
-            effect=np.array(effect, dtype=np.float64),
-        ),
-    )
+    local = tuple(u + share * du for u, du in zip(point.local, step.local, strict=True))
+    effect = candidate.stepped(point.effect, share * step.effect)
+    return _bounded(problem, Point(point.shared + share * step.shared, local, effect))
 
 
 def _bounded(problem: Problem, point: Point) -> Point:
@@ -303,9 +291,7 @@ def _bounded(problem: Problem, point: Point) -> Point:
     )
 
 
-def free_shape(
-    problem: Problem, named: CandidateFit, number: int, give_up: float | None = None
-) -> CandidateFit | None:
+def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateFit | None:
     """Fit the family of one effect of a fit: its shape free, from the canonical one.
 
     Parameters
@@ -316,8 +302,6 @@ def free_shape(
         With canonical shapes.
     number : int
         Of the effect among its terms.
-    give_up : float, optional
-        See `fit`.
 
     Returns
     -------
@@ -332,7 +316,7 @@ def free_shape(
     parts[number] = replace(term, free_shape=True), np.append(values, canonical)
     terms, begin = zip(*parts, strict=True)
     start = replace(named.point, effect=np.concatenate(begin))
-    return attempt(problem, Candidate(terms), start, give_up=give_up)
+    return attempt(problem, Candidate(terms), start)
 
 
 def is_box(candidate: Candidate) -> bool:

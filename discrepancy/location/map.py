@@ -218,9 +218,8 @@ def _stretches(item: FittedTrial, column: int) -> Iterator[tuple[str, float, flo
     for axis, values, edges in axes:
         place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
         for number, (low, high) in enumerate(pairwise(edges.tolist())):
-            where = used & (place == number)
-            if low < high and where.any():
-                yield axis, low, high, where
+            if low < high:
+                yield axis, low, high, used & (place == number)
 
 
 def _along(

@@ -209,13 +209,14 @@ def test_sizes_in_closed_form(setting):
         (60.0, ("50 Hz", "400 Hz")),  # 60 Hz is a constant
         (110.0, ("50 or 60 Hz", "400 Hz")),
         (50.0, ("60 Hz",)),
+        (50.001, ("60 Hz",)),  # 50 Hz shows at 0.001 Hz
         (20.0, ("50 Hz",)),  # at 10 Hz, every second sample of the other sign
         (10.0, ()),
     ],
 )
 def test_lines_that_a_sampling_rate_can_show(setting, rate, lines):
     trial = next(item for item in setting.campaign.trials if item.name == "release")
-    resampled = replace(trial, time=np.arange(len(trial.time)) / rate)
+    resampled = replace(trial, time=5000.0 + np.arange(len(trial.time)) / rate)
     given = replace(setting, campaign=replace(setting.campaign, trials=(resampled,)))
     assert mains_lines(given) == lines
     hum = by_name("mains_hum")

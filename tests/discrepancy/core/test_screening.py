@@ -283,10 +283,16 @@ def test_held_out_trials_move_nothing_that_is_shared():
     np.testing.assert_array_equal(adapted.point.shared, found.point.shared)
     assert any(np.any(u != 0.0) for u in adapted.point.local)
     # its own nuisances are at their optimum given the rest: the dense solution of one trial
+    shown = {item.trial.name: item for item in residual_set(problem, found, sensitivities=False).trials}
     for number, data in enumerate(there.trials):
         parts = there.linearise(number, start, Candidate())
-        columns, _ = there.columns(number, start, parts, Candidate())
-        local = data.standardised(columns[: data.unknowns.size]).reshape(data.unknowns.size, -1)
+        columns, index = there.columns(number, start, parts, Candidate())
+        local, shared = np.split(data.standardised(columns).reshape(len(columns), -1), [data.unknowns.size])
         residual = there.residual(number, start, parts.response).ravel()
-        exact = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local @ residual)
-        np.testing.assert_allclose(adapted.point.local[number], exact, atol=0.02)
+        taken = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local)
+        np.testing.assert_allclose(adapted.point.local[number], taken @ residual, atol=0.02)
+        # what is left varies by what is shared, less what they took
+        along = shared - shared @ local.T @ taken
+        more = np.sum(along * (found.covariance[np.ix_(index, index)] @ along), axis=0)
+        wanted = 1.0 + more - np.sum(local * taken, axis=0)
+        np.testing.assert_allclose(shown[data.trial.name].expected_variance.ravel(), wanted, atol=1e-9)
