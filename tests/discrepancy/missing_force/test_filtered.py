@@ -187,6 +187,8 @@ def test_states_and_noise_by_closed_forms():
     generator, push = trial.system.generator, -trial.system.actions[0]
     wanted = [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
     np.testing.assert_allclose(trial.pushed(0, np.ones(len(wanted))), wanted, atol=1e-12)
+    still = replace(trial, settled=True).pushed(0, np.ones(len(wanted)))
+    np.testing.assert_allclose(still - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
     # noise of first order is taken apart
     noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
     assert decaying_part(noise, 0.01) == (
