@@ -13,6 +13,7 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.when import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
 from discrepancy.missing_force.filtered import Filtered, Process, regression
+from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
 from discrepancy.missing_force.windows import residual_windows
@@ -189,6 +190,12 @@ def test_states_and_noise_by_closed_forms():
     np.testing.assert_allclose(trial.pushed(0, np.ones(len(wanted))), wanted, atol=1e-12)
     still = replace(trial, settled=True).pushed(0, np.ones(len(wanted)))
     np.testing.assert_allclose(still - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
+    # noise of a deviation of one, part of it coloured
+    count = 5000
+    told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=((0, 0.4, 12.0),))
+    made = _noise(told)
+    np.testing.assert_allclose(made.std(axis=0), 1.0, rtol=0.1)
+    assert made[1:, 0] @ made[:-1, 0] / count == pytest.approx(0.4 * np.exp(-12.0 * 0.02), abs=0.1)
     # noise of first order is taken apart
     noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
     assert decaying_part(noise, 0.01) == (
