@@ -12,7 +12,7 @@ from benchmarks.force_events import counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.when import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
-from discrepancy.missing_force.filtered import Filtered, Process, regression
+from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
 from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
@@ -202,6 +202,15 @@ def test_states_and_noise_by_closed_forms():
         pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
     )  # fmt: skip
     assert decaying_part(noise, 0.02) is None
+
+
+def test_evidence_beside_unknowns_is_that_of_their_prior():
+    random, precision = np.random.default_rng(2), np.array([4.0, 0.01])
+    readings, columns = random.standard_normal(9), random.standard_normal((2, 9))
+    rows = np.vstack((readings, columns))
+    found = Regression(rows @ rows.T, 0.0).solve([0, 1], precision)
+    covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
+    assert found.evidence == pytest.approx(gaussian(covariance, readings))
 
 
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
