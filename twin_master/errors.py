@@ -15,10 +15,6 @@ class InvalidObservationError(TwinMasterError, ValueError):
     """An observation has the wrong shape or holds an infinite value."""
 
 
-class InvalidObservationLibraryError(TwinMasterError, ValueError):
-    """A library of observations or strains is missing, damaged, or cannot be sampled as asked."""
-
-
 class PlanningError(TwinMasterError, RuntimeError):
     """Value iteration was given no solvable problem, or did not converge."""
 
@@ -79,7 +75,6 @@ def check_names(
     whose: str,
     where: str,
     rows: Iterable[tuple[str, Iterable[str], Collection[str]]],
-    error: type[TwinMasterError] = MissionInputError,
     advice: str = "",
 ) -> None:
     """Check names of several sorts against those that are known.
@@ -92,15 +87,13 @@ def check_names(
         What knows names: "the binding uav_wing".
     rows : iterable of (str, names, known names)
         What the names are of, in the singular.
-    error : type
-        What is raised.
     advice : str
         What to do, behind a colon.
     """
     for what, names, known in rows:
         unknown = sorted({*names} - {*known})
         if unknown:
-            raise error(
+            raise MissionInputError(
                 f"{whose} {what} {', '.join(unknown)}, which {where} does not know; it knows "
                 f"{', '.join(known) or 'none'}{f': {advice}' if advice else ''}."
             )

@@ -83,11 +83,10 @@ def _knowledge(
 
 def _planned(knowledge: "Knowledge") -> "tuple[DecisionProblem, BeliefPlan, ComparedPolicy]":
     """Return what is decided on, the plan, and what it promises."""
-    from twin_master.mission.planning import decision_problem, expected_plan, promised
+    from twin_master.mission.planning import expected_plan, promised
 
-    scenario, rewards = knowledge.scenario, knowledge.rewards
-    problem = decision_problem(scenario, knowledge.model, knowledge.sensor_model, rewards)
-    plan = expected_plan(scenario, problem, rewards)[0]
+    scenario, problem = knowledge.scenario, knowledge.problem
+    plan = expected_plan(scenario, problem, knowledge.rewards)[0]
     return problem, plan, promised(scenario, problem, plan.policy)
 
 

@@ -130,14 +130,12 @@ class ShapeParameter:
 class Setting:
     """Where an effect is to be built: campaign, model, natural scales.
 
-    `joint_elements` is how many elements stand for the continuous distribution of a joint that slips;
     `largest` keeps the largest readings that were found, as patches are built at every step of a fit.
     """
 
     campaign: Campaign
     model: Model
     scales: Scales
-    joint_elements: int = 24
     largest: dict[object, float] = field(default_factory=dict, init=False, compare=False, repr=False)
 
 

@@ -66,6 +66,12 @@ class Term:
                 found[number] = np.clip(item.prior.normal(value), lowest, highest)
         return found
 
+    @property
+    def may_turn(self) -> bool:
+        """Whether its size may be negative."""
+        ends = [item.prior.low for item in self.parameters if item.magnitude]
+        return not ends or min(ends) < 0.0
+
     def start(self) -> FloatArray:
         """Return the standard normal variables at prior medians and canonical shapes."""
         return np.array(
@@ -126,6 +132,11 @@ class Candidate:
         """Return each term with its own of the standard normal variables (size,)."""
         ends = np.cumsum([len(term.parameters) for term in self.terms])
         return list(zip(self.terms, np.split(normal, ends[:-1]), strict=True)) if self.terms else []
+
+    def stepped(self, normal: FloatArray, step: FloatArray) -> FloatArray:
+        """Return standard normal variables after a step, of magnitudes along the tangents of values."""
+        moves = zip(self.parameters, normal.tolist(), step.tolist(), strict=True)
+        return np.array([item.prior.stepped(u, du) if item.magnitude else u + du for item, u, du in moves])
 
     def patches(self, setting: Setting, normal: FloatArray) -> list[ModelPatch]:
         """Return the patch of each term at standard normal variables (size,)."""

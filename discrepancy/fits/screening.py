@@ -61,13 +61,7 @@ class Change:
     @property
     def gain(self) -> float:
         """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
-        return 0.5 * self.fits * self.scale if self.fits > 0.0 or self.may_turn else 0.0
-
-    @property
-    def may_turn(self) -> bool:
-        """Whether its scale may be negative."""
-        sizes = [item.prior.shape for item in self.term.parameters if item.magnitude]
-        return not sizes or any(shape != "log_normal" for shape in sizes)
+        return 0.5 * self.fits * self.scale if self.fits > 0.0 or self.term.may_turn else 0.0
 
     @property
     def best(self) -> FloatArray:

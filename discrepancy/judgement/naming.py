@@ -293,7 +293,8 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
     again = attempt(problem, Candidate(), found.none.point)  # time steps may be finer by now
     second = Search(problem, found.effects, again or found.none, tell=tell)
     second.force = found.force
-    second.run()
+    second.singles()
+    second.sets()
     other = _named(second)
     second.forces = found.forces
     named = other.verdict.kind is VerdictKind.NAMED_IN_PART and any(_acts(problem, other.fit))

@@ -66,8 +66,6 @@ class EventSearch:
         Number of the port.
     process : Process
         A force that acts throughout: the scale of both forces' priors.
-    turning : bool
-        Whether the force of events turns its sign with the speed of its port.
     every : int
         Of so many readings one is looked at.
 
@@ -75,21 +73,12 @@ class EventSearch:
     ----------
     trials, columns : sequence of SeenTrial, sequence of (K, N, C) ndarray
         What is looked at: stamps, and which readings count; residuals and columns of all unknowns.
-    flips : sequence of (N,) ndarray of bool
-        By trial, the samples at which it does.
     """
 
-    def __init__(
-        self, view: View, port: int, process: Process, *, turning: bool = False, every: int = 1
-    ) -> None:
-        self.view, self.port, self.process, self.turning = view, port, process, turning
+    def __init__(self, view: View, port: int, process: Process, *, every: int = 1) -> None:
+        self.view, self.port, self.process = view, port, process
         self.trials = [replace(one, time=one.time[::every], used=one.used[::every]) for one in view.trials]
         self.columns = [rows[:, ::every] for rows in view.rows]
-        self.flips = [np.zeros(len(trial.time), dtype=bool) for trial in self.trials]
-        if turning and view.motions:  # of readings alone nothing moves
-            moves = zip(view.trials, view.motions, strict=True)
-            speeds = [motion.speeds[:: trial.parts * every, port] for trial, motion in moves]
-            self.flips = [np.r_[False, np.diff(speed > 0.0)] for speed in speeds]
 
     def told(self, forces: Forces, paths: Sequence[BoolArray]) -> list[Told]:
         """Return what each trial tells of the shared unknowns."""
@@ -172,17 +161,12 @@ class SwitchedRecord:
         moves[:3, :, f] = 0.0
         noises[:3, :, f], noises[:3, :, :, f] = 0.0, 0.0
         noises[1, :, f, f] = 1.0
-        moves, noises = (np.concatenate((items, items), axis=1) for items in (moves, noises))
-        self.size, half = moves.shape[1], moves.shape[1] // 2
-        moves[:, half:, f] *= -1.0  # the force turns with the motion
-        noises[:, half:, f] *= -1.0
-        noises[:, half:, :, f] *= -1.0
         used = np.zeros(((len(trial.time) - 1) * parts + 1, trial.used.shape[1]), dtype=bool)
         used[::parts] = trial.used
         columns = np.zeros((*used.shape, len(search.columns[number])))
         columns[::parts] = np.moveaxis(search.columns[number] * one.white, 0, -1)
         self.length = np.concatenate((which[:1], np.repeat(which[1:], parts)))
-        self.length[::parts] += half * search.flips[number]
+        self.size = moves.shape[1]
         moves, noises = (items.reshape(-1, *start.shape) for items in (moves, noises))
         self.steps = Steps(moves, noises, rows, used, columns)
         self.begun = [self.steps.begin(cover) for cover in (still, start)]
@@ -348,15 +332,11 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
     every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
     event = Process(LARGER * process.size, process.time, rough=True)
     forces = event, replace(process, size=LITTLE * process.size)
-    searches = [EventSearch(view, port, process, turning=turning, every=every) for turning in (False, True)]
-    off = [np.zeros(len(trial.time), dtype=bool) for trial in searches[0].trials]
-    searches = searches[: 1 + any(flips.any() for flips in searches[1].flips)]
-    steady = max((_throughout(search, off) for search in searches), key=lambda found: found.score)
-    best = max(
-        (_round(search, forces, off, FEW_PASSES) for search in searches), key=lambda found: found.score
-    )
+    search = EventSearch(view, port, process, every=every)
+    off = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
+    steady, best = _throughout(search, off), _round(search, forces, off, FEW_PASSES)
     for _ in range(ROUNDS):
-        again = _round(best.search, best.forces, best.paths, MOST_PASSES)
+        again = _round(search, best.forces, best.paths, MOST_PASSES)
         if again.score < best.score + LEAST_GAIN:
             break
         best = again
@@ -375,7 +355,7 @@ def throughout(view: View, port: int, process: Process) -> Events:
 def _in_full(found: Events, every: int) -> Events:
     """Return events found in a part of the readings, placed among all."""
     part = found.search
-    search = EventSearch(part.view, part.port, part.process, turning=part.turning)
+    search = EventSearch(part.view, part.port, part.process)
     moves = zip(found.paths, search.trials, strict=True)
     paths = [np.repeat(on, every)[: len(trial.time)] for on, trial in moves]
     whole = Events(search, found.forces, paths, -np.inf)

@@ -76,18 +76,6 @@ def variants(term: Term) -> list[FloatArray]:
     return found
 
 
-def both_signs(term: Term) -> bool:
-    """Whether an effect's size may be negative."""
-    return any(item.prior.low < 0.0 for item in term.effect.parameters if item.magnitude)
-
-
-def stepped(candidate: Candidate, effect: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the unknowns of a candidate (E,) after a step, taken along the values' tangents."""
-    priors = [item.prior for item in candidate.parameters]
-    moved = [prior.stepped(float(u), float(s)) for prior, u, s in zip(priors, effect, step, strict=True)]
-    return np.clip(moved, -LARGEST, LARGEST)
-
-
 def scaled(processes: Processes, size: float, time: float) -> Mapping[int, Process]:
     """Return processes of other sizes and times."""
     return {port: replace(one, size=one.size * size, time=one.time * time) for port, one in processes.items()}

@@ -19,8 +19,8 @@ from discrepancy.fits.candidate import Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
 from .filtered import Process, Solution
-from .hypotheses import LARGEST, Columns, both_signs, log_prior, scaled, stepped, variants
-from .view import Column, Motion, Processes, View, combined
+from .hypotheses import LARGEST, Columns, log_prior, scaled, variants
+from .view import MOST_STEPS, Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 WIDE = 3.0
@@ -138,20 +138,15 @@ class ForceSearch:
     ----------
     problem : Problem
         With dynamic trials, of a model that has ports.
-    about : Point, optional
-        Where parameters are, if a fit tells it; what a law alone shows (the speed at which a body began to
-        fall) it alone knows.
 
     Attributes
     ----------
     at : dict of str to Explained
         The missing force at each port: first along the model's own motion, for the initial states; then along
         the motion that was, with the parameters about where they are and the laws that the model has itself.
-    whole : Explained
-        Missing forces at all ports at once, or at those that matter most if they are many.
     """
 
-    def __init__(self, problem: Problem, about: Point | None = None) -> None:
+    def __init__(self, problem: Problem) -> None:
         linear, self.laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
         self.problem = problem.with_trials(trials, linear)
@@ -159,22 +154,20 @@ class ForceSearch:
         self.ports = tuple(linear.ports)
         self.at: dict[str, Explained] = {}
         self.point = self.problem.start(NOTHING)
-        if about is not None:
-            self.point = Point(about.shared, about.local, NO_VALUES)
         for turn in range(2):
             bare = self._view()
             for port, name in enumerate(self.ports):
                 view = self.columns.along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
                 first = self.about((port,))
                 self.at[name] = seen(view, first, self.at[name].processes if turn else first)
-            if not turn and about is None:
+            if not turn:
                 self.point = self._point(self.best())
-        self.whole = self._together()
 
     # ---------------------------------------------------------------- where
 
-    def _together(self) -> Explained:
-        """Return missing forces at all ports at once, or at those that matter most if they are many."""
+    @cached_property
+    def whole(self) -> Explained:
+        """Missing forces at all ports at once, or at those that matter most if they are many."""
         best = self.best()
         ranked = sorted(self.at.values(), key=lambda item: -item.log_evidence)[:MOST_PORTS]
         if len(ranked) == 1:
@@ -236,7 +229,7 @@ class ForceSearch:
         """Return hypotheses, the most probable first: sets of effects that were found one after another.
 
         Each effect alone, with its own shape and with a free one; the best of these with one more effect,
-        while that makes a more probable set; then the best set less one effect.
+        while that makes a more probable set.
         """
         found: dict[Key, Explained] = {(): self.whole}
         beam = [self.whole]
@@ -256,14 +249,6 @@ class ForceSearch:
             if not ranked or self.score(ranked[0], len(effects)) <= self.score(best, len(effects)):
                 break
             beam = ranked[:BEAM]
-        best = self._ranked(found, len(effects))[0]
-        count = len(best.candidate.terms)
-        for left in range(count) if count > 1 else ():
-            less, values = best.candidate.some((k for k in range(count) if k != left), best.effect)
-            if less.key not in found:
-                one = self.followed(self.whole, less, values)
-                if one is not None:
-                    found[less.key] = one
         return self._ranked(found, len(effects))
 
     def score(self, found: Explained, count: int) -> float:
@@ -325,7 +310,7 @@ class ForceSearch:
                 solution = products.solve(chosen, whole.precisions[chosen])
                 factor = float(solution.mean[-1])
                 better = number not in found or found[number][0] < solution.evidence
-                if better and np.isfinite(solution.evidence) and (factor > 0.0 or both_signs(term)):
+                if better and np.isfinite(solution.evidence) and (factor > 0.0 or term.may_turn):
                     found[number] = (solution.evidence, factor)
         return found
 
@@ -340,21 +325,17 @@ class ForceSearch:
 
     def followed(self, base: Explained, candidate: Candidate, effect: FloatArray) -> Explained | None:
         """Return a hypothesis at its most probable values, begun beside another; None: it cannot be."""
-        processes, motions, share, settled = dict(base.processes), base.motions, 1.0, False
+        processes, motions, share, settled = base.processes, base.motions, 1.0, False
         best: Explained | None = None
         before = np.zeros(len(effect))
         for turn in range(ROUNDS):
             view = self.linear(base.view, motions, candidate, effect)
             if view is None:
                 break
-            if turn == 0 or settled or turn == ROUNDS - 1:
-                near = turn > 0
-                found = seen(view, self.about(processes), processes, candidate, effect, near=near)
-                processes = dict(found.processes)
-            else:
-                evidence = view.evidence(self.about(processes), processes)
-                smoothed = view.smoothed(processes)
-                found = Explained(candidate, effect, processes, evidence, view, *smoothed)
+            most = MOST_STEPS if settled or turn == ROUNDS - 1 else 0
+            about = self.about(processes)
+            found = seen(view, about, processes, candidate, effect, near=turn > 0, most=most)
+            processes = found.processes
             step = found.solution.mean[len(view.shared_precision) :] - effect
             far = np.where(np.abs(step) > SETTLED, step, 0.0)
             if far.any():  # a value that it cannot reach is not its own
@@ -367,7 +348,8 @@ class ForceSearch:
                 break
             turns_back = step @ before < -0.5 * (before @ before)
             share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
-            effect = stepped(candidate, effect, share * np.clip(step, -LONGEST_STEP, LONGEST_STEP))
+            move = share * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+            effect = np.clip(candidate.stepped(effect, move), -LARGEST, LARGEST)
             motions, before = found.motions, step
             settled = turn > 0 and np.abs(step).max(initial=0.0) < SETTLED
         return best
@@ -401,7 +383,8 @@ def seen(
     effect: FloatArray = NO_VALUES,
     *,
     near: bool = False,
+    most: int = MOST_STEPS,
 ) -> Explained:
     """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begin, near=near)
+    processes, evidence = view.most_probable(about, begin, near=near, most=most)
     return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))

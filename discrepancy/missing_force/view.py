@@ -157,7 +157,7 @@ class View:
 
     @np.errstate(invalid="ignore")
     def most_probable(
-        self, about: Processes, begin: Processes, *, near: bool = False
+        self, about: Processes, begin: Processes, *, near: bool = False, most: int = MOST_STEPS
     ) -> tuple[dict[int, Process], float]:
         """Return the processes of the largest evidence times their prior, and its logarithm [nat].
 
@@ -172,6 +172,8 @@ class View:
             From which they are looked for: port after port from the best of `STARTS`.
         near : bool
             From `begin` itself instead.
+        most : int
+            Steps of Newton's method.
         """
 
         def at(logs: FloatArray) -> dict[int, Process]:
@@ -188,7 +190,7 @@ class View:
         for port in () if near else np.eye(len(logs)):
             logs = max((np.clip(logs + np.outer(port, start), low, high) for start in STARTS), key=value)
         top, far, units = value(logs), np.inf, NEAR * np.eye(logs.size).reshape(-1, *logs.shape)
-        for _ in range(MOST_STEPS):
+        for _ in range(most):
             ahead, back = (np.array([value(logs + step) for step in steps]) for steps in (units, -units))
             if far > NEAR:
                 bend = np.diag(ahead + back - 2.0 * top)

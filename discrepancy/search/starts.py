@@ -17,7 +17,7 @@ from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import SENSORS, MicroSlip
+from fe.runtime.patch import SENSORS
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
@@ -90,7 +90,7 @@ def pairs(changes: Sequence[Change], sign: FloatArray) -> list[tuple[float, Chan
             continue
         scale = np.linalg.solve(gram, fits)
         # a size that cannot be negative: the other one alone
-        able = [size >= 0.0 or item.may_turn for size, item in zip(scale, (one, other), strict=True)]
+        able = [size >= 0.0 or item.term.may_turn for size, item in zip(scale, (one, other), strict=True)]
         misfit = -0.5 * float(fits @ scale)
         if all(able) and (key not in best or misfit < best[key][0]):
             best[key] = (misfit, _scaled(one, scale[0]), _scaled(other, scale[1]))
@@ -100,12 +100,6 @@ def pairs(changes: Sequence[Change], sign: FloatArray) -> list[tuple[float, Chan
 def _scaled(change: Change, scale: float) -> Change:
     """Return the change whose best scale alone is the given one."""
     return Change(change.term, change.start, change.vector, scale * change.size, change.size)
-
-
-def slips(problem: Problem, found: CandidateFit) -> bool:
-    """Whether a fit has a joint that slips."""
-    patch = found.candidate.patch(problem.setting, found.point.effect) if found.candidate.terms else ()
-    return any(isinstance(item, MicroSlip) for item in patch)
 
 
 def beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:

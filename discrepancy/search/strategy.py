@@ -12,7 +12,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
@@ -20,7 +20,7 @@ from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
-from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, slips, starts, tried
+from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, starts, tried
 
 
 @dataclass
@@ -174,7 +174,7 @@ class Search:
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
         """Return a base with its nuisances where they are beside a missing force."""
         point = self.problem.start(base.candidate)
-        if self._moves and self.force is not None:
+        if self.moves and self.force is not None:
             along = self.force.whole
             if base.candidate.terms:
                 along = self.force.followed(along, base.candidate, base.effect) or along
@@ -224,18 +224,13 @@ class Search:
 
     # ---------------------------------------------------------------- the strategy
 
-    def run(self) -> None:
-        """Search: simple causes before others.
-
-        One effect, the best of them beside their optimum too, one law of free shape, more effects, any
-        two. The best candidate is computed finely before what rests on its evidence.
-        """
-        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
-        for rank, item in enumerate(ranked[: SEARCH.ridges]):
-            misses = absolute_gate(self.problem, item).passed is False
-            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
-                self.keep(around(self.problem, item), exact=True)
+    def singles(self) -> None:
+        """Search among single effects; the best is computed finely before what rests on its evidence."""
+        self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
         self.settle()
+
+    def sets(self) -> None:
+        """Search beyond one effect: a law of free shape, more effects, any two."""
         self.families()
         self.settle()
         # beside a law whose shape is free further effects would be anything
@@ -246,16 +241,13 @@ class Search:
         self.settle()
 
     @property
-    def _moves(self) -> bool:
+    def moves(self) -> bool:
         """Whether all trials are in motion."""
         return all(data.trial.is_dynamic for data in self.problem.trials)
 
-    def by_force(self) -> bool:
-        """Fit the sets of effects that follow the missing force best; False where that is not seen."""
-        force = self.force if self._moves else None
-        if force is None:
-            return False
-        self.forces = force.name(self.effects)
+    def by_force(self, force: ForceSearch) -> None:
+        """Compare the sets of effects that follow the missing force best, in place of what was fitted."""
+        self.exact, self.rough, self.forces = {(): self.none}, {}, force.name(self.effects)
         able = [
             one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
             if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
@@ -268,37 +260,23 @@ class Search:
             if found is not None:
                 self.keep(found, exact=True)
         self.settle()
-        return True
 
     def unexplained(self) -> bool:
         """Whether the best candidate cannot be shown to explain the data."""
         return not absolute_gate(self.problem, self.best()).passed
 
     def settle(self) -> None:
-        """Compute the best candidate finely: joints that slip by more elements, motions by smaller steps."""
-        setting = self.problem.setting
-        if setting.joint_elements < SEARCH.fine_joint and slips(self.problem, self.best()):
-            ranked = self._ranked()
-            self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
-            self._fit_again([item for item in ranked if slips(self.problem, item)])
-            if slips(self.problem, self.best()):
-                self.keep(around(self.problem, self.best()), exact=True)
+        """Compute the best candidate finely: halve the time steps while they cost it too much."""
         while (
             self.problem.refinement < SEARCH.finest
             and solver_share(self.problem, self.best()) > SEARCH.solver_share
         ):
             self.problem.refinement *= 2
-            self._fit_again(self._ranked())
-
-    def _ranked(self) -> list[CandidateFit]:
-        return sorted(self.exact.values(), key=lambda item: -self.score(item))
-
-    def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
-        """Replace the best exact fits by those of the finer model from where they stand."""
-        for item in rough[: SEARCH.refitted]:
-            again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
-            if again is not None:  # else the rough one stands
-                self.exact[item.candidate.key] = again
+            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
+            for item in ranked[: SEARCH.refitted]:
+                again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
+                if again is not None:  # else the rough one stands
+                    self.exact[item.candidate.key] = again
 
     def longer(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
@@ -328,11 +306,9 @@ class Search:
             singles = [item for item in fitting if self.score(item) > close]
             if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
                 return
-        # a rival that fits is followed to its end; one that does not has to promise more than the best
-        give_up = None if fitting else self.best().objective
         kept: dict[tuple[str, str], CandidateFit] = {}
         for named in singles:
-            family = free_shape(self.problem, named, 0, give_up=give_up)
+            family = free_shape(self.problem, named, 0)
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
@@ -388,6 +364,11 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
         if again is not None and again.objective < none.objective - SEARCH.worth_fitting:
             found = Search(problem, usable, again, tell=tell)
-    if not found.by_force():
-        found.run()
+    force = found.force if found.moves else None
+    if force is None or len(force.ports) > 1:  # forces at several ports take up nearly any law at one
+        found.singles()
+        if force is None or not found.unexplained():
+            found.sets()
+            return found
+    found.by_force(force)
     return found

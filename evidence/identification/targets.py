@@ -151,7 +151,7 @@ def read_targets(data: Path | str) -> Targets:
         If a file is missing, cannot be read or lacks an entry or a column.
     ExperimentDataError
         If a value is not a finite number, or the library has other states or gauges than published.
-    InvalidObservationLibraryError
+    MissionInputError
         If the library is none.
     """
     data = Path(data)

@@ -21,7 +21,6 @@ from tests.twin_master.runs import check_same, cut_off_after, text_of, written
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import (
-    InvalidObservationLibraryError,
     MissionInputError,
     NotResumableError,
     RunFolderError,
@@ -231,7 +230,7 @@ def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, scenario,
     check_same(moved, whole, *SAME)
     for path in moved.rglob("*"):
         assert path.is_dir() or str(tmp_path).encode() not in path.read_bytes(), path
-    with pytest.raises(InvalidObservationLibraryError):
+    with pytest.raises(MissionInputError):
         fly(tmp_path / "never", library)
     assert not (tmp_path / "never").exists()
     if scenario == "level_turns":
@@ -339,7 +338,7 @@ def test_what_cannot_be_resumed(tmp_path, library_file):
     with pytest.raises(NotResumableError, match="strain library changed"):
         resume_run(folder)
     copy.unlink()
-    with pytest.raises(InvalidObservationLibraryError, match="cannot be read"):
+    with pytest.raises(MissionInputError, match="cannot be read"):
         resume_run(folder)
     copy.write_bytes(content)
     lock = lock_run_folder(folder)

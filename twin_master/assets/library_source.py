@@ -24,7 +24,7 @@ from twin_master.assets.asset_source import OBSERVATIONS_COPY, AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.errors import InvalidModelError, InvalidObservationLibraryError, MissionInputError
+from twin_master.errors import InvalidModelError, MissionInputError
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.asset import BeliefSection
@@ -119,18 +119,18 @@ class ObservationLibrary:
 
         Raises
         ------
-        InvalidObservationLibraryError
+        MissionInputError
             The library has other states, or a level is none of its levels.
         """
         if set(names) != set(self.states.names):
-            raise InvalidObservationLibraryError(said("assets.states", self=self, names=names))
+            raise MissionInputError(said("assets.states", self=self, names=names))
         wanted = coordinates[:, [names.index(name) for name in self.states.names]]
         for factor, asked in zip(self.states.factors, wanted.T, strict=True):
             levels = np.array(factor.levels)
             for level in np.unique(asked):
                 if _place(levels[:, None], level) is None:
                     of = {"levels": _listed(levels), "name": factor.name}
-                    raise InvalidObservationLibraryError(said("assets.levels", level=level, **of))
+                    raise MissionInputError(said("assets.levels", level=level, **of))
         return [_place(self.states.coordinates, state) or 0 for state in wanted]
 
     def control_of(self, name: str, values: Mapping[str, float]) -> int:
@@ -138,15 +138,15 @@ class ObservationLibrary:
 
         Raises
         ------
-        InvalidObservationLibraryError
+        MissionInputError
             There is none, or the library has other control inputs.
         """
         if set(values) != set(self.control_values):
-            raise InvalidObservationLibraryError(said("assets.inputs", self=self, values=values))
+            raise MissionInputError(said("assets.inputs", self=self, values=values))
         known = np.column_stack([self.control_values[key] for key in values])
         if (place := _place(known, np.array([*values.values()]))) is None:
             shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
-            raise InvalidObservationLibraryError(said("assets.control", shown=shown, name=name, self=self))
+            raise MissionInputError(said("assets.control", shown=shown, name=name, self=self))
         return place
 
     def at_draws(self, name: str, draws: Float) -> Float:
@@ -154,20 +154,20 @@ class ObservationLibrary:
 
         Raises
         ------
-        InvalidObservationLibraryError
+        MissionInputError
             The library has another parameter, or a value lies outside the sampled ones.
         """
         if not self.parameter and len(draws) == 1:
             return self.values
         if name != self.parameter:
             own = self.parameter or "none"
-            raise InvalidObservationLibraryError(said("assets.parameter", own=own, name=name))
+            raise MissionInputError(said("assets.parameter", own=own, name=name))
         order = np.argsort(self.draws, kind="stable")
         nodes = self.draws[order]
         slack = _SAME * max(1.0, float(np.abs(nodes).max()))
         if draws.min() < nodes[0] - slack or draws.max() > nodes[-1] + slack:
             ends = draws.min(), draws.max(), nodes[0], nodes[-1]
-            raise InvalidObservationLibraryError(said("assets.draws", name=name, ends=ends))
+            raise MissionInputError(said("assets.draws", name=name, ends=ends))
         share = np.array([np.interp(draws, nodes, own) for own in np.eye(len(nodes))])
         return np.tensordot(share.T, self.values[order], axes=1)
 
@@ -198,24 +198,24 @@ def load_observation_library(path: Path) -> ObservationLibrary:
 
     Raises
     ------
-    InvalidObservationLibraryError
+    MissionInputError
         There is no whole library; the sentence says what is wrong.
     """
     if not path.is_file():
-        raise InvalidObservationLibraryError(said("assets.no_library", path=path))
+        raise MissionInputError(said("assets.no_library", path=path))
     from reporting.netcdf import read_groups  # which loads xarray
 
     try:
         dataset = read_groups(path).to_dataset()
     except DamagedFileError as error:
-        raise InvalidObservationLibraryError(said("assets.not_whole", path=path)) from error
+        raise MissionInputError(said("assets.not_whole", path=path)) from error
     if dataset.attrs.get("kind") != KIND or dataset.attrs.get("format") != FORMAT:
-        raise InvalidObservationLibraryError(said("assets.format", path=path, format=FORMAT))
+        raise MissionInputError(said("assets.format", path=path, format=FORMAT))
     try:
         return ObservationLibrary(dataset)
     except (KeyError, ValueError, TypeError, InvalidModelError) as error:
         reason = error.args[0] if error.args else error
-        raise InvalidObservationLibraryError(said("assets.layout", path=path, reason=reason)) from error
+        raise MissionInputError(said("assets.layout", path=path, reason=reason)) from error
 
 
 def _listed(values: Float) -> str:
@@ -278,7 +278,7 @@ class LibrarySource(AssetSource):
 
         Raises
         ------
-        InvalidObservationLibraryError
+        MissionInputError
             It is missing or damaged, or lacks something.
         """
         library = load_observation_library(self.path(OBSERVATIONS_COPY))
@@ -296,7 +296,7 @@ class LibrarySource(AssetSource):
             if has != wanted:
                 what = f"{self.path(OBSERVATIONS_COPY).name} {what}"
                 both = [", ".join(names) or "none" for names in (has, wanted)]
-                raise InvalidObservationLibraryError(said("assets.differs", what=what, both=both))
+                raise MissionInputError(said("assets.differs", what=what, both=both))
         if not library.parameter or library.parameter == scenario.calibration.parameter:
             self._places(library, build_graphical_model(scenario))
         else:
@@ -306,19 +306,6 @@ class LibrarySource(AssetSource):
     def check(self) -> None:
         """Check that the library has what the scenario asks for."""
         _ = self.library
-
-    def files(self) -> dict[str, bytes]:
-        """Return the library, and the design if one is named.
-
-        Raises
-        ------
-        InvalidObservationLibraryError
-            One cannot be read.
-        """
-        try:
-            return super().files()
-        except MissionInputError as error:
-            raise InvalidObservationLibraryError(f"the observation library: {error}") from error
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Prepare the design if one is named; what is flown is prepared before."""
@@ -344,7 +331,7 @@ class LibrarySource(AssetSource):
 
         Raises
         ------
-        InvalidObservationLibraryError
+        MissionInputError
             The library lacks a state, control or range of the parameter.
         """
         rows, controls = self._places(self.library, model)

@@ -170,10 +170,8 @@ def asset_source(scenario: Scenario) -> AssetSource:
     Raises
     ------
     MissionInputError
-        The scenario flies a strain library and names none, or one that does not fit; or the twin cannot
-        believe what it is told to.
-    InvalidObservationLibraryError
-        The strain library is missing or damaged.
+        The scenario flies a strain library and names none, or one that is missing, damaged or does not fit;
+        or the twin cannot believe what it is told to.
     InvalidModelError
         The twin of the scenario does not fit in memory.
     """

@@ -18,7 +18,6 @@ from reporting.json_file import read_json
 from twin_master.assets.asset_source import LIBRARY_COPY, Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import (
-    InvalidObservationLibraryError,
     MissionInputError,
     check_names,
 )
@@ -84,7 +83,7 @@ class StrainLibrary:
 
         Raises
         ------
-        InvalidObservationLibraryError
+        MissionInputError
             The state lies outside the levels.
         """
         strain = self.strain[:, control_index].reshape(*self.states.shape, -1)
@@ -92,7 +91,7 @@ class StrainLibrary:
             known = factor.levels
             if not known[0] <= value <= known[-1]:
                 why = said("assets.covers", factor=factor, ends=(known[0], known[-1]), value=value)
-                raise InvalidObservationLibraryError(why)
+                raise MissionInputError(why)
             weights = [np.interp(value, known, level) for level in np.eye(len(known))]
             strain = np.tensordot(weights, strain, axes=1)
         return strain
@@ -108,20 +107,20 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
 
     Raises
     ------
-    InvalidObservationLibraryError
+    MissionInputError
         If the file cannot be read, is no JSON, lacks an entry (it is named), or has values that are not in
         the published format.
     """
     path = Path(path)
     file = path / FILE_NAME if path.is_dir() else path
-    content = read_json(file, InvalidObservationLibraryError, what="strain library")
+    content = read_json(file, MissionInputError, what="strain library")
     try:
         return _arranged(content)
     except KeyError as error:
         why = said("assets.lacks", file=file, error=error, file_name=FILE_NAME)
-        raise InvalidObservationLibraryError(why) from error
+        raise MissionInputError(why) from error
     except (TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InvalidObservationLibraryError(said("assets.unread", file=file, error=error)) from error
+        raise MissionInputError(said("assets.unread", file=file, error=error)) from error
 
 
 def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
@@ -169,9 +168,7 @@ class StrainLibrarySection(AssetSection):
         Raises
         ------
         MissionInputError
-            No file is named, or the library does not fit the scenario.
-        InvalidObservationLibraryError
-            It is missing or damaged.
+            No file is named, or the library is missing, damaged or does not fit the scenario.
         """
         if self.file is None:
             where = REPOSITORY, FILE_NAME
@@ -194,9 +191,7 @@ class StrainLibraryBelief(BeliefSection):
         Raises
         ------
         MissionInputError
-            A strain library flies, or the library does not fit the scenario.
-        InvalidObservationLibraryError
-            It is missing or damaged.
+            A strain library flies, or the library is missing, damaged or does not fit the scenario.
         """
         if not scenario.asset.is_fmu:
             raise MissionInputError(said("assets.believed"))

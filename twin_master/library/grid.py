@@ -20,7 +20,7 @@ from twin_master.assets.design_source import DesignBelief
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.library_source import LibraryBelief
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import InvalidObservationLibraryError
+from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.scenario.section import LARGEST_COUNT
 from twin_master.sentences import said
@@ -132,7 +132,7 @@ class GridSampler:
 
         Raises
         ------
-        InvalidObservationLibraryError
+        MissionInputError
             The FMU has a memory, or does not settle.
         FmuError
             The FMU failed; the sentence names the point.
@@ -211,7 +211,7 @@ class GridSampler:
         shown = f"{sensor} = {before[worst]:.9g}"
         of = {"grid": self._grid, "place": self._name(index), "shown": shown, "later": again[worst]}
         why = said("library.unsettled" if steps else "library.remembers", **of)
-        raise InvalidObservationLibraryError(why)
+        raise MissionInputError(why)
 
 
 _ROLES = ("health", "control", "load", "parameter")
@@ -225,7 +225,7 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
 
     Raises
     ------
-    InvalidObservationLibraryError
+    MissionInputError
         A text is no such thing, or the binding has no such name.
     """
     found: dict[str, dict[str, tuple[float, ...]]] = {role: {} for role in _ROLES}
@@ -240,10 +240,10 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
         if not equals or not places:
             known = [f"{role}.{key}" for role in _ROLES for key in tables[role]]
             why = said("library.grid", binding=binding, known=known, text=text)
-            raise InvalidObservationLibraryError(why)
+            raise MissionInputError(why)
         if len(places) > 1:
             full = " or ".join(f"{role}.{key}" for role, key in places)
-            raise InvalidObservationLibraryError(f"{name} is a name of several roles: write {full}.")
+            raise MissionInputError(f"{name} is a name of several roles: write {full}.")
         role, key = places[0]
         found[role][key] = _values(text, values)
     return found
@@ -261,7 +261,7 @@ def _values(text: str, values: str) -> tuple[float, ...]:
         if not all(math.isfinite(number) for number in numbers):
             raise ValueError
     except ValueError:
-        raise InvalidObservationLibraryError(said("library.numbers", most=LARGEST_COUNT, text=text)) from None
+        raise MissionInputError(said("library.numbers", most=LARGEST_COUNT, text=text)) from None
     return tuple(numbers)
 
 
@@ -278,25 +278,25 @@ def grid_of_fmu(
 
     Raises
     ------
-    InvalidObservationLibraryError
+    MissionInputError
         A text is wrong, something has several values that can have one, or the role is not told.
     """
     binding = load_binding(binding_file)
     given = parse_grid(texts, binding)
     if role is None:
         if len(binding.observation) != 1:
-            raise InvalidObservationLibraryError(said("library.role", binding=binding))
+            raise MissionInputError(said("library.role", binding=binding))
         role = next(iter(binding.observation))
     swept = [name for name, values in given["parameter"].items() if len(values) > 1]
     if len(swept) > 1:
-        raise InvalidObservationLibraryError(said("library.one_parameter", names=", ".join(swept)))
+        raise MissionInputError(said("library.one_parameter", names=", ".join(swept)))
     parameter = swept[0] if swept else ""
     inputs = given["control"]
     controls = {}
     combinations = math.prod(len(values) for values in inputs.values())
     if combinations > LARGEST_COUNT:
         numbers = {"combinations": combinations, "most": LARGEST_COUNT}
-        raise InvalidObservationLibraryError(said("library.controls", inputs=inputs, **numbers))
+        raise MissionInputError(said("library.controls", inputs=inputs, **numbers))
     for values in itertools.product(*inputs.values()):
         setting = dict(zip(inputs, values, strict=True))
         controls[", ".join(f"{name} = {value:g}" for name, value in setting.items())] = setting
@@ -319,7 +319,7 @@ def _single(role: str, given: dict[str, tuple[float, ...]]) -> dict[str, float]:
     for name, values in given.items():
         if len(values) > 1:
             what = f"{role} {name}"
-            raise InvalidObservationLibraryError(said("library.single", what=what, number=len(values)))
+            raise MissionInputError(said("library.single", what=what, number=len(values)))
     return {name: values[0] for name, values in given.items()}
 
 
@@ -338,7 +338,7 @@ def grid_of_scenario(
 
     Raises
     ------
-    InvalidObservationLibraryError
+    MissionInputError
         The scenario flies no FMU, or a text gives something else.
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         The asset of the scenario cannot be prepared.
@@ -346,7 +346,7 @@ def grid_of_scenario(
     scenario = resolve_scenario(_without_library(loaded), overrides or Overrides())
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
-        raise InvalidObservationLibraryError(said("library.kind", scenario=scenario))
+        raise MissionInputError(said("library.kind", scenario=scenario))
     believed = scenario.belief.source(scenario, flown)
     source = flown if believed is flown else PairedSource(flown, believed)
     source.check()
@@ -357,7 +357,7 @@ def grid_of_scenario(
     states = {factor.name: factor.levels for factor in scenario.state} | given.pop("health")
     swept = given.pop("parameter")
     if any(given.values()) or {*swept} - {draws.name}:
-        raise InvalidObservationLibraryError(said("library.scenario", name=draws.name))
+        raise MissionInputError(said("library.scenario", name=draws.name))
     fixed = {name: value for name, value in flown.parameters().items() if name != draws.name}
     return SamplingGrid(
         fmu=str(folder / FMU_COPY),

@@ -32,7 +32,7 @@ from twin_master.assets.library_source import (
     ObservationLibrary,
     write_observation_library,
 )
-from twin_master.errors import InvalidObservationLibraryError, check_names
+from twin_master.errors import MissionInputError, check_names
 from twin_master.library.grid import Float, GridSampler, SamplingGrid
 from twin_master.network.memory import NUMBER, check_fits
 from twin_master.sentences import said
@@ -107,7 +107,7 @@ def sample_library(
 
     Raises
     ------
-    InvalidObservationLibraryError
+    MissionInputError
         The file exists, an interrupted sampling is there or is of another grid, the FMU has a memory or does
         not settle.
     InvalidModelError
@@ -119,14 +119,14 @@ def sample_library(
     """
     count = processor_count() if workers is None else workers
     if count < 1:
-        raise InvalidObservationLibraryError(f"the number of workers must be at least 1, and {count} came.")
+        raise MissionInputError(f"the number of workers must be at least 1, and {count} came.")
     binding = load_binding(grid.binding)
     sensors = _check_grid(grid, binding)
     record = _record(grid)
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
     lock = lock_folder(folder)
     if lock is None:
-        raise InvalidObservationLibraryError(said("library.locked", folder=folder))
+        raise MissionInputError(said("library.locked", folder=folder))
     try:
         rows = _kept_rows(folder, (grid.size, sensors))
         todo = [(first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()]
@@ -173,16 +173,16 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
         ("load", grid.load, binding.load),
         ("parameter", parameters, binding.parameter),
     )
-    check_names("the grid has the", f"the binding {binding.name}", rows, InvalidObservationLibraryError)
+    check_names("the grid has the", f"the binding {binding.name}", rows)
     binding.observation_slice(grid.role)
     if not grid.states or not grid.controls or not grid.draws:
-        raise InvalidObservationLibraryError(said("library.bare"))
+        raise MissionInputError(said("library.bare"))
     taken = sorted({*grid.states} & {*RESERVED})
     if taken:
-        raise InvalidObservationLibraryError(said("library.reserved", name=taken[0]))
+        raise MissionInputError(said("library.reserved", name=taken[0]))
     for name, levels in grid.states.items():
         if any(b <= a for a, b in itertools.pairwise(levels)):
-            raise InvalidObservationLibraryError(f"the levels of {name} must increase, and {levels} came.")
+            raise MissionInputError(f"the levels of {name} must increase, and {levels} came.")
     fmu = FmiAsset(grid.fmu, binding)
     say_sandbox(Path(grid.fmu), binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
@@ -204,21 +204,21 @@ def _record(grid: SamplingGrid) -> dict[str, Any]:
 
 def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_existing: bool) -> Path:
     if out.suffix != ".nc":
-        raise InvalidObservationLibraryError(said("library.suffix", out=out))
+        raise MissionInputError(said("library.suffix", out=out))
     folder = blocks_folder(out)
     plan = folder / PLAN_NAME
     if replace_existing:
         shutil.rmtree(folder, ignore_errors=True)
     elif out.exists():
-        raise InvalidObservationLibraryError(f"{out} exists: choose another --out or give --replace.")
+        raise MissionInputError(f"{out} exists: choose another --out or give --replace.")
     text = json.dumps(record, indent=1) + "\n"  # the order of the states matters
     if folder.exists():
         if not resume:
-            raise InvalidObservationLibraryError(said("library.interrupted", folder=folder))
+            raise MissionInputError(said("library.interrupted", folder=folder))
         kept = plan.read_bytes() if plan.is_file() else b""
         if kept and kept != text.encode("utf-8"):
             what = _difference(kept, record)
-            raise InvalidObservationLibraryError(said("library.another", folder=folder, what=what))
+            raise MissionInputError(said("library.another", folder=folder, what=what))
         if kept:
             return folder
     atomic_write_text(plan, text)
@@ -227,9 +227,9 @@ def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_
 
 def _difference(kept: bytes, record: dict[str, Any]) -> str:
     try:
-        before = parse_json(kept, PLAN_NAME, InvalidObservationLibraryError)
+        before = parse_json(kept, PLAN_NAME, MissionInputError)
         return ", ".join(key for key in record if before.get(key) != record[key]).replace("_", " ")
-    except (InvalidObservationLibraryError, AttributeError):
+    except (MissionInputError, AttributeError):
         return "damaged"
 
 

@@ -1,4 +1,4 @@
-"""The plan of a scenario, by the state or on the belief: what it promises, and what other rules bring."""
+"""The plan of a scenario on the belief: what it promises, and what other rules bring."""
 
 import io
 import zipfile
@@ -18,9 +18,8 @@ from twin_master.network.belief_planning import (
     simulated_returns,
 )
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
+from twin_master.network.planner import BeliefPolicy, value_iteration
 from twin_master.network.rewards import RewardModel
-from twin_master.network.sensor_model import GaussianSensorModel, observation_classes
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 from twin_master.sentences import said
@@ -35,47 +34,10 @@ _HARDEST, _HALVINGS = 2.0**12, 4
 """The largest price of a turn beyond the limit, in rewards, and how often the interval of it is halved."""
 
 
-def planned(
-    scenario: Scenario,
-    model: GraphicalModel,
-    sensor_model: GaussianSensorModel,
-    rewards: RewardModel,
-    policy: Float | BeliefPolicy | None = None,
-) -> PlannedPolicy:
-    """Return the policy that is given, or the one that the scenario asks for."""
-    reward, discount = _reward(scenario, rewards), discounts(scenario)
-    if policy is not None and not isinstance(policy, BeliefPolicy):
-        return given_policy(model.transition, reward, discount, model.policy(policy))
-    plan = value_iteration(model.transition, reward, discount)
-    if policy is None and scenario.planner.policy == "qmdp":
-        policy = BeliefPolicy(plan.action_value.T, np.arange(len(discount)))
-    elif policy is None and scenario.planner.policy == "belief":
-        problem = decision_problem(scenario, model, sensor_model, rewards)
-        policy = expected_plan(scenario, problem, rewards)[0].policy
-    return replace(plan, on_belief=policy)
-
-
-def decision_problem(
-    scenario: Scenario, model: GraphicalModel, sensor_model: GaussianSensorModel, rewards: RewardModel
-) -> DecisionProblem:
-    """Return what a scenario decides on, its observations joined to classes under its seed."""
-    return DecisionProblem(
-        model.transition,
-        _reward(scenario, rewards),
-        discounts(scenario),
-        observation_classes(sensor_model, generator(scenario.mission.seed, "planning")),
-        model.prior,
-    )
-
-
 def discounts(scenario: Scenario) -> Float:
     """Return the discount behind a turn under each control (U,): zero where it ends the mission."""
     ends = [scenario.ends(index) for index in range(len(scenario.control))]
     return np.where(ends, 0.0, scenario.planner.gamma)
-
-
-def _reward(scenario: Scenario, rewards: RewardModel) -> Float:
-    return rewards.planning_reward(scenario.rewards.health_weight, scenario.rewards.control_weight)
 
 
 def expected_plan(

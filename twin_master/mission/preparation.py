@@ -5,7 +5,7 @@ import json
 import os
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,17 +26,19 @@ from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.learning.words import Words
-from twin_master.mission.planning import planned
+from twin_master.mission.planning import discounts, expected_plan
 from twin_master.mission.truth import Plant, Truth
+from twin_master.network.belief_planning import DecisionProblem
 from twin_master.network.estimator import Estimator, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
-from twin_master.network.planner import BeliefPolicy, PlannedPolicy
+from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
 from twin_master.network.rewards import RewardModel
-from twin_master.network.sensor_model import GaussianSensorModel, check_noise
+from twin_master.network.sensor_model import GaussianSensorModel, check_noise, observation_classes
 from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.seeds import generator
 from twin_master.sentences import said
 
 
@@ -113,7 +115,24 @@ class Knowledge:
     @cached_property
     def plan(self) -> PlannedPolicy:
         """Value iteration, what the scenario asks for, or the policy that was given."""
-        return planned(self.scenario, self.model, self.sensor_model, self.rewards, self.policy)
+        scenario, policy = self.scenario, self.policy
+        basis = self.model.transition, self.planning_reward, discounts(scenario)
+        if policy is not None and not isinstance(policy, BeliefPolicy):
+            return given_policy(*basis, self.model.policy(policy))
+        plan = value_iteration(*basis)
+        if policy is None and scenario.planner.policy == "qmdp":
+            policy = BeliefPolicy(plan.action_value.T, np.arange(len(scenario.control)))
+        elif policy is None and scenario.planner.policy == "belief":
+            policy = expected_plan(scenario, self.problem, self.rewards)[0].policy
+        return replace(plan, on_belief=policy)
+
+    @cached_property
+    def problem(self) -> DecisionProblem:
+        """What is decided on, its observations joined to classes under the seed of the scenario."""
+        seed = generator(self.scenario.mission.seed, "planning")
+        classes = observation_classes(self.sensor_model, seed)
+        basis = self.model.transition, self.planning_reward, discounts(self.scenario)
+        return DecisionProblem(*basis, classes, self.model.prior)
 
     @property
     def planning_reward(self) -> Float:

@@ -178,6 +178,12 @@ class Run:
         return self.scenario.mission.step_name
 
     @property
+    def decides_ahead(self) -> bool:
+        """Whether it is decided by the belief that is predicted for the next step."""
+        planner = self.scenario.planner
+        return planner.decide_on == "predicted" or planner.policy != "mode"
+
+    @property
     def watched(self) -> bool:
         """Whether it is that of a real asset."""
         return bool(self.config.get("watched"))

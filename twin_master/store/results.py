@@ -156,7 +156,8 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]
                 "residual": (observed - expected.mean) / expected.noise,
                 "sensors_received": np.isfinite(observed).sum(axis=1),
             }
-            words["decided_on"] = _DECIDED_ON[result.scenario.planner.decide_on]
+            told = "predicted" if known.plan.on_belief is not None else result.scenario.planner.decide_on
+            words["decided_on"] = _DECIDED_ON[told]
             words["how"] = "that the twin assumes" if learns is None else "that the twin has learnt"
         elif name == "predicted":
             values["control_probability"] = joint.sum(axis=-2)

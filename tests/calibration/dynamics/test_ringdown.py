@@ -158,10 +158,7 @@ def test_the_spectrum_of_a_cosine():
 def test_the_digitised_records(reference):
     records = read_records(reference)
     assert len(records) == 5
-    trials = fit_trials(records)
-    assert average(trials, "frequency", 0).mean == pytest.approx(5.65, rel=0.005)
-    assert average(trials, "frequency", 1).mean == pytest.approx(29.9, rel=0.005)
-    assert average(trials, "damping_ratio", 0).mean == pytest.approx(0.028, rel=0.10)
+    trials = fit_trials(records)  # whose means test_lab_files.py holds
     # Trials repeat each other closely; mode 2 is seen by 8.1 ms columns of pixels.
     assert average(trials, "frequency", 0).standard_deviation < 0.002
     assert average(trials, "frequency", 1).standard_deviation < 0.1

@@ -384,10 +384,8 @@ def test_two_modes_are_separated():
     noise = np.random.default_rng(3).standard_normal(TIME.size)
     signal = _viscous() + _viscous(0.03, 30.0) + 0.01 * noise
     first, second = backbones(TIME, signal, (5.0, 30.0), noise_deviation=0.01)
-    for curve, frequency, ratio in (
-        (first, 5.0, 0.01),
-        (second, 30.0, 0.03),
-    ):  # errors are those that are made
+    # errors are those that are made
+    for curve, frequency, ratio in ((first, 5.0, 0.01), (second, 30.0, 0.03)):
         assert 0.2 < np.mean(((curve.frequency - frequency) / curve.frequency_error) ** 2) < 3.0
         assert 0.2 < np.mean(((curve.damping_ratio - ratio) / curve.damping_ratio_error) ** 2) < 3.0
     assert second.time[-1] < 3.0 < 8.0 < first.time[-1]

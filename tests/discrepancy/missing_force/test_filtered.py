@@ -268,17 +268,6 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
             assert search.evidence([switched.whole(on)]) == pytest.approx(values[a, b], abs=1e-7)
 
 
-def test_a_force_that_turns_is_one_that_does_not_turned():
-    """Its readings before and after a turn have the opposite correlation; what they are alone is the same."""
-    trial = trial_of(0.02 * np.arange(40), np.random.default_rng(5).standard_normal((40, 2)))
-    both = [EventSearch(View([trial], np.zeros(0)), 0, EVENT) for _ in range(2)]
-    both[1].flips = [np.arange(40) == 20]
-    forces = EVENT, Process(1e-6, 1.0, rough=True)
-    for on, same in ((np.arange(40) < 20, True), (np.ones(40, dtype=bool), False)):
-        one, other = (search.evidence(search.told(forces, [on])) for search in both)
-        assert bool(abs(one - other) < 1e-9) is same
-
-
 @pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
 def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(settled):
     """Of a settled trial, too, whose state before is what the forces that act make of it."""

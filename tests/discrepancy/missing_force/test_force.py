@@ -207,7 +207,7 @@ def test_an_fmu_whose_system_is_not_known_shows_no_force(foreign_fmu, tmp_path):
     fmu = FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2"), unknown))
     try:
         problem = problem_of(released(ModelPatch((STIFF,))), fmu)
-        assert not Search(problem, (), fit(problem, Candidate(), problem.start(Candidate()))).by_force()
+        assert Search(problem, (), fit(problem, Candidate(), problem.start(Candidate()))).force is None
     finally:
         fmu.close()
 
@@ -295,15 +295,6 @@ def test_friction_that_holds_is_the_law_of_the_missing_force():
         slips = np.abs(item.speed) > 0.02
         np.testing.assert_allclose(np.abs(item.law[slips]), 0.528, rtol=0.06)
         assert np.abs(item.law).max() < 0.56  # where it sticks no more than that holds it
-
-
-def test_the_missing_force_does_not_depend_on_where_it_is_linear_about():
-    """Gains and parameters at the fit of the right law, or where the search finds them without one."""
-    problem = chain("ringdown", "coulomb_friction", "joint", friction_ratio=0.004)
-    candidate = Candidate((Term(FRICTION, "joint"),))
-    there = fit(problem, candidate, problem.start(candidate)).point
-    one, other = (ForceSearch(problem, about).at["joint"] for about in (None, there))
-    assert one.log_evidence == pytest.approx(other.log_evidence, abs=20.0)  # of 7,500 readings
 
 
 def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():

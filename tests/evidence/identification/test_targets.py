@@ -7,7 +7,7 @@ import pytest
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from evidence.identification.targets import FITTED_LEVELS, LEVELS, fitted_states, read_targets
-from twin_master.errors import InvalidObservationLibraryError
+from twin_master.errors import MissionInputError
 
 RESULTS = Path("calibration") / "step3" / "massoptimizationresults.csv"
 LIBRARY = Path("library") / "UAVconfig.json"
@@ -91,7 +91,7 @@ def strains(content: dict[str, Any]) -> list[float]:
     return content["observations"]["20"]["0"]["3g"]["mean"]
 
 
-LIBRARY_ERROR = InvalidObservationLibraryError
+LIBRARY_ERROR = MissionInputError
 
 
 @pytest.mark.parametrize(

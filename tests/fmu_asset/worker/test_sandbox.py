@@ -24,7 +24,7 @@ from fmu_asset.worker.sandbox import landlock_version
 from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE
 from tests.fmu_asset.making import ROOT, bound, changed, run_python, system
 from tests.fmu_asset.worker.test_hostile import MISBEHAVIOURS
-from twin_master.errors import InvalidObservationLibraryError
+from twin_master.errors import MissionInputError
 from twin_master.library.grid import SamplingGrid
 from twin_master.library.sampling import sample_library
 
@@ -224,7 +224,7 @@ def test_components_and_samplers_are_confined_too(attempting, key, tmp_path) -> 
         sample_library(sampled(fmu, tmp_path), library, workers=1)
     assert key.exists()
     free = sampled(fmu, tmp_path, "[limits]\nsandbox = false\n")
-    with pytest.raises(InvalidObservationLibraryError):  # an integrator does not settle
+    with pytest.raises(MissionInputError):  # an integrator does not settle
         sample_library(free, library, workers=1, replace_existing=True)
     assert not key.exists()
 

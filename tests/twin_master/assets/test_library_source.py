@@ -20,7 +20,7 @@ from tests.refusals import Inputs, refused
 from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, merged, table_of
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
-from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
+from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.library.grid import grid_of_scenario
 from twin_master.library.sampling import sample_library
 from twin_master.network.inference import known_control
@@ -111,7 +111,7 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
 
 @pytest.mark.parametrize(("key", "entry", "words"), INPUTS.refused("library"))
 def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
-    with pytest.raises(InvalidObservationLibraryError, match=words):
+    with pytest.raises(MissionInputError, match=words):
         fly(changed(key, entry), tmp_path / "run", Overrides(library=made))
 
 
@@ -143,10 +143,10 @@ def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
         wrong.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
         cases[name] = "finite"
     for name, words in cases.items():
-        with refused(InvalidObservationLibraryError, words):
+        with refused(MissionInputError, words):
             load_observation_library(tmp_path / f"{name}.nc")
     given = Overrides(strain_library=library_file)
-    with pytest.raises(InvalidObservationLibraryError, match="kind `strain_library`, and one FMU can be"):
+    with pytest.raises(MissionInputError, match="kind `strain_library`, and one FMU can be"):
         grid_of_scenario(load_scenario("level_turns"), tmp_path, overrides=given)
 
 
@@ -230,5 +230,5 @@ def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path):
     names = [f"csv/{file.name}" for file in (tmp_path / "asked" / "csv").iterdir()]
     check_same(tmp_path / "sampled", tmp_path / "asked", *names)
     # With another seed the draws are others, inside the sampled range only for some.
-    with pytest.raises(InvalidObservationLibraryError, match="scenario and seed"):
+    with pytest.raises(MissionInputError, match="scenario and seed"):
         fly(small_pump(), tmp_path / "other", Overrides(library=library.library, seed=3))

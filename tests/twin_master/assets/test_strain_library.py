@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
-from twin_master.errors import InvalidObservationLibraryError
+from twin_master.errors import MissionInputError
 
 LEVELS = [[0, 20, 40], [0, 50]]
 
@@ -62,10 +62,10 @@ def test_between_the_levels_strain_is_multilinear(tmp_path):
         np.testing.assert_allclose(library.strain_at((z1, z2), 1), expected, rtol=1e-13)
     single = loaded(tmp_path, small_content([LEVELS[0], [0]]))  # of one region, as it were
     np.testing.assert_allclose(single.strain_at((0.07, 0.0), 1), 1e-6 * strain(7, 0, 3), rtol=1e-13)
-    with pytest.raises(InvalidObservationLibraryError, match=r"covers z2 from 0 to 0, got 0\.1"):
+    with pytest.raises(MissionInputError, match=r"covers z2 from 0 to 0, got 0\.1"):
         single.strain_at((0.07, 0.1), 1)
     for outside in (0.41, -0.01, np.nan):
-        with pytest.raises(InvalidObservationLibraryError, match=r"covers z1 from 0 to 0\.4"):
+        with pytest.raises(MissionInputError, match=r"covers z1 from 0 to 0\.4"):
             library.strain_at((outside, 0.0), 0)
 
 
@@ -82,7 +82,7 @@ def test_between_the_levels_strain_is_multilinear(tmp_path):
 def test_an_incomplete_library_is_refused(tmp_path, change, sentence):
     content = small_content()
     change(content)
-    with pytest.raises(InvalidObservationLibraryError, match=sentence):
+    with pytest.raises(MissionInputError, match=sentence):
         loaded(tmp_path, content)
 
 
@@ -91,10 +91,10 @@ def cell(content: dict[str, Any], draw: str) -> list[float]:
 
 
 def test_a_missing_or_damaged_file_is_refused(tmp_path):
-    with pytest.raises(InvalidObservationLibraryError, match="cannot be read"):
+    with pytest.raises(MissionInputError, match="cannot be read"):
         load_strain_library(tmp_path)
     for text, words in (('{"states": [[0', "not valid JSON"), ("[1, 2]", "not in the published format")):
-        with pytest.raises(InvalidObservationLibraryError, match=words):
+        with pytest.raises(MissionInputError, match=words):
             loaded(tmp_path, text)
 
 

@@ -35,6 +35,7 @@ from twin_master.watch.opening import begun_watch
 from uav_twin import fly_fleet, learn_from_fleet, load_scenario, open_fleet
 
 TURNS = 6
+LOGS = 'observations = "logs/*.csv"'
 Decision = Mapping[str, Any]
 
 
@@ -52,20 +53,18 @@ def fleet_file(library_file: Path, tmp_path: Path) -> Path:
     lines = log_of(tmp_path, 2).read_text().splitlines()
     lines[3], lines[4] = lines[4], lines[3]
     log_of(tmp_path, 2).write_text("\n".join(lines) + "\n")
-    return fleet_of(tmp_path, "logs/*.csv")
+    return fleet_of(tmp_path, LOGS)
 
 
 def log_of(folder: Path, number: int) -> Path:
     return folder / "logs" / f"wing-{number}.csv"
 
 
-def fleet_of(folder: Path, observations: str, *more: str) -> Path:
-    lines = [
+def fleet_of(folder: Path, *lines: str) -> Path:
+    head = (
         'format = 1\nfleet = { name = "real", seed = 7 }\n[[group]]\nname = "north"\nscenario = "wing.toml"'
-    ]
-    return written(
-        folder, "\n".join([*lines, f'observations = "{observations}"', *more, ""]), name="fleet.toml"
     )
+    return written(folder, "\n".join([head, *lines, ""]), name="fleet.toml")
 
 
 @pytest.fixture
@@ -130,7 +129,7 @@ def test_files_that_grow(fleet_file, alone, tmp_path, monkeypatch):
             (tmp_path / "growing" / name).write_bytes(content[: int(cuts[min(step, 4)] * len(content))])
         fleet.asked = step == 8
 
-    growing = load_fleet(fleet_of(tmp_path, "growing/*.csv"))
+    growing = load_fleet(fleet_of(tmp_path, LOGS.replace("logs", "growing")))
     fleet = FleetWatch(growing, tmp_path / "out", lambda *_: None, print, follow=True)
     fleet.run(grow)
     assert journals(tmp_path / "out") == alone
@@ -144,14 +143,9 @@ def test_an_asset_is_lost_alone(fleet_file, alone, tmp_path):
     assert "colour" in failures["north/wing-0"]
     assert "void.csv is empty" in failures["north/void"]
     assert journals(tmp_path / "out") == alone[1:]
-    none = fleet_of(tmp_path, "none/*.csv")
-    with pytest.raises(FleetError, match="no recording fits"):
-        FleetWatch(load_fleet(none), tmp_path / "none", print, print)
-    flown = written(
-        tmp_path, none.read_text(), ('observations = "none/*.csv"', "count = 2"), name="fleet.toml"
-    )
-    with pytest.raises(FleetError, match="north has none"):
-        FleetWatch(load_fleet(flown), tmp_path / "flown", print, print)
+    for line, words in ((LOGS.replace("logs", "none"), "no recording fits"), ("count = 2", "north has none")):
+        with pytest.raises(FleetError, match=words):
+            FleetWatch(load_fleet(fleet_of(tmp_path, line)), tmp_path / "none", print, print)
 
 
 @pytest.fixture
@@ -161,7 +155,7 @@ def broker(fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         pytest.skip("no mosquitto")
     monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
     broker = Mosquitto(tmp_path)
-    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    fleet_of(tmp_path, f'observations = "mqtt://wing@127.0.0.1:{broker.port}/wings/+"')
     yield broker
     broker.stop()
 
@@ -205,9 +199,8 @@ def test_an_asset_that_was_lost_is_taken_up_again(fleet_file, alone, tmp_path, m
             log.write_bytes(content)
         fleet.asked = at == 6
 
-    fleet = FleetWatch(
-        load_fleet(fleet_of(tmp_path, "logs/*")), tmp_path / "out", tell, notes.append, follow=True
-    )
+    planned = load_fleet(fleet_of(tmp_path, LOGS.replace(".csv", "")))
+    fleet = FleetWatch(planned, tmp_path / "out", tell, notes.append, follow=True)
     fleet.run(mend)
     assert journals(tmp_path / "out") == alone
     assert fleet.failures == {"north/wing-1 of wing-1.txt": "another file has the same name."}
@@ -359,7 +352,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
 def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     short = log_of(tmp_path, 0)
     short.write_text("".join(short.read_text().splitlines(keepends=True)[:4]))
-    planned = load_fleet(fleet_of(tmp_path, "logs/*.csv", f"steps = {TURNS}"))
+    planned = load_fleet(fleet_of(tmp_path, LOGS, f"steps = {TURNS}"))
     outcome = fly_fleet(planned, tmp_path / "flown", Engine(0))
     group = open_fleet(outcome.folder)["north"]
     for row, turns in enumerate((3, TURNS, TURNS)):
@@ -381,7 +374,7 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     write_fleet_report(outcome.folder)
     south = '[[group]]\nname = "south"\nscenario = "wing.toml"\nobservations = "none/*.csv"'
     with pytest.raises(FleetError, match="no recording fits"):
-        fly_fleet(load_fleet(fleet_of(tmp_path, "logs/*.csv", south)), tmp_path / "other", Engine(0))
+        fly_fleet(load_fleet(fleet_of(tmp_path, LOGS, south)), tmp_path / "other", Engine(0))
 
 
 def test_recordings_teach_what_the_flights_taught(fleet_file, tmp_path):
@@ -405,7 +398,7 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     header, *rows = log.read_text().splitlines()
     rows[2] = ",".join([*rows[2].split(",")[:-1], "OL"])
     log.write_text("\n".join([header, *rows]) + "\n")
-    fleet_of(tmp_path, "logs/*.csv", f"steps = {TURNS}")
+    fleet_of(tmp_path, LOGS, f"steps = {TURNS}")
     fleet = watched(fleet_file, tmp_path / "out")
     fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
     group, alarmed = open_fleet(tmp_path / "flown")["north"], 0

@@ -18,7 +18,7 @@ from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.packing.contents import build_script_fmu
 from tests.refusals import Inputs
 from twin_master.assets.library_source import load_observation_library
-from twin_master.errors import InvalidObservationLibraryError
+from twin_master.errors import MissionInputError
 from twin_master.library.grid import SamplingGrid, grid_of_fmu
 from twin_master.library.sampling import blocks_folder, sample_library
 
@@ -112,9 +112,9 @@ def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, signals)
             assert words.startswith("Interrupted; finished blocks are kept")
             assert "Traceback" not in words
     assert not out.exists()
-    with pytest.raises(InvalidObservationLibraryError, match=r"part\.nc\.blocks holds the finished blocks"):
+    with pytest.raises(MissionInputError, match=r"part\.nc\.blocks holds the finished blocks"):
         sample_library(slow, out)
-    with pytest.raises(InvalidObservationLibraryError, match=r"another FMU, binding, grid .*\(draws\)"):
+    with pytest.raises(MissionInputError, match=r"another FMU, binding, grid .*\(draws\)"):
         sample_library(grid(files, SLOW), out, resume=True)
     outcome = sample_library(slow, out, workers=2, resume=True)
     assert wanted <= outcome.kept_blocks < outcome.block_count
@@ -148,11 +148,9 @@ def test_what_is_damaged_is_sampled_again(files, tmp_path, monkeypatch, damage):
 
 def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(files, tmp_path):
     for mode in (LAG, COUNT):
-        with pytest.raises(
-            InvalidObservationLibraryError, match=r"remembers earlier steps: at wear = .*--settle"
-        ):
+        with pytest.raises(MissionInputError, match=r"remembers earlier steps: at wear = .*--settle"):
             sample_library(grid(files, mode), tmp_path / "lever.nc", workers=1, replace_existing=True)
-    with pytest.raises(InvalidObservationLibraryError, match="has not settled after 3 steps"):
+    with pytest.raises(MissionInputError, match="has not settled after 3 steps"):
         sample_library(
             grid(files, LAG, settling_steps=3), tmp_path / "lever.nc", workers=1, replace_existing=True
         )
@@ -181,14 +179,14 @@ def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(files, 
 def test_what_does_not_fit_is_named_before_anything_is_started(files, tmp_path):
     out = tmp_path / "lever.nc"
     for changes, words in Inputs(__file__).refused("grids"):
-        with pytest.raises(InvalidObservationLibraryError, match=words):
+        with pytest.raises(MissionInputError, match=words):
             sample_library(grid(files, **changes), out, workers=1)
-    with pytest.raises(InvalidObservationLibraryError, match="suffix"):
+    with pytest.raises(MissionInputError, match="suffix"):
         sample_library(grid(files), tmp_path / "lever.csv", workers=1)
-    with pytest.raises(InvalidObservationLibraryError, match="at least 1"):
+    with pytest.raises(MissionInputError, match="at least 1"):
         sample_library(grid(files), out, workers=0)
     out.write_bytes(b"a library")
-    with pytest.raises(InvalidObservationLibraryError, match="exists"):
+    with pytest.raises(MissionInputError, match="exists"):
         sample_library(grid(files), out, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["lever.nc"]
 

@@ -22,7 +22,6 @@ from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
-    decision_problem,
     expected_plan,
     policy_file,
     promised,
@@ -155,6 +154,7 @@ def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp
         assert read[inspected] == pytest.approx(truth["state"].sel(region=name).values[inspected], abs=0.4)
     assert "learnt" in run
     assert "notice" in run
+    assert "belief predicted" in run["filtered"]["decision_probability"].attrs["long_name"]
 
 
 def test_missions_side_by_side_are_those_alone_with_readings_and_repairs():
@@ -183,7 +183,7 @@ def test_an_action_that_ends_ends_the_mission():
 @cache
 def planned() -> tuple[Any, Any]:
     known = knowledge()
-    problem = decision_problem(known.scenario, known.model, known.sensor_model, known.rewards)
+    problem = known.problem
     return problem, expected_plan(known.scenario, problem, known.rewards)[0]
 
 

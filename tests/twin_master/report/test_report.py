@@ -169,8 +169,9 @@ def test_captions_tell_the_decision_and_what_it_rests_on(run, folder, tmp_path):
     sentence = "At the end of turn 18 the twin decided on 3g for the next one: the policy asks for it with "
     captions = {figure.name: figure.caption for figure in report.report_figures(folder, 18)}
     assert f"{sentence}probability {asked:.2f} in the state as just observed." in captions["mission_now"]
-    place = stored(rescripted(run, planner={"decide_on": "predicted"}), tmp_path / "run")
-    assert "in the state predicted for that turn." in next(report.report_figures(place, 18)).caption
+    for key, value in (("decide_on", "predicted"), ("policy", "qmdp")):
+        place = stored(rescripted(run, planner={key: value}), tmp_path / key)
+        assert "in the state predicted for that turn." in next(report.report_figures(place, 18)).caption
 
 
 def test_the_present_is_chosen_before_the_first_change_of_control(run):
