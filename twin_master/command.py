@@ -224,6 +224,7 @@ def watch(
 
     Everything is kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up.
     """
+    from reporting.words import counted
     from twin_master.store.writing import REPORT_NAME
     from twin_master.watch import opening as from_python
     from twin_master.watch.feeds import is_broker
@@ -253,8 +254,9 @@ def watch(
         )  # fmt: skip
         _write("", flush=True)
         counts = watches[0].intake.counts
-        refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
-        typer.echo(f"Watch: {folder}, {counts.received} messages{refused}.", err=True)
+        refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
+        refused *= counts.rejected > 0
+        typer.echo(f"Watch: {folder}, {counted(counts.received, 'message')}{refused}.", err=True)
         if not no_report and (folder / REPORT_NAME).is_file():
             typer.echo(f"Report: {folder / REPORT_NAME}", err=True)
 

@@ -171,7 +171,7 @@ class Calibration:
     Raises
     ------
     CalibrationRecordError
-        If the name cannot be printed.
+        If the name cannot be printed, or samples are missing or not finite.
     """
 
     asset: str
@@ -199,6 +199,10 @@ class Calibration:
 
     def __post_init__(self) -> None:
         check_name(self.asset)
+        for samples in (self.samples, self.prior_samples):
+            whole = len(samples) and samples.shape[1:] == (len(self.figures),)
+            if not (whole and np.isfinite(samples).all()):
+                raise CalibrationRecordError(said("posterior.samples", self=self))
 
     # ------------------------------------------------------------ figures
 

@@ -11,6 +11,7 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from calibration.dynamics.figures import ring_down_figure
+from calibration.errors import CalibrationRecordError
 from calibration.geometry import Lengths, tailored_design
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import QUANTITIES, tabulate_wing, wing_priors
@@ -37,6 +38,7 @@ from calibration.result.record import (
     check_name,
     prior_samples,
 )
+from calibration.sentences import said
 from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import PUBLISHED_LINE, child_seed
@@ -141,6 +143,8 @@ def calibrate(
     FiniteElementError
         If the tailored wing cannot be built.
     """
+    if procedure not in ("joint", "paper") or seed not in range(2**63):
+        raise CalibrationRecordError(said("posterior.asked", procedure=procedure, seed=seed))
     progress = reporter(progress)
     if not isinstance(lab, LabData):
         lab = published_data() if lab is None else read_lab_folder(Path(lab))
@@ -169,14 +173,13 @@ def calibrate(
     ).as_dict()
 
     def record(way: Procedure, state: Float) -> Calibration:
-        lengths = _lengths(lab.lengths, len(state), seed)
         found = Calibration(
             asset=name,
             model=tailored.name,
             model_hash=tailored.hash,
             procedure=way,
             priors=priors,
-            samples=np.column_stack([state, lengths, table.outputs(state)]),
+            samples=np.column_stack([state, _lengths(lab.lengths, len(state), seed), table.outputs(state)]),
             prior_samples=prior,
             explained=None,
             findings=(),

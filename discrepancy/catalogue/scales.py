@@ -53,12 +53,6 @@ class Here:
             )
         return ports[self.target.name]
 
-    @property
-    def stiffness_at_rest(self) -> float:
-        """Stiffness of the port at rest [N/m or N m/rad]."""
-        port = self.port
-        return port.stiffness if port.static_stiffness is None else port.static_stiffness
-
 
 def loss_integral(velocity_exponent: float, displacement_exponent: float) -> float:
     """Return B((p + 2) / 2, (a + 1) / 2): half the loss of a cycle over F_0 A; 2 for p = a = 0."""
@@ -83,9 +77,9 @@ def _holding_force(here: Here) -> float:
     return LARGEST_SHARE * port.static_stiffness * port.displacement
 
 
-def _largest_displacement(here: Here) -> float:
-    port = here.port
-    return port.displacement if port.largest_displacement is None else port.largest_displacement
+def _known(scale: str, usual: str) -> Callable[[Here], float]:
+    """Return what gives a natural scale of the port, the usual one where it is not known."""
+    return lambda here: next(x for key in (scale, usual) if (x := getattr(here.port, key)) is not None)
 
 
 def _largest_reading(here: Here) -> float:
@@ -135,8 +129,8 @@ SCALES: dict[str, Callable[[Here], float]] = {
     "port_displacement": lambda here: here.port.displacement,
     "port_stiffness": lambda here: here.port.stiffness,
     "port_angular_frequency": lambda here: here.port.angular_frequency,
-    "port_stiffness_at_rest": lambda here: here.stiffness_at_rest,
-    "port_largest_displacement": _largest_displacement,
+    "port_stiffness_at_rest": _known("static_stiffness", "stiffness"),
+    "port_largest_displacement": _known("largest_displacement", "displacement"),
     "port_holding_force": _holding_force,
     "port_is_held": _held,
     "mean_power": lambda here: here.port.mean_power(here.values["exponent"] + 1.0),

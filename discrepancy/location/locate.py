@@ -16,7 +16,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 from discrepancy.sentences import said
 
-from .dependence import Dependence, dependences, excess, mode_shares, predicted_frequencies
+from .dependence import dependences, excess, mode_shares, predicted_frequencies
 from .map import Cell, residual_map
 from .omnibus_tests import OmnibusTest, coloured_noise, mean_square, noise_groups, serial_tests, variance_test
 from .residuals import FittedTrial, ResidualSet
@@ -274,11 +274,15 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
 def _disagreement(kind: Kind, patterns: Sequence[Disagreement]) -> Disagreement | None:
     """Return the finding on what the excess of a kind of trial goes with."""
     rows = list(dependences(kind.items))
-    told = _smallest_sufficient(rows)
-    if told is None:
+    worth = [row for row in rows if row.share >= _WORTH_TELLING and row.p_value < 1e-3]
+    if not worth:
         return None
-    subject = told.subject or _subject(kind, patterns)
-    words = f"by {_dependence_words(told, rows)}"
+    close = [row for row in worth if row.share >= max(row.share for row in worth) - _CLOSE]
+    told = min(close, key=lambda row: (row.coefficients, -row.share))  # the simplest that suffices
+    subject, words = told.subject or _subject(kind, patterns), f"by {told.name}"
+    rival = told.subject, {"amplitude": "time", "time": "amplitude"}.get(told.name)
+    if any((row.subject, row.name) == rival and row.share >= told.share - _CLOSE for row in rows):
+        words = "by amplitude or time (these releases do not tell the two apart)"
     if told.name.startswith("a "):
         words = told.name
         if subject.startswith("mode"):
@@ -296,21 +300,3 @@ def _subject(kind: Kind, patterns: Sequence[Disagreement]) -> str:
     at = predicted_frequencies(kind.items) if kind.items[0].trial.is_dynamic else ()
     shares = mode_shares(kind.items, kind.white, at) if at else np.zeros(1)
     return f"mode {int(np.argmax(shares)) + 1}" if shares.max() > 0.5 else "all channels"
-
-
-def _smallest_sufficient(rows: Sequence[Dependence]) -> Dependence | None:
-    """Return the dependence with fewest coefficients among those within 2 % of the largest share."""
-    rows = [row for row in rows if row.share >= _WORTH_TELLING and row.p_value < 1e-3]
-    best = max((row.share for row in rows), default=0.0)
-    close = [row for row in rows if row.share >= best - _CLOSE]
-    return min(close, key=lambda row: (row.coefficients, -row.share), default=None)
-
-
-def _dependence_words(told: Dependence, rows: Sequence[Dependence]) -> str:
-    """Return the dependence, and its rival where one release amplitude cannot tell the two apart."""
-    rival = {"amplitude": "time", "time": "amplitude"}.get(told.name)
-    if any(
-        (row.subject, row.name) == (told.subject, rival) and row.share >= told.share - _CLOSE for row in rows
-    ):
-        return "amplitude or time (these releases do not tell the two apart)"
-    return told.name

@@ -97,7 +97,7 @@ def _root(mean: Estimated) -> Estimated:
     return Estimated(root, mean.error / (2.0 * root) if root > 0.0 else 0.0)
 
 
-def open_fleet(folder: Path) -> "dict[str, xr.Dataset]":
+def open_fleet(folder: Path | str) -> "dict[str, xr.Dataset]":
     """Return the groups of a fleet by their names.
 
     Raises
@@ -105,8 +105,8 @@ def open_fleet(folder: Path) -> "dict[str, xr.Dataset]":
     RunFolderError, FleetError
         The folder holds no fleet.
     """
-    names = [group["name"] for group in fleet_config(folder)["fleet"]["groups"]]
-    return {name: open_group(folder, name) for name in names}
+    names = [group["name"] for group in fleet_config(Path(folder))["fleet"]["groups"]]
+    return {name: open_group(Path(folder), name) for name in names}
 
 
 def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.int64]:

@@ -13,6 +13,7 @@ from calibration.errors import CalibrationRecordError
 from calibration.result.figures import corner_figure
 from calibration.result.file import load_calibration, result_bytes, save_calibration
 from calibration.result.record import Calibration
+from calibration.wing.calibrate import calibrate
 
 MakeCalibration = Callable[..., Calibration]
 
@@ -171,8 +172,13 @@ def test_other_files_are_told(tmp_path, make_calibration):
         ({"asset": ""}, "1 to 80 printable"),
         ({"asset": "a\nb"}, "1 to 80 printable"),
         ({"asset": "x" * 81}, "1 to 80 printable"),
+        ({"samples": np.full((3, 11), np.nan)}, "finite ones"),
+        ({"prior_samples": np.ones((0, 11))}, "finite ones"),
     ],
 )
 def test_what_is_no_calibration(change, message, make_calibration):
     with pytest.raises(CalibrationRecordError, match=message):
         replace(make_calibration(), **change)
+    for asked in ({"procedure": "Paper"}, {"seed": -1}, {"seed": 2**63}):
+        with pytest.raises(CalibrationRecordError, match="'joint' or 'paper' and the seed"):
+            calibrate(**asked)

@@ -53,9 +53,10 @@ FRICTION = ("coulomb_friction", {"friction_ratio": 0.02}, "joint")
 BENCHES = {"small": SMALL, "rig": RIG, "tip": TIP, "laboratory": kit.BENCH}
 
 
-def coloured(generator, shape):
-    white = generator.standard_normal((shape[0] + 200, *shape[1:]))
-    return np.sqrt(1.0 - 0.49) * lfilter([1.0], [1.0, -0.7], white, axis=0)[200:]
+def coloured(generator, shape, share=0.7, before=200):
+    """Return noise of deviation one and a correlation from sample to sample."""
+    white = generator.standard_normal((shape[0] + before, *shape[1:]))
+    return np.sqrt(1.0 - share**2) * lfilter([1.0], [1.0, -share], white, axis=0)[before:]
 
 
 def outliers(generator, shape):
@@ -68,10 +69,7 @@ def remainder(size, share):
 
     def draw(generator, shape):
         white = generator.standard_normal(shape)
-        if shape[0] < 50:
-            return white
-        steps = generator.standard_normal((shape[0] + 200, shape[1])) * np.sqrt(1.0 - share**2)
-        return np.asarray(white + size * lfilter([1.0], [1.0, -share], steps, axis=0)[200:])
+        return white if shape[0] < 50 else white + size * coloured(generator, shape, share)
 
     return draw
 
@@ -289,10 +287,7 @@ def test_coloured_noise_with_a_short_record_is_no_gap(seed):
     """Correlation 0.5 from sample to sample, in the trials and in a record of 100 samples."""
 
     def draw(generator, shape):
-        if shape[0] < 50:
-            return generator.standard_normal(shape)
-        white = generator.standard_normal((shape[0] + 50, shape[1]))
-        return np.asarray(np.sqrt(0.75) * lfilter([1.0], [1.0, -0.5], white, axis=0)[50:])
+        return generator.standard_normal(shape) if shape[0] < 50 else coloured(generator, shape, 0.5, 50)
 
     problem, records = RIG.problem(seed, noise=draw), {}
     generator = np.random.default_rng(seed)

@@ -502,7 +502,7 @@ def whole_force(law: Primitive, path: np.ndarray[Any, Any]) -> np.ndarray[Any, A
     return found.forces[:, 0] + law.stiffness * path
 
 
-@pytest.mark.parametrize("chi", [0.0, -0.5])
+@pytest.mark.parametrize("chi", [0.0, -0.5, -0.9])
 def test_an_iwan_joint_loses_the_energy_of_its_density_and_obeys_masing(chi):
     law = MicroSlip("mass", slip_force=1.0, stiffness=4.0, chi=chi, element_count=400)
     amplitude, most = 0.2, (2 + chi) / ((1 + chi) * 4.0)
@@ -515,18 +515,14 @@ def test_an_iwan_joint_loses_the_energy_of_its_density_and_obeys_masing(chi):
         return float(16.0 * d * (amplitude - d) * (1 + chi) * d**chi / most ** (1 + chi))
 
     loss = quad(lost, 0.0, amplitude)[0]
-    assert np.trapezoid(whole[401:], loop[401:]) == pytest.approx(loss, rel=5e-3)
+    assert np.trapezoid(whole[401:], loop[401:]) == pytest.approx(loss, rel=5e-4)
     # Masing 1926: unloading from the turn is the first loading, twice as large
     down = slice(401, 3 * 401)
-    first = np.interp(0.5 * (amplitude - loop[down]), up, whole[:401])
-    np.testing.assert_allclose(whole[400] - whole[down], 2.0 * first, atol=2e-5)
-
-
-@pytest.mark.parametrize("chi", [0.0, -0.4, -0.9])
-def test_elements_of_a_joint_slip_together_at_the_slip_force(chi):
-    law = MicroSlip("mass", slip_force=2.0, stiffness=8.0, chi=chi)
+    first = whole_force(law, 0.5 * (amplitude - loop[down]))
+    np.testing.assert_allclose(whole[400] - whole[down], 2.0 * first, atol=1e-12)
+    # all slip at the slip force
     assert law.elements().mean() == pytest.approx(0.25)
-    assert whole_force(law, np.array([50.0]))[0] == pytest.approx(2.0)
+    assert whole_force(law, np.array([50.0]))[0] == pytest.approx(1.0)
 
 
 def test_a_bouc_wen_law_that_yields_at_once_is_dry_friction_in_position():

@@ -42,7 +42,7 @@ def whole(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
     given = Overrides(strain_library=library_file)
     outcome = fly_fleet(ensemble("level_turns", range(2020, 2023), given), tmp_path / "many")
-    group = open_fleet(outcome.folder)["level_turns"]
+    group = open_fleet(str(outcome.folder))["level_turns"]
     tree = open_run(new_run("level_turns", tmp_path / "one", given, report=False).folder)
     row = group["seed"].values.tolist().index(int(tree.attrs["seed"]))
     for ours, (part, name) in {

@@ -210,7 +210,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     done = command(*words, "--no-report", "--resume")
     beginning.join()
     assert [json.loads(line)["turn"] for line in done.stdout.splitlines()] == [0]
-    assert "1 messages." in done.stderr
+    assert "1 message." in done.stderr
     assert [path.read_text() for path in watch.folder.glob("*.mqtt")] == names[:1]
     assert all(note.startswith("Connected") for note in notes)
     listener.disconnect()
