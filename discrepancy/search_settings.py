@@ -83,20 +83,6 @@ class SearchSettings:
     rivals: float = 30.0
     """Effects that fit within this log evidence of the best one have families that may overtake it."""
 
-    # ---------------------------------------------------------------- beside an optimum
-    ridges: int = 2
-    """Candidates that do not quite fit whose neighbourhood is searched."""
-    ridge_steps: tuple[float, ...] = (-0.8, -0.3, 0.3, 0.8)
-    """Steps along the direction that the data tell least of."""
-    place_steps: tuple[float, ...] = (-0.15, -0.05, 0.05, 0.15)
-    """Steps of parameters that are not mere sizes: a place has an optimum at each sensor that it passes."""
-    neighbour_iterations: int = 8
-    """Steps of each fit beside an optimum."""
-    neighbour_gain: float = 1.0
-    """Gain of log evidence from which a neighbour is the better optimum."""
-    rounds: int = 5
-    """How often one neighbour leads to the next."""
-
     # ---------------------------------------------------------------- far from the truth
     far: float = 1.5
     """Chi-square per sample above which a fit is far from the truth."""

@@ -13,7 +13,6 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
-from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 
 from .candidate import Candidate, Linearisation, Point, Remainder, State
@@ -24,15 +23,10 @@ LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
-STALLED = 1
-"""So do more than this many steps in a row that gain less, whatever they promised."""
 WHOLE_STEP, LARGEST_DAMPING = 1e-2, 1.0
 """Damping below which a step is nearly that of Gauss and Newton, and above which it is a mere trial."""
 STEP_SHARES = (1.0, 0.3)
 """Shares of a step that are tried before the damping grows."""
-CREEPING, NEAR_END = 0.2, 30.0
-"""Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
-the one before it promised: close to the end, promises should fall fast."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,15 +122,10 @@ def fit(
     if not np.isfinite(state.objective):
         names = candidate.identifiers or "no effect"
         raise FitError(said("models.not_finite", names=names))
-    converged, fresh, before, stalled = False, known is None, np.inf, 0
+    converged, fresh = False, known is None
     for _ in range(iterations):
         step, promised = descent.step(state, damping)
-        if not fresh and CREEPING * before < promised < NEAR_END:
-            # old derivatives turn a long valley into a row of short steps, each of which keeps its promise
-            state, fresh = descent.state(state.point), True
-            step, promised = descent.step(state, damping)
-        before = promised
-        following = None if promised < CONVERGED else descent.following(state, step, damping)
+        following = None if promised < CONVERGED else descent.following(state, step)
         if following is not None:
             gain = state.objective - following.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
@@ -144,10 +133,6 @@ def fit(
             if gain < 0.7 * promised:  # derivatives have grown old
                 state, fresh = descent.state(state.point), True
             if give_up is not None and damping < WHOLE_STEP and state.objective - 2.0 * promised > give_up:
-                break
-            stalled = stalled + 1 if gain < CONVERGED and damping < WHOLE_STEP else 0
-            if stalled > STALLED and fresh:
-                converged = True
                 break
         elif not fresh:
             state, fresh = descent.state(state.point), True
@@ -240,22 +225,12 @@ class _Descent:
         local = tuple(step[a:b] for a, b in pairwise(ends.tolist()))
         return Point(step[:first], local, step[first:own]), 0.5 * float(found.gradient @ step)
 
-    def following(self, state: State, step: Point, damping: float) -> State | None:
-        """Return the state after a step, or None if none better was found.
-
-        Where the phases of a record bend the valley that the step follows, its end lies on the slope; a
-        second step with the same derivatives by the nuisances leads back to the bottom (the second-order
-        correction of Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
-        """
+    def following(self, state: State, step: Point) -> State | None:
+        """Return the state after a step, or None if none better was found."""
         for share in STEP_SHARES:
             try:
                 ahead = _ahead(self.problem, self.candidate, state.point, step, share)
-                there = objective(self.problem, self.candidate, ahead)
-                if share == 1.0 and state.objective <= there < np.inf:
-                    correction, _ = self.step(self.state(ahead, state.linearisations), damping)
-                    ahead = _ahead(self.problem, self.candidate, ahead, correction)
-                    there = objective(self.problem, self.candidate, ahead)
-                if there < state.objective:
+                if objective(self.problem, self.candidate, ahead) < state.objective:
                     return self.state(ahead, state.linearisations)
             except DiscrepancyError:  # outside what the structure can carry: a shorter step
                 continue
@@ -276,7 +251,7 @@ def _finished(problem: Problem, candidate: Candidate, state: State, converged: b
     )  # fmt: skip
 
 
-def _ahead(problem: Problem, candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
+def _ahead(problem: Problem, candidate: Candidate, point: Point, step: Point, share: float) -> Point:
     """Return the point a share of a step ahead."""
     local = tuple(u + share * du for u, du in zip(point.local, step.local, strict=True))
     effect = candidate.stepped(point.effect, share * step.effect)
@@ -317,39 +292,3 @@ def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateF
     terms, begin = zip(*parts, strict=True)
     start = replace(named.point, effect=np.concatenate(begin))
     return attempt(problem, Candidate(terms), start)
-
-
-def is_box(candidate: Candidate) -> bool:
-    """Whether an effect has more than one parameter that is no mere size, as a place and a length.
-
-    Its edges pass sensors and lines of the mesh, and optima on either side may fit within the noise.
-    """
-    return any(sum(not item.magnitude for item in term.parameters) > 1 for term in candidate.terms)
-
-
-def around(problem: Problem, found: CandidateFit) -> CandidateFit:
-    """Return the best fit of the same candidate beside an optimum, or the fit itself.
-
-    Hysteresis of several elements has many local optima along the direction that the data tell least of, and
-    a place has them at each sensor that it passes.
-    """
-    options, size = {"iterations": SEARCH.neighbour_iterations}, found.candidate.size
-    free = [number for number, item in enumerate(found.candidate.parameters) if not item.magnitude]
-    for _ in range(SEARCH.rounds):
-        moves = [step * axis for axis in np.eye(size)[free] for step in SEARCH.place_steps]
-        if size > 1:
-            _, directions = np.linalg.eigh(found.effect_covariance)
-            moves += [step * directions[:, -1] for step in SEARCH.ridge_steps]
-        better = found
-        for move in moves:
-            start = replace(found.point, effect=found.effect + move)
-            again = attempt(problem, found.candidate, start, give_up=better.objective, **options)
-            if again is None or again.log_evidence <= better.log_evidence + SEARCH.neighbour_gain:
-                continue
-            if not again.converged:  # along a bent valley one far better may have run out of steps
-                again = attempt(problem, again.candidate, again.point, **options) or again
-            better = again
-        if better is found:
-            break
-        found = better
-    return found

@@ -12,7 +12,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, around, attempt, fit, free_shape, is_box
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
@@ -225,15 +225,8 @@ class Search:
     # ---------------------------------------------------------------- the strategy
 
     def singles(self) -> None:
-        """Search among single effects, and beside the optimum of the best of them.
-
-        The best is computed finely before what rests on its evidence.
-        """
-        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
-        for rank, item in enumerate(ranked[: SEARCH.ridges]):
-            misses = absolute_gate(self.problem, item).passed is False
-            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
-                self.keep(around(self.problem, item), exact=True)
+        """Search among single effects; the best is computed finely before what rests on its evidence."""
+        self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
         self.settle()
 
     def sets(self) -> None:
