@@ -104,7 +104,7 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     each = np.broadcast_to(scenario.observation.standard_deviation, len(titles))
     blind = np.where([title in names for title in titles], each + _BLIND * shown, each)
     levels = np.abs(knowledge.model.states.coordinates).max()
-    unread = {"standard_deviation": _BLIND * levels}
+    unread = {"standard_deviation": _BLIND * (1.0 + levels)}
     bare = scenario.model_copy(
         update={
             "action": tuple(a.model_copy(update=unread if a.name in names else {}) for a in scenario.action),

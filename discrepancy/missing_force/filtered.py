@@ -221,7 +221,7 @@ class Regression:
         mean = size * cho_solve(factor, size * part[1:, 0])
         left = np.r_[1.0, -mean]
         value = -0.5 * float(left @ part @ left + mean @ (prior * mean)) - self.log_determinant
-        value -= float(np.sum(np.log(np.diag(factor[0]) / size)) + 0.5 * np.sum(np.log(prior)))
+        value -= float(np.sum(np.log(np.diag(factor[0]) / size)) - 0.5 * np.sum(np.log(prior)))
         return Solution(value, mean, np.outer(size, size) * cho_solve(factor, np.eye(len(prior))))
 
 

@@ -200,10 +200,10 @@ def _noise(trial: SeenTrial) -> FloatArray:
     generator = np.random.default_rng(SEED)
     found = generator.standard_normal(trial.residual.shape)
     for channel, share, rate in trial.coloured:
-        kept = np.exp(-rate * np.diff(trial.time, prepend=trial.time[0]))
+        kept = np.exp(-rate * np.diff(trial.time, prepend=-np.inf))
         slow = np.zeros(len(found))
         for k, fresh in enumerate(generator.standard_normal(len(found))):
-            slow[k] = fresh if k == 0 else kept[k] * slow[k - 1] + np.sqrt(1.0 - kept[k] ** 2) * fresh
+            slow[k] = kept[k] * slow[k - 1] + np.sqrt(1.0 - kept[k] ** 2) * fresh
         found[:, channel] = np.sqrt(1.0 - share) * found[:, channel] + np.sqrt(share) * slow
     return np.asarray(found * trial.used)
 

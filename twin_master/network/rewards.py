@@ -44,7 +44,8 @@ def _error_moments(observation: Float, shown: Float, variance: Float, scale: Flo
 def _mixed(weight: Float, mean: Float, within: Float) -> tuple[Float, Float]:
     """Return mean and variance (B, R) of mixtures with weights (B, ...) of parts with moments (R, ...)."""
     flat, means, variances = (part.reshape(len(part), -1) for part in (weight, mean, within))
-    whole, spread = flat @ means.T, flat @ variances.T
+    # Of each belief what it would be alone, which a product of matrices does not give.
+    whole, spread = (np.einsum("bn,rn->br", flat, part) for part in (means, variances))
     for row, own, center in zip(spread, flat, whole, strict=True):
         row += (means - center[:, None]) ** 2 @ own
     return whole, spread

@@ -12,7 +12,8 @@ from benchmarks.force_events import counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.when import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
-from discrepancy.missing_force.filtered import Filtered, Process, regression
+from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
+from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
 from discrepancy.missing_force.windows import residual_windows
@@ -187,12 +188,29 @@ def test_states_and_noise_by_closed_forms():
     generator, push = trial.system.generator, -trial.system.actions[0]
     wanted = [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
     np.testing.assert_allclose(trial.pushed(0, np.ones(len(wanted))), wanted, atol=1e-12)
+    still = replace(trial, settled=True).pushed(0, np.ones(len(wanted)))
+    np.testing.assert_allclose(still - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
+    # noise of a deviation of one, part of it coloured
+    count = 5000
+    told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=((0, 0.4, 12.0),))
+    made = _noise(told)
+    np.testing.assert_allclose(made.std(axis=0), 1.0, rtol=0.1)
+    assert made[1:, 0] @ made[:-1, 0] / count == pytest.approx(0.4 * np.exp(-12.0 * 0.02), abs=0.1)
     # noise of first order is taken apart
     noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
     assert decaying_part(noise, 0.01) == (
         pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
     )  # fmt: skip
     assert decaying_part(noise, 0.02) is None
+
+
+def test_evidence_beside_unknowns_is_that_of_their_prior():
+    random, precision = np.random.default_rng(2), np.array([4.0, 0.01])
+    readings, columns = random.standard_normal(9), random.standard_normal((2, 9))
+    rows = np.vstack((readings, columns))
+    found = Regression(rows @ rows.T, 0.0).solve([0, 1], precision)
+    covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
+    assert found.evidence == pytest.approx(gaussian(covariance, readings))
 
 
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])

@@ -250,9 +250,9 @@ def test_a_pendulum_follows_its_target_as_integrated(hold: str, measured: bool) 
 def test_a_speed_is_held_with_a_proportional_and_an_integral_gain() -> None:
     loop = 'name = "position", quantity = "angular_velocity", reference = "target", vector = 1.0, acts = 1.0'
     text = f"{INPUTS.text('servo.toml')}controller = [{{ {loop}, proportional = 0.5, integral = 2.0 }}]"
-    time = np.linspace(0.0, 2.0, 60)
-    what = trial(time, RecordedInput("target", Quantity.ANGULAR_VELOCITY, np.full(60, 3.0), Hold.ZERO_ORDER))
-    found = seen(model_of(text), what, {"angle": Quantity.ANGULAR_VELOCITY, "torque": Quantity.TORQUE})
+    time, outputs = np.linspace(0.0, 2.0, 60), {"angle": Quantity.ANGULAR_VELOCITY, "torque": Quantity.TORQUE}
+    what = trial(time, RecordedInput("target", Quantity.ANGULAR_VELOCITY, np.full(60, 2.6), Hold.ZERO_ORDER))
+    found = seen(model_of(text), what, outputs, offset=(0.4,))
     true = integrated(
         lambda t, y: [(0.5 * (3.0 - y[0]) + 2.0 * y[1] - 0.1 * y[0]) / 0.14, 3.0 - y[0]], time, np.zeros(2)
     )

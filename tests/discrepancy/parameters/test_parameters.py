@@ -170,6 +170,7 @@ def test_ranges_cut_off_the_posterior(procedure, law, truth, priors):
     values = noisy(law, *truth, seed=3)
     found = calibrate_parameters(campaign_of(values), choice_of(law, *priors), samples=20_000)
     assert found.procedure == procedure
+    assert not any("settled" in sentence for sentence in found.findings)
     for place, (middle, spread) in enumerate(on_grid(law, values, priors), start=1):
         assert found.mean(f"p{place}") == pytest.approx(middle, abs=0.03 * spread)
         assert found.standard_deviation(f"p{place}") == pytest.approx(spread, rel=0.03)
