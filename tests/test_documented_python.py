@@ -4,6 +4,7 @@ Notebooks are pages like others. Each page has a namespace and a folder of its o
 says that the reader has by then.
 """
 
+import ast
 import contextlib
 import itertools
 import re
@@ -206,6 +207,14 @@ def calibrated_wing(
     folder = tmp_path_factory.mktemp("calibration")
     save_calibration(make_calibration(), folder / "calibration.nc")
     return folder
+
+
+@pytest.mark.parametrize("name", TABLES["minutes"])
+def test_what_a_page_of_minutes_imports_is_there(name):
+    for block in blocks(WITH_PYTHON[name], "python"):
+        if not block.startswith("%%"):
+            found = [node for node in ast.parse(block).body if isinstance(node, ast.Import | ast.ImportFrom)]
+            exec(compile(ast.Module(found, []), name, "exec"), {})
 
 
 @pytest.mark.slow
