@@ -167,7 +167,7 @@ def masses(log_density: Float) -> Float:
 def lines(weight: Float, axes: Axes, *of: Callable[[Float], Float]) -> tuple[Line, ...]:
     """Return the marginals of weights on a grid, of figures that the functions give in turn."""
     others = (tuple(i for i in range(weight.ndim) if i != k) for k in range(weight.ndim))
-    sums = zip(axes, others, cycle(of or (np.asarray,)), strict=False)
+    sums = zip(axes, others, cycle(of), strict=False)
     return tuple(Line(axis, weight.sum(axis=other), own) for axis, other, own in sums)
 
 
@@ -297,5 +297,5 @@ def population(nodes: Float, log_evidence: Float, scale: float) -> tuple[Line, L
 
     limits = (nodes[0], nodes[-1]), (0.25 * step, 0.5 * (nodes[-1] - nodes[0]))
     axes, found = narrowed(density, tuple(np.linspace(*limit, POPULATION_POINTS) for limit in limits))
-    mean, spread = lines(masses(found), axes)
+    mean, spread = lines(masses(found), axes, np.asarray)
     return mean, spread

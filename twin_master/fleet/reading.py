@@ -147,7 +147,7 @@ def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     stays = keeps.copy()
     for _ in range(steps - 1):
         stays = keeps * transition.expected(control, stays)
-    return np.maximum(1.0 - belief @ stays, 0.0)
+    return np.asarray(np.maximum(1.0 - belief @ stays, 0.0))
 
 
 def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
