@@ -96,7 +96,7 @@ class LearntExpectation:
         return stacked(self._known(found, *row) for found, row in zip(last, rows, strict=True))
 
     def predicted(self, carried: Sequence[Carried], beliefs: Float, horizon: int) -> Expected:
-        """Return what is expected after each of T turns, whose filtered beliefs are given, of the H to come."""
+        """Return what is expected after each of T turns, of given filtered beliefs, of the H to come."""
         rows = zip(carried, beliefs, strict=True)
         return stacked(self._ahead(turn, belief, horizon) for turn, belief in rows)
 

@@ -282,8 +282,8 @@ def watch(
                 counts = watched.run(feed, decide, between, turns=turns, patched=patch, untold=untold)
             watched.store(counts, last=last, report=report)
         except Exception as error:
-            kept = "kept" if _observed(watched.folder) else "begun"
-            error.add_note(said(f"watch.{kept}", folder=watched.folder))
+            kept = _observed(watched.folder)
+            error.add_note(said("watch.kept", folder=watched.folder) if kept else said("watch.begun"))
             raise
     return watched.folder
 
