@@ -179,7 +179,7 @@ class _Wing(NamedStructure):
 
     def check_places(self, patch: "PatchFile") -> None:
         """Refuse effects at places beside the wing; raises `MissionInputError`."""
-        from fe.runtime.patch import LocalStiffnessLoss, LoadPlace, PointMass
+        from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, PointMass
         from fe.runtime.wing_rows import OVERHANG
 
         span = self.wing_design.planform.semi_span

@@ -362,7 +362,7 @@ def _policy(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
 
 
 Decide = Callable[[Float, Float, int], Index]
-"""Returns the controls (B,) of a turn for the beliefs (B, S) of its states and of those of the turn before, both
+"""Returns the controls (B,) of a turn for the beliefs (B, S) of its states and of those of the turn before,
 given all observations up to that one, and for its number from 0."""
 
 
@@ -399,6 +399,43 @@ def simulated_returns(
             filtered[rows] = now / now.sum(axis=1, keepdims=True)
             belief[rows] = after / after.sum(axis=1, keepdims=True)
     return total
+
+
+LIVES = 200
+"""That are drawn of each twin."""
+
+
+def leaving_probability(
+    problem: DecisionProblem, policy: BeliefPolicy, belief: Float, control: int, turns: int,
+    generator: np.random.Generator,
+) -> Float:  # fmt: skip
+    """Return the share of lives in which a policy leaves a control within some turns: (B,).
+
+    Parameters
+    ----------
+    problem : DecisionProblem
+        Whose state is observed before it moves.
+    policy : BeliefPolicy
+    belief : (B, S)
+        Before the first of the turns.
+    control : int
+        In force until it is left.
+    turns : int
+        In which is decided, the first one by the belief that is given.
+    generator : numpy.random.Generator
+        The lives of all twins share what chance brings.
+    """
+    result, chance = np.empty(len(belief)), generator.random((turns - 1, LIVES))
+    for twin, own in enumerate(belief):
+        rows = np.tile(own, (LIVES, 1))
+        left = policy.decide(rows) != control
+        for uniform in chance[: 0 if left.all() else None]:
+            seen = _drawn(rows @ problem.likelihood[control].T, uniform)
+            after = problem.following(rows, control, seen)
+            rows = after / after.sum(axis=1, keepdims=True)
+            left |= policy.decide(rows) != control
+        result[twin] = left.mean()
+    return result
 
 
 def _drawn(rows: Float, uniform: Float) -> Index:

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from benchmarks.study_planning import PROBLEMS, tiger
-from twin_master.network.belief_planning import DecisionProblem, plan_on_belief, simulated_returns
-from twin_master.network.planner import value_iteration
+from twin_master.network import belief_planning
+from twin_master.network.belief_planning import (
+    DecisionProblem,
+    leaving_probability,
+    plan_on_belief,
+    simulated_returns,
+)
+from twin_master.network.planner import BeliefPolicy, value_iteration
 from twin_master.network.transition import TransitionModel
 
 
@@ -108,6 +114,26 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first):
     assert plan.lower - error <= total.mean() <= plan.upper + error
     known = value_iteration(problem.transition, problem.reward, problem.discount)
     assert plan.upper <= problem.prior @ known.value + 1e-9
+
+
+def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypatch):
+    monkeypatch.setattr(belief_planning, "LIVES", 4000)
+    problem, rng = drawn(8, 4, moves_first=False), np.random.default_rng(1)
+    policy = BeliefPolicy(
+        0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]]), np.array([1, 0, 2])
+    )
+
+    def leaves(belief: np.ndarray, turns: int) -> float:
+        if policy.decide(belief) != 1:
+            return 1.0
+        after = problem.following(belief, 1) if turns > 1 else np.zeros((0, 4))
+        return float(sum(row.sum() * leaves(row / row.sum(), turns - 1) for row in after))
+
+    beliefs = rng.dirichlet(np.ones(4), 5)
+    exact = [leaves(belief, 4) for belief in beliefs]
+    found = leaving_probability(problem, policy, beliefs, 1, 4, rng)
+    np.testing.assert_allclose(found, exact, atol=0.03)
+    assert sum(0.05 < value < 0.95 for value in exact) > 1
 
 
 def test_the_difference_of_two_rules_varies_little_from_mission_to_mission():
