@@ -88,7 +88,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             source.prepare(self._folder, progress or SilentProgress())
             self.knowledge = prepare_knowledge(self.scenario, source, self.scenario.mission.seed)
             self._asset: Asset | None = source.open()
-            opened.callback(lambda: self._asset and self._asset.close())
+            opened.callback(self._let_go)
             self._start = self._asset.save_state()
             self._opened = opened.pop_all()
         self._plant: Plant | None = None
@@ -116,7 +116,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             raise MissionInputError("the environment is closed: make a new one.")
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         if getattr(self.scenario.asset, "seeds", ()):  # chance of its own, which begins with it
-            self._asset.close()
+            self._let_go()
             scenario = self.scenario.under(self._seed)
             source = scenario.asset.source(scenario)
             source.use(self._folder)
@@ -161,7 +161,12 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     def close(self) -> None:
         """Let go of the asset and what was packed for it."""
         self._opened.close()
-        self._asset = self._plant = None
+        self._plant = None
+
+    def _let_go(self) -> None:
+        if self._asset is not None:
+            self._asset.close()
+        self._asset = None
 
     def _fly(self, control: int, before: int | None) -> tuple[Float, float, dict[str, Any]]:
         assert self._plant is not None
