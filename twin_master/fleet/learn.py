@@ -20,7 +20,7 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
-from twin_master.fleet.posterior import POINTS, Grid, Line, narrowed, population, refined, shared
+from twin_master.fleet.posterior import POINTS, Grid, Line, masses, narrowed, population, refined, shared
 from twin_master.fleet.reading import noticed
 from twin_master.fleet.store import has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
@@ -263,8 +263,7 @@ def _noise(part: _Seen, worsening: Worsening, nodes: _Nodes | None) -> Line:
 
     bound = np.log(LARGEST_NOISE)
     (axis,), found = narrowed(log_density, (np.linspace(-bound, bound, NOISE_POINTS),))
-    weight = np.exp(found - found.max())
-    return Line(axis, weight / weight.sum(), np.exp)
+    return Line(axis, masses(found), np.exp)
 
 
 _Told = Mapping[str, Any]

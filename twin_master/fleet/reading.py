@@ -12,7 +12,9 @@ from reporting.arrays import Float
 from twin_master.fleet.flight import GROUPS, fleet_config
 from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
+from twin_master.network.belief_planning import leaving_probability
 from twin_master.scenario.schema import Scenario
+from twin_master.seeds import generator
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -121,7 +123,9 @@ def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
 
 
 def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
-    """Return the probability that the policy leaves a control within the steps that are predicted: (B,).
+    """Return the probability that twins leave a control within the steps that are predicted: (B,).
+
+    Of a policy by states it is that of the state; where the belief decides it is of lives that are drawn.
 
     Parameters
     ----------
@@ -130,13 +134,20 @@ def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     belief : (B, S)
         After the last turn.
     control : int
-        In force then; it stays so until the policy leaves it.
+        In force then; it stays so until it is left.
     """
+    steps, transition = knowledge.scenario.mission.prediction_steps, knowledge.model.transition
+    if knowledge.plan.on_belief is not None:
+        ahead, chance = (
+            transition.forward(control, belief),
+            generator(knowledge.scenario.mission.seed, "planning"),
+        )
+        return leaving_probability(knowledge.problem, knowledge.plan.on_belief, ahead, control, steps, chance)
     keeps = (knowledge.plan.control_index == control).astype(np.float64)
     stays = keeps.copy()
-    for _ in range(knowledge.scenario.mission.prediction_steps - 1):
-        stays = keeps * knowledge.model.transition.expected(control, stays)
-    return np.asarray(1.0 - belief @ stays)
+    for _ in range(steps - 1):
+        stays = keeps * transition.expected(control, stays)
+    return np.asarray(np.maximum(1.0 - belief @ stays, 0.0))
 
 
 def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
@@ -167,7 +178,7 @@ def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Flo
         control = group["control_index"].values[np.arange(len(chance)), last_turns(group)]
         for index in np.unique(control[flown]):
             mine = flown[control[flown] == index]
-            chance[mine] = np.maximum(attention(knowledge, belief[mine], int(index)), 0.0)
+            chance[mine] = attention(knowledge, belief[mine], int(index))
     return chance
 
 
