@@ -239,7 +239,7 @@ def load_learnt(path: Path | str) -> LearntFile:
 
 
 def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) -> None:
-    """Put what was learnt in the place of what the table of a scenario says.
+    """Put what was learnt in the place of what the twin of a scenario assumes; the truth stays as it is.
 
     Parameters
     ----------
@@ -263,10 +263,14 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
         if sorted(own) != names or moves != "independent_worsening":
             both = {"own": own, "names": names}
             raise MissionInputError(said("assets.learnt_controls", path=path, **both, kind=moves))
+        if table["truth"]["kind"] == "random_growth":
+            table["truth"]["probability"] = (
+                table["truth"]["probability"] or table["transition"]["probability"]
+            )
     if learnt.calibration is not None and learnt.calibration.parameter != given["parameter"]:
         of = learnt.calibration.parameter, given["parameter"]
         raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))
-    anew = {"calibration": {"draws": given["draws"], "source": "normal"}}
+    anew = {"calibration": {"draws": given["draws"], "source": "normal", "file": given["file"]}}
     for name in LearntTables.model_fields:
         if (part := getattr(learnt, name)) is not None:
             table[name] = anew.get(name, table[name]) | part.model_dump()
