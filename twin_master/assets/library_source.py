@@ -269,7 +269,7 @@ class LibrarySource(AssetSource):
 
     @property
     def words(self) -> str:
-        """The library; it differs from the asset if it was sampled from another FMU or with other parameters."""
+        """The library; it differs if it was sampled from another FMU or with other parameters."""
         return f"observation library{self._of}"
 
     @cached_property
