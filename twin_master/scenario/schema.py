@@ -301,7 +301,7 @@ class Scenario(Section):
         for action in self.action:
             yield unknown(action.control, controls, "action.control", "control")
             same = loads.get(action.name, loads[action.control]) == loads[action.control]
-            taken = action.name == action.control or not same
+            taken = not same or action.name in (action.control, *controls[: -len(self.action)])
             yield taken, f"action `{action.name}` needs a name of its own, and a control has it"
             free = action.cost > 0.0 and rewards.control_weight == 0.0
             yield free, said("scenario.free_action", name=action.name)
