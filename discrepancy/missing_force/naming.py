@@ -341,11 +341,11 @@ class ForceSearch:
             if far.any():  # a value that it cannot reach is not its own
                 loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
                 found = replace(found, log_evidence=found.log_evidence - loss)
+            if settled:
+                return replace(found, effect=effect + step)
             # along the motion of its base, which follows the readings, a hypothesis looks better than it is
             if best is None or turn == 1 or found.log_evidence > best.log_evidence:
                 best = found
-            if settled:
-                break
             turns_back = step @ before < -0.5 * (before @ before)
             share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
             move = share * np.clip(step, -LONGEST_STEP, LONGEST_STEP)

@@ -116,6 +116,10 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypat
     second = next(item for item in ranked if item.candidate.terms[0].effect.family not in families)
     assert ranked[0].log_evidence > second.log_evidence + 10.0
     assert ranked[0].log_evidence > search.whole.log_evidence + 10.0
+    # its values are where a fit that begins there stays
+    again = search.followed(ranked[0], ranked[0].candidate, ranked[0].effect)
+    deviations = np.sqrt(np.diag(ranked[0].effect_covariance))
+    np.testing.assert_allclose((again.effect - ranked[0].effect) / deviations, 0.0, atol=0.4)
     share = ForceShares(search).of(ranked[0], held_out=False)
     assert share.value > 0.85
     assert share.interval[0] <= share.value <= share.interval[1]
