@@ -15,7 +15,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.candidate import Candidate, Key, Point, Term
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
 from .filtered import Process, Solution
@@ -221,7 +221,9 @@ class ForceSearch:
         local = [np.zeros(data.unknowns.size) for data in self.problem.trials]
         for number, values in zip(self.numbers, found.local, strict=True):
             local[number] = values
-        return Point(np.clip(found.shared, -2.0, 2.0), tuple(local), np.zeros(0))
+        low, high = self.problem.shared.ends  # nothing would follow from a step beyond them
+        low, high = np.maximum(low + PARAMETER_STEP, -2.0), np.minimum(high - PARAMETER_STEP, 2.0)
+        return Point(np.clip(found.shared, low, high), tuple(local), np.zeros(0))
 
     # ---------------------------------------------------------------- what
 

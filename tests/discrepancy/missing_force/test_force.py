@@ -240,6 +240,23 @@ def seen_force(problem, effect=None, place=""):
     return missing_force(search, found or search.whole)
 
 
+@pytest.mark.parametrize("high", [3.0, 1.05])
+def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(high):
+    """Beside no law a damper takes up what the drag does: the drag is the same wherever its range ends."""
+    rig, (drag,) = LumpedModel.load("single_mass_rig"), chosen("quadratic_damping")
+    first, damper = rig.description.parameter
+    rows = [first, damper.model_copy(update={"high": high})]
+    rig = LumpedModel(rig.description.model_copy(update={"parameter": rows}))
+    problem = problem_of(released(ModelPatch((DAMPED,))), rig)
+    search = ForceSearch(problem)
+    term = Term(drag, "slide")
+    start = next(item for item in search.screened(search.whole, [drag]) if item[1] == term)[2]
+    found = search.followed(search.whole, Candidate((term,)), start)
+    (law,) = found.candidate.patch(problem.setting, found.effect)
+    at_one = law.coefficient / law.reference_velocity**2
+    assert at_one == pytest.approx(DAMPED.coefficient / DAMPED.reference_velocity**2, rel=0.06)
+
+
 @pytest.mark.parametrize("number", [CART, SERVO, SHAKEN, STORES])
 def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, number):
     """To first order: a heavier body moves less under the same force, and a reaction shows another part."""
