@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from twin_master.fleet.flight import GROUPS, fleet_config
-from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, has_flown, open_group
+from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, WITHIN, has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.belief_planning import leaving_probability
 from twin_master.scenario.schema import Scenario
@@ -18,10 +18,6 @@ from twin_master.seeds import generator
 
 if TYPE_CHECKING:
     import xarray as xr
-
-
-WITHIN = 2
-"""Turns within which the fallback is to come."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,8 @@ class Outcomes:
     Attributes
     ----------
     within : Estimated
-        Share of the called-for fallbacks that came within `WITHIN` steps; NaN without any.
+        Share of the called-for fallbacks that came within `WITHIN` steps, as far as these were flown; NaN
+        without any.
     early : Estimated
         Share of missions with a fallback before the damage could be seen.
     rms, bias : tuple of Estimated
