@@ -99,16 +99,19 @@ class Worsening:
             )
 
         lists, other, keys = lists_at(0.25), lists_at(0.75), [*assumed]
-        rows = [
-            keys.index((control, name if name in each[control] else ""))
-            for name, levels in zip(scenario.state_names, lists[0].tolist(), strict=True)
-            for control in scenario.control_names
-            for _ in range(levels)
-        ]
+        rows = np.array(
+            [
+                keys.index((control, name if name in each[control] else ""))
+                for name, levels in zip(scenario.state_names, lists[0].tolist(), strict=True)
+                for control in scenario.control_names
+                for _ in range(levels)
+            ]
+        )
+        count = (lists[2][1:] - lists[2][:-1]).astype(np.int64)
         slope = 2.0 * (other[4] - lists[4])
         return cls(
             tuple(f"{control}, {name}" if name else control for control, name in keys),
-            np.array([*assumed.values()]), lists, np.repeat(rows, np.diff(lists[2].astype(np.int64))),
+            np.array([*assumed.values()]), lists, np.repeat(rows, count),
             lists[4] + slope * [[-0.25], [0.75]], build_graphical_model(scenario).prior,
         )  # fmt: skip
 
