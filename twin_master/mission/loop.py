@@ -102,7 +102,8 @@ def gap_of(history: History, skipped: int, knowledge: Knowledge) -> dict[str, An
         joint = known_control(left.filtered, left.control_index, sensors.control_count)
         expected = expected_of(sensors, knowledge.rewards, joint, None, quantiles=False)
     else:
-        expected = learns.filtered([turn.concluded.carried for turn in left.turns], left.observed)
+        carried = [turn.concluded.carried for turn in left.turns]
+        expected = learns.filtered(carried, left.filtered, left.observed)
     residual = (left.observed - expected.mean) / expected.noise
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),

@@ -361,8 +361,9 @@ def _policy(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
     return BeliefPolicy(np.vstack(kept), np.repeat(np.arange(len(kept)), [len(each) for each in kept]))
 
 
-Decide = Callable[[Float, int], Index]
-"""Returns the controls (B,) for the beliefs (B, S) before a turn, of that number from 0."""
+Decide = Callable[[Float, Float, int], Index]
+"""Returns the controls (B,) of a turn for the beliefs (B, S) of its states and of those of the turn before,
+given all observations up to that one, and for its number from 0."""
 
 
 def simulated_returns(
@@ -378,9 +379,10 @@ def simulated_returns(
     chance = generator.random((turns + 1, 2, missions))
     states = _drawn(np.tile(problem.prior, (missions, 1)), chance[turns, 0])
     belief = np.tile(problem.prior, (missions, 1))
+    filtered = belief.copy()
     total, weight = np.zeros(missions), np.ones(missions)
     for turn in range(turns):
-        control = decide(belief, turn)
+        control = decide(belief, filtered, turn)
         total += weight * np.einsum("bs,sb->b", belief, problem.reward[:, control])
         weight *= problem.discount[control]
         for chosen in np.unique(control).tolist():
@@ -393,6 +395,8 @@ def simulated_returns(
             told = likelihood[:, states[rows] if problem.moves_first else before].T
             seen = _drawn(told, chance[turn, 1, rows])
             after = problem.following(belief[rows], chosen, seen)
+            now = after if problem.moves_first else belief[rows] * likelihood[seen]
+            filtered[rows] = now / now.sum(axis=1, keepdims=True)
             belief[rows] = after / after.sum(axis=1, keepdims=True)
     return total
 

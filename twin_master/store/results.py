@@ -135,7 +135,8 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]
         if learns is None:
             expected = expected_of(known.sensor_model, known.rewards, joint, observed if flown else None)
         else:
-            expected = getattr(learns, name)(flight.carried, observed if flown else horizon)
+            belief_now = flight.smoothed if name == "smoothed" else flight.filtered
+            expected = getattr(learns, name)(flight.carried, belief_now, observed if flown else horizon)
         values = {
             "probability": belief,
             "mean": states.mean(belief),

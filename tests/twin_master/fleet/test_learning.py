@@ -239,6 +239,7 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
         assert rate["lower_95"] < rate["mean"] < rate["upper_95"]
     scenario = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
     assert scenario.transition.probability["3g"] == record["probability"]["3g"]["mean"]
+    assert scenario.truth.probability == {"2g": 0.05, "3g": 0.1}
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
     found = scenario.observation.standard_deviation
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))

@@ -109,7 +109,7 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first):
     problem = drawn(6, 4, moves_first)
     plan = plan_on_belief(problem, gap=1e-3)
     rng = np.random.default_rng(0)
-    total = simulated_returns(problem, lambda belief, _turn: plan.policy.decide(belief), 4000, 40, rng)
+    total = simulated_returns(problem, lambda belief, *_: plan.policy.decide(belief), 4000, 40, rng)
     error = 4.0 * total.std() / np.sqrt(len(total))
     assert plan.lower - error <= total.mean() <= plan.upper + error
     known = value_iteration(problem.transition, problem.reward, problem.discount)
@@ -143,7 +143,7 @@ def test_the_difference_of_two_rules_varies_little_from_mission_to_mission():
     def returns(values: np.ndarray) -> np.ndarray:
         rng = np.random.default_rng(0)
         return simulated_returns(
-            problem, lambda belief, _turn: np.argmax(belief @ values, axis=1), 1000, 20, rng
+            problem, lambda belief, *_: np.argmax(belief @ values, axis=1), 1000, 20, rng
         )
 
     first, second = returns(known), returns(known + np.array([0.3, 0.0, 0.0]))
