@@ -73,20 +73,27 @@ $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or later is needed, found " + sys.version.split()[0] + "; call make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
 
+# Packages are compiled by all cores at once, where pip takes one; their own tests are left out.
+install = $(1)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r $(2)
+compile = @$(1)/bin/python -m compileall -qq -j 0 -x '/tests/' $$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') || true
+
 $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/bin/python
 	@echo "Installing the packages of requirements.lock into $(VENV): about a minute the first time."
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(call install,$(VENV),requirements.lock)
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation --no-deps --editable .
+	$(call compile,$(VENV))
 	@touch $@
 
 $(VENV)/.dev: requirements-dev.lock $(VENV)/.runtime
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
+	$(call install,$(VENV),requirements-dev.lock)
+	$(call compile,$(VENV))
 	@touch $@
 
 # The site reads docstrings and runs notebooks, so its packages see those of development behind their own.
 $(DOCS_VENV)/.docs: requirements-docs.lock $(VENV)/.dev
 	$(BIN)/python -m venv $(DOCS_VENV)
-	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
+	$(call install,$(DOCS_VENV),requirements-docs.lock)
+	$(call compile,$(DOCS_VENV))
 	@$(BIN)/python -c 'import sysconfig; print("import site; site.addsitedir(%r)" % sysconfig.get_path("purelib"))' \
 	  > "$$($(DOCS_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/runtime.pth"
 	@touch $@

@@ -5,7 +5,7 @@ for what really happened, eqs. (9) and (10) of Kapteyn et al. 2021 with its weig
 """
 
 from collections.abc import Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -84,10 +84,11 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         source = source_of(self.scenario)
         source.check()
         with ExitStack() as opened:  # what is packed is held as long as it is flown
-            folder = Path(opened.enter_context(TemporaryDirectory(prefix="uav_twin_")))
-            source.prepare(folder, progress or SilentProgress())
+            self._folder = Path(opened.enter_context(TemporaryDirectory(prefix="uav_twin_")))
+            source.prepare(self._folder, progress or SilentProgress())
             self.knowledge = prepare_knowledge(self.scenario, source, self.scenario.mission.seed)
-            self._asset: Asset | None = opened.enter_context(closing(source.open()))
+            self._asset: Asset | None = source.open()
+            opened.callback(self._let_go)
             self._start = self._asset.save_state()
             self._opened = opened.pop_all()
         self._plant: Plant | None = None
@@ -114,7 +115,14 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         if self._asset is None:
             raise MissionInputError("the environment is closed: make a new one.")
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._asset.restore_state(self._start)
+        if getattr(self.scenario.asset, "seeds", ()):  # chance of its own, which begins with it
+            self._let_go()
+            scenario = self.scenario.under(self._seed)
+            source = scenario.asset.source(scenario)
+            source.use(self._folder)
+            self._asset = source.open()
+        else:
+            self._asset.restore_state(self._start)
         self._plant = self.knowledge.plant(self.knowledge.truth(self._seed), self._asset)
         self._step = 0
         observation, _, info = self._fly(self.knowledge.twin().proposed_control, None)
@@ -139,26 +147,26 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         if not self.action_space.contains(action):
             known = self.scenario.control_names
             raise gymnasium.error.InvalidAction(said("environment.control", known=known, action=action))
+        ended, last = "", self.scenario.mission.steps
         try:
             observation, reward, info = self._fly(int(action), self._control)
+            if self.scenario.ends(int(action)):
+                ended = decided_to_end(self.scenario, int(action))
         except FmuEndedError as error:
-            self._step = self.scenario.mission.steps
-            return self._seen, 0.0, True, False, self._info | {"ended": error.sentence}
-        if self.scenario.ends(int(action)):
-            self._step = self.scenario.mission.steps
-            return (
-                observation,
-                reward,
-                True,
-                False,
-                info | {"ended": decided_to_end(self.scenario, int(action))},
-            )
-        return observation, reward, False, self._step >= self.scenario.mission.steps, info
+            observation, reward, info, ended = self._seen.copy(), 0.0, self._info, error.sentence
+        if ended:
+            self._step, info = last, info | {"ended": ended}
+        return observation, reward, bool(ended), not ended and self._step >= last, info
 
     def close(self) -> None:
         """Let go of the asset and what was packed for it."""
         self._opened.close()
-        self._asset = self._plant = None
+        self._plant = None
+
+    def _let_go(self) -> None:
+        if self._asset is not None:
+            self._asset.close()
+        self._asset = None
 
     def _fly(self, control: int, before: int | None) -> tuple[Float, float, dict[str, Any]]:
         assert self._plant is not None

@@ -330,15 +330,15 @@ def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -
     watched = scenario.asset.kind == WATCHED_KIND
     source = believed_source(scenario) if watched else asset_source(scenario)
     source.check()
-    origin, mission, calibration = source.origin, scenario.mission, scenario.calibration
+    origin, mission, (drawn, draws) = source.origin, scenario.mission, source.uncertain
     levels = {factor.name: len(factor.levels) for factor in scenario.state}
     return {
         "name": mission.name,
         "title": mission.title,
         "flown": "nothing, a real asset is watched" if watched else origin.asset,
         "believed": origin.model,
-        "uncertain": f"{calibration.parameter}, from {calibration.source.replace('_', ' ')}",
-        "draws": 1 if calibration.source == "fixed" else calibration.draws,
+        "uncertain": f"{scenario.calibration.parameter}, from {drawn}",
+        "draws": draws,
         "levels": levels,
         "states": prod(levels.values()),
         "controls": scenario.control_names,

@@ -34,7 +34,8 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     Notes
     -----
     With a remainder the leverage is that of the trials' own unknowns: what is shared takes a few samples of
-    all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show.
+    all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show. The noise
+    of channels without a record is what the fitted trials leave of them.
     """
     fitted = _predicted(problem, found, found, sensitivities=sensitivities)
     if problem.campaign.held_out:
@@ -61,9 +62,11 @@ def _predicted(
     root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
     at, items = len(root), []
     total = at + sum(data.unknowns.size for data in problem.trials)
-    ones, counted = np.ones(len(problem.channel_names)), float(found.remainder is None)
+    counted = float(found.remainder is None)
+    precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(found.sums))
     for number, data in enumerate(problem.trials):
-        item = trial_rows(problem, number, adapted, adapted.candidate, ones)
+        item = trial_rows(problem, number, adapted, adapted.candidate, precision)
+        deviation = data.deviation / np.sqrt(precision[data.groups])
         local, shared = np.split(item.rows, [data.unknowns.size])
         factor, along = item.followed()
         own = solve_triangular(factor, local, trans="T")
@@ -78,7 +81,7 @@ def _predicted(
             leverage = np.minimum(taken + counted * carried, 1.0)
             variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
         if found.remainder is not None and data.trial.is_dynamic:
-            variance = variance + found.remainder.size[data.groups] ** 2
+            variance = variance + precision[data.groups] * found.remainder.size[data.groups] ** 2
         sensitive = None
         if sensitivities:
             sensitive = np.zeros((*shape, total))
@@ -92,8 +95,8 @@ def _predicted(
                 trial=replace(data.trial, used=data.weight > 0.0),  # after a gap a filter leaves out more
                 prediction=prediction,
                 residual=residual * data.deviation,  # what a remainder takes up is what is left
-                noise_deviation=data.deviation,
-                predictive_deviation=data.deviation * np.sqrt(np.maximum(variance, 1e-9)),
+                noise_deviation=deviation,
+                predictive_deviation=deviation * np.sqrt(np.maximum(variance, 1e-9)),
                 leverage=leverage.reshape(shape),
                 rates=np.gradient(prediction, data.trial.interval, axis=0) if data.trial.is_dynamic else None,
                 sensitivity=sensitive,

@@ -19,6 +19,7 @@ from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
 from fe.sentences import said
 from fe.structure.tables import Part, StructureDesign
 from reporting.toml_file import Fault, checked, read_toml
+from reporting.words import brief
 
 from . import parts
 
@@ -65,6 +66,11 @@ class WingDesign(Part):
     lift: parts.Lift
     tip_load: parts.TipLoad
     mesh: parts.MeshSettings
+
+    def __repr__(self) -> str:
+        return brief(
+            self, name=self.name, regions=self.regions, gauges=len(self.gauges.positions), hash=self.hash
+        )
 
     def faults(self) -> Iterator[Fault]:
         """Yield parts that do not fit together."""

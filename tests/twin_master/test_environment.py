@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tests.twin_master.runs import flight_of, text_of, written
+from tests.twin_master.runs import changed_scenario, flight_of, text_of, written
 from twin_master.assets.resolution import asset_source
 from twin_master.environment import ScenarioEnvironment
 from twin_master.errors import MissionInputError
@@ -82,6 +82,17 @@ def test_an_action_that_ends_the_mission_terminates_the_episode(tmp_path):
     with pytest.raises(gymnasium.error.ResetNeeded):
         environment.step(0)
     environment.close()
+
+
+def test_chance_inside_the_asset_begins_with_the_seed_of_the_episode():
+    loaded = changed_scenario("three_fmus", {"mission": {"steps": 3}})
+    environment, other = (ScenarioEnvironment(loaded, {"in_process": True, "seed": seed}) for seed in (1, 5))
+    first, second, again = (environment.reset(seed=seed)[0] for seed in (5, 6, 5))
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(other.reset(seed=5)[0], first)
+    assert not np.array_equal(first, second)
+    environment.close()
+    other.close()
 
 
 def test_without_gymnasium_there_is_a_sentence():

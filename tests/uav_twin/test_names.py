@@ -120,6 +120,7 @@ def test_records_show_themselves_in_a_few_words(library_file):
         (knowledge.model, ("states=", "controls=2 (2g, 3g)")),
         (knowledge.sensor_model, ("draws=", "sensors=")),
         (knowledge.twin(), ("turns=0", "GraphicalModel(")),
+        (uav_twin.load_design(), ("regions=2 (z1, z2)", "gauges=24")),
     ]
     for record, words in shown:
         text = repr(record)

@@ -222,6 +222,12 @@ class AssetSource:
         """The same twice."""
         return FlownAndBelieved(self.words, self.words, self.differ)
 
+    @property
+    def uncertain(self) -> tuple[str, int]:
+        """Where draws of the parameter come from, in words, and how many there are."""
+        given = self._scenario.calibration
+        return given.source.replace("_", " "), 1 if given.source == "fixed" else given.draws
+
     def check(self) -> None:
         """Look at what is given before anything is made; raise what is wrong with it."""
 
@@ -307,6 +313,11 @@ class PairedSource(AssetSource):
         told = ("draws", "observation_table", "structural_table", "write_field")
         for name, source in {"open": asset, **dict.fromkeys(told, model)}.items():
             setattr(self, name, getattr(source, name))
+
+    @property
+    def uncertain(self) -> tuple[str, int]:
+        """As of what is believed."""
+        return self._model.uncertain
 
     @property
     def origin(self) -> FlownAndBelieved:

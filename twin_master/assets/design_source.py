@@ -177,6 +177,24 @@ class _Wing(NamedStructure):
 
         return None if self.patch_path is None else load_patch(self.patch_path)
 
+    def check_places(self, patch: "PatchFile") -> None:
+        """Refuse effects at places beside the wing; raises `MissionInputError`."""
+        from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, PointMass
+        from fe.runtime.wing_rows import OVERHANG
+
+        span = self.wing_design.planform.semi_span
+        load = span - self.wing_design.tip_load.distance_from_tip
+        for effect in patch.effects:
+            for item in effect.patch:
+                first, length, beyond = 0.0, 0.0, (1.0 + OVERHANG) * span
+                if isinstance(item, LocalStiffnessLoss):
+                    first, length, beyond = item.start, item.length, span
+                elif isinstance(item, LoadPlace | PointMass):
+                    first = item.station if isinstance(item, PointMass) else load + item.along_span
+                if first > beyond or first + length < 0.0:
+                    of = {"effect": effect, "kind": item.kind, "place": first, "span": span}
+                    raise MissionInputError(said("assets.place", where=self.patch_path, **of))
+
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain under a state and a control as VTU; return whether there is a field.
 
@@ -222,6 +240,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         patch, effects = self.patch, tuple[str, ...]()
         check_form(self.section.packed, patched=patch is not None)
         if patch is not None:
+            self.check_places(patch)
             known = patch.for_gauges(len(self.wing_design.gauges.positions), str(self.patch_path))
             effects = tuple(row.name for row in effect_rows(known.plain, 0, {}))
         known_names, where = (*binding.parameter, *effects), f"the binding {binding.name}"
@@ -253,6 +272,7 @@ class DesignSource(_Wing, StructureSource):
             role = self._scenario.observation.role
             if role != "strain":
                 raise MissionInputError(said("assets.patched_role", role=role))
+            self.check_places(self.patch)
             check_model_patch(self.patch, len(self.design.gauge), str(self.patch_path))
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:

@@ -287,7 +287,11 @@ class FmuSource(AssetSource):
                 return session.step(control, health, load).values[chosen]
 
             for row, value in enumerate(draws.values):
-                others = {name: float(values[row]) for name, values in draws.others.items()}
+                others = {
+                    name: float(values[row])
+                    for name, values in draws.others.items()
+                    if name in session.binding.parameter
+                }
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
                 rows.append(asked_table(scenario, model.states.coordinates, ask))
         return np.array(rows)

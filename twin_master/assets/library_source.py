@@ -71,7 +71,7 @@ class ObservationLibrary:
         The uncertain parameter; empty without one.
     draws : (E,)
         Its values; NaN without one.
-    load : dict of str to float
+    load, parameters : dict of str to float
         What else was set.
     settling_steps : int
         Steps from a fresh start at every point; 0: the FMU has no memory, and each point is one step.
@@ -95,6 +95,7 @@ class ObservationLibrary:
         )
         self.settling_steps = int(about["settling_steps"])
         self.load: Mapping[str, float] = json.loads(about["load"])
+        self.parameters: Mapping[str, float] = json.loads(about["parameters"])
         self.sensors, self.sensor_units, self.controls = (
             tuple(str(text) for text in dataset[name].values) for name in ("sensor", "sensor_unit", "control")
         )
@@ -264,13 +265,12 @@ class LibrarySource(AssetSource):
         self._model: AssetSource = flown
         if section.design is not None:
             self._model = DesignSource(scenario, section=DesignBelief(design=section.design))
-        self._other_fmu: bool | None = False
+        self._of = " of it"
 
     @property
     def words(self) -> str:
-        """The library; it differs from the asset if it was sampled from another FMU."""
-        other = {True: " of another FMU", False: " of it", None: ""}[self._other_fmu]
-        return f"observation library{other}"
+        """The library; it differs if it was sampled from another FMU or with other parameters."""
+        return f"observation library{self._of}"
 
     @cached_property
     def library(self) -> ObservationLibrary:
@@ -310,11 +310,15 @@ class LibrarySource(AssetSource):
     def _make(self, progress: Progress) -> dict[str, str]:
         """Prepare the design if one is named; what is flown is prepared before."""
         assert self._folder is not None
-        fmu, own = self._folder / FMU_COPY, self._model is not self._flown
+        fmu, own, library = self._folder / FMU_COPY, self._model is not self._flown, self.library
+        flown = {k: value for k, value in self._flown.parameters().items() if k != library.parameter}
         hashes = self._model.prepare(self._folder, progress) if own else {}
-        # Of several FMUs each has its own hash.
-        self._other_fmu = self.library.fmu_hash != hash_file(fmu) if fmu.exists() else None
-        self.differ = self._other_fmu is True
+        if not fmu.exists():  # of several FMUs each has its own hash
+            self._of = ""
+        elif library.fmu_hash != hash_file(fmu):
+            self._of, self.differ = " of another FMU", True
+        elif library.parameters != flown:
+            self._of, self.differ = " of it under other parameters", True
         return hashes
 
     def draws(self, seed: int) -> ParameterDraws:

@@ -75,9 +75,8 @@ def draw_parameter(
     CalibrationError
         The measurements do not fit the model, or the calibration file cannot be read.
     """
-    name, count = calibration.parameter, calibration.draws
+    name, count, found = calibration.parameter, calibration.draws, read_calibration(calibration)
     if calibration.source == "file":
-        found = read_calibration(calibration)
         assert found is not None  # the schema asks for it
         values = found.stratified_draws(name, count, seed_sequence(seed, "calibration"))
         from calibration.result.file import run_record
@@ -85,7 +84,7 @@ def draw_parameter(
         return ParameterDraws(
             name, values, found.mean(name), found.standard_deviation(name),
             f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
-            run_record(found, name), found.given(name, values) if found.design is None else {},
+            run_record(found, name), found.given(name, values),
         )  # fmt: skip
     if calibration.source in ("fixed", "normal"):
         mean, deviation = calibration.mean, calibration.standard_deviation or 0.0
@@ -98,7 +97,9 @@ def draw_parameter(
 
         random = generator(seed, "calibration")
         values = mean + deviation * ndtri(stratified(random, count))
-        return ParameterDraws(name, values, mean, deviation, "normal distribution of the scenario")
+        others = {} if found is None else found.given(name, values)
+        source = "normal distribution of the scenario"
+        return ParameterDraws(name, values, mean, deviation, source, others=others)
     if calibration.curve == "design" and model is None:
         raise MissionInputError(said("assets.curve"))
     return _draws_of_load_test(calibration, seed, model if calibration.curve == "design" else None)

@@ -82,9 +82,9 @@ class ReducedModelSource(AssetSource):
         states, controls = model.states.coordinates, scenario.control
         shape = (len(draws.values), len(states), len(controls))
         draw, state, control = (index.ravel() for index in np.indices(shape))
-        loads = scenario.asset.constant_load
-        columns: dict[str, Float | float] = {n: value for n, value in loads.items() if n in reduced.chosen}
-        columns |= {n: values[draw] for n, values in {**draws.others, draws.name: draws.values}.items()}
+        beside = {**scenario.asset.constant_load, **{n: values[draw] for n, values in draws.others.items()}}
+        columns: dict[str, Float | float] = {n: value for n, value in beside.items() if n in reduced.chosen}
+        columns[draws.name] = draws.values[draw]
         columns |= zip(scenario.state_names, states[state].T, strict=True)
         for name in controls[0].values:
             columns[name] = np.array([item.values[name] for item in controls])[control]

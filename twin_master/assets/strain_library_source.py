@@ -207,11 +207,17 @@ class StrainLibrarySource(AssetSource):
         super().__init__(scenario)
         self.places = {} if path is None else {LIBRARY_COPY: path}
         self._library = library
-        rows = [("control", scenario.control_names, library.controls)]
-        check_names("the scenario has the", "the strain library", rows)
-        self._control_index = [library.controls.index(name) for name in scenario.control_names]
+        loads = {action.name: action.control for action in scenario.action}
+        names = [loads.get(name, name) for name in scenario.control_names]
+        check_names("the scenario has the", "the strain library", [("control", names, library.controls)])
+        self._control_index = [library.controls.index(name) for name in names]
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
             raise MissionInputError(said("assets.gauges", library=library, scenario=scenario))
+
+    @property
+    def uncertain(self) -> tuple[str, int]:
+        """Samples of its own."""
+        return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return the library's own samples of its parameter."""

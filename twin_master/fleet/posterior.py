@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
+from functools import cached_property
+from itertools import cycle, product
 
 import numpy as np
 
@@ -47,9 +48,9 @@ class Line:
     Attributes
     ----------
     x : (N,)
-        Equally spaced, where an interval is asked for.
+        Equally spaced.
     weight : (N,)
-        Probability of each; they sum to 1.
+        Probability of each, of `masses`.
     of : callable
         Returns the figure for x: a probability for its log odds.
     """
@@ -58,15 +59,36 @@ class Line:
     weight: Float
     of: Callable[[Float], Float] = np.asarray
 
+    @cached_property
+    def _fine(self) -> tuple[Float, Float]:
+        """Return many values of x and their shares: the cubic through the log density, between the bounds.
+
+        Where the spacing is as wide as the distribution, or a bound cuts it off, sums over x alone are wrong.
+        """
+        from scipy.interpolate import CubicSpline
+
+        # Where there is nothing, the logarithm would make the spline swing.
+        inside = np.flatnonzero(self.weight > NOTHING * self.weight.max())
+        part = slice(max(0, min(inside[0], len(self.x) - 4)), max(4, inside[-1] + 1))
+        fine = np.linspace(self.x[part][0], self.x[part][-1], 2001)
+        density = self.weight.copy()
+        density[[0, -1]] *= 2.0
+        log_weight = np.log(np.maximum(density[part], NOTHING * density.max()))
+        density = np.exp(CubicSpline(self.x[part], log_weight)(fine) - log_weight.max())
+        density[[0, -1]] *= 0.5
+        return fine, density / density.sum()
+
     @property
     def mean(self) -> float:
         """Mean of the figure."""
-        return float(self.weight @ self.of(self.x))
+        fine, share = self._fine
+        return float(share @ self.of(fine))
 
     @property
     def standard_deviation(self) -> float:
         """Standard deviation of the figure."""
-        return float(np.sqrt(self.weight @ (self.of(self.x) - self.mean) ** 2))
+        fine, share = self._fine
+        return float(np.sqrt(share @ (self.of(fine) - self.mean) ** 2))
 
     @property
     def figures(self) -> dict[str, float]:
@@ -76,16 +98,9 @@ class Line:
         return moments | {"lower_95": low, "upper_95": high}
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the bounds of the central interval, by the cubic through the log density."""
-        from scipy.interpolate import CubicSpline
-
-        # Where there is nothing, the logarithm would make the spline swing.
-        inside = np.flatnonzero(self.weight > NOTHING * self.weight.max())
-        part = slice(max(0, min(inside[0], len(self.x) - 4)), max(4, inside[-1] + 1))
-        fine = np.linspace(self.x[part][0], self.x[part][-1], 2001)
-        log_weight = np.log(np.maximum(self.weight[part], NOTHING * self.weight.max()))
-        density = np.exp(CubicSpline(self.x[part], log_weight)(fine) - log_weight.max())
-        reached = np.cumsum(density) / density.sum()
+        """Return the bounds of the central interval."""
+        fine, share = self._fine
+        reached = np.cumsum(share) - 0.5 * share
         bounds = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], reached, fine)
         low, high = self.of(bounds).tolist()
         return low, high
@@ -96,17 +111,19 @@ def narrowed(log_density: Callable[[Axes], Float], axes: Axes) -> tuple[Axes, Fl
     limits, numbers = [(axis[0], axis[-1]) for axis in axes], range(len(axes))
     while True:
         found = log_density(axes)
-        weight = np.exp(found - found.max())
-        bounds, resolved = [], True
+        weight, bounds, resolved = masses(found), [], True
         for k, (axis, (low, high)) in enumerate(zip(axes, limits, strict=True)):
             others = tuple(other for other in numbers if other != k)
-            inside, step = np.flatnonzero(weight.max(axis=others) > np.exp(-BELOW)), axis[1] - axis[0]
-            bounds.append((max(low, axis[inside[0]] - step), min(high, axis[inside[-1]] + step)))
-            marginal = weight.sum(axis=others) / weight.sum()
+            inside, step = np.flatnonzero(found.max(axis=others) > found.max() - BELOW), axis[1] - axis[0]
+            # With a whole step more grids of few points would stay too wide.
+            bounds.append(
+                (max(low, axis[inside[0]] - 0.75 * step), min(high, axis[inside[-1]] + 0.75 * step))
+            )
+            marginal = weight.sum(axis=others)
             spread = np.sqrt(marginal @ (axis - marginal @ axis) ** 2)
             resolved &= bool(step <= RESOLVED * spread) and len(inside) >= len(axis) // 3
         # Where the next grid would be no finer, this is what can be had (a posterior at the bounds).
-        if resolved or all(b - a > 0.8 * (x[-1] - x[0]) for (a, b), x in zip(bounds, axes, strict=True)):
+        if resolved or all(b - a > 0.95 * (x[-1] - x[0]) for (a, b), x in zip(bounds, axes, strict=True)):
             return axes, found
         axes = tuple(np.linspace(a, b, len(x)) for (a, b), x in zip(bounds, axes, strict=True))
 
@@ -130,8 +147,7 @@ class Grid:
     def marginals(self) -> tuple[Line, ...]:
         """Posterior of each probability under a uniform prior."""
         log_density = self.log_likelihood + _uniform(self.axes)
-        weight = np.exp(log_density - log_density.max())
-        return _lines(weight / weight.sum(), self.axes, logistic)
+        return lines(masses(log_density), self.axes, logistic)
 
 
 def _uniform(axes: Axes) -> Float:
@@ -140,10 +156,19 @@ def _uniform(axes: Axes) -> Float:
     return np.asarray(sum(np.log(logistic(x) * logistic(-x)) for x in meshed))
 
 
-def _lines(weight: Float, axes: Axes, of: Callable[[Float], Float] = np.asarray) -> tuple[Line, ...]:
-    """Return the marginals of weights on a grid."""
-    others = [tuple(i for i in range(weight.ndim) if i != k) for k in range(weight.ndim)]
-    return tuple(Line(axis, weight.sum(axis=other), of) for axis, other in zip(axes, others, strict=True))
+def masses(log_density: Float) -> Float:
+    """Return the probability of each point of a grid; those at bounds have half an interval."""
+    weight = np.exp(log_density - log_density.max())
+    for axis in range(weight.ndim):
+        np.moveaxis(weight, axis, 0)[[0, -1]] *= 0.5
+    return np.asarray(weight / weight.sum())
+
+
+def lines(weight: Float, axes: Axes, *of: Callable[[Float], Float]) -> tuple[Line, ...]:
+    """Return the marginals of weights on a grid, of figures that the functions give in turn."""
+    others = (tuple(i for i in range(weight.ndim) if i != k) for k in range(weight.ndim))
+    sums = zip(axes, others, cycle(of), strict=False)
+    return tuple(Line(axis, weight.sum(axis=other), own) for axis, other, own in sums)
 
 
 def points_of(axes: Sequence[Float]) -> Float:
@@ -200,15 +225,14 @@ def shared(grids: Sequence[Grid]) -> Shared:
     grids : sequence of Grid
         Log likelihood of each group, of the same K = 1 or 2 probabilities.
     """
-    from scipy.special import betaln, softmax
+    from scipy.special import betaln
 
     count = len(grids[0].axes)
     axes = [tuple(np.linspace(axis[0], axis[-1], FINE) for axis in grid.axes) for grid in grids]
     likelihoods = [_resampled(grid, own) for grid, own in zip(grids, axes, strict=True)]
     low, high = (float(logit(np.array(bound))) for bound in (LOWEST, HIGHEST))
-    m = logistic(np.linspace(low, high, FINE))
-    kappa = np.geomspace(3.0, 3000.0, 13)
-    means, sizes = (array.ravel() for array in np.meshgrid(m, kappa, indexing="ij"))
+    odds, digits = np.linspace(low, high, FINE), np.linspace(np.log10(3.0), np.log10(3000.0), 13)
+    means, sizes = (array.ravel() for array in np.meshgrid(logistic(odds), 10.0**digits, indexing="ij"))
     a, b = means * sizes, (1.0 - means) * sizes
 
     def density(x: Float) -> Float:
@@ -220,30 +244,25 @@ def shared(grids: Sequence[Grid]) -> Shared:
     priors = [[*(density(x) for x in own), np.ones((1, 1))][:2] for own in axes]
     evidence = [first @ seen @ second.T for (first, second), seen in zip(priors, likelihoods, strict=True)]
     total = np.sum([np.log(np.maximum(one, 1e-300)) for one in evidence], axis=0)
-    weight = softmax(total)
+    hyper = masses(total.reshape((len(odds), len(digits)) * count))
+    weight = hyper.reshape(total.shape)
     groups = []
     for own, (first, second), seen, told in zip(axes, priors, likelihoods, evidence, strict=True):
         joint = seen * (first.T @ (weight / np.maximum(told, 1e-300)) @ second)
         joint /= joint.sum()
-        sums = joint.sum(axis=1), joint.sum(axis=0)
-        groups.append(tuple(Line(x, np.asarray(one), logistic) for x, one in zip(own, sums, strict=False)))
-    hyper = (weight.sum(axis=1), weight.sum(axis=0))[:count]
-    return Shared(
-        tuple(Line(means, one) for one in hyper),
-        tuple(Line(np.log10(sizes), one) for one in hyper),
-        tuple(groups),
-    )
+        groups.append(lines(joint.reshape((FINE,) * count), own, logistic))
+    found = lines(hyper, (odds, digits) * count, logistic, np.asarray)
+    return Shared(found[::2], found[1::2], tuple(groups))
 
 
 def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:
-    """Return the likelihood of a grid on finer axes of the same range, FINE points each."""
+    """Return the likelihood of a grid, times intervals, on finer axes of the same range, FINE points each."""
     from scipy.interpolate import RegularGridInterpolator
 
     # Far below the largest there is nothing but what would make the spline swing.
     log_likelihood = np.maximum(grid.log_likelihood - grid.log_likelihood.max(), -60.0)
     fine = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    found = np.exp(RegularGridInterpolator(grid.axes, log_likelihood, method="cubic")(fine))
-    return np.asarray(found.reshape(FINE, -1))
+    return masses(RegularGridInterpolator(grid.axes, log_likelihood, method="cubic")(fine)).reshape(FINE, -1)
 
 
 def population(nodes: Float, log_evidence: Float, scale: float) -> tuple[Line, Line]:
@@ -278,7 +297,5 @@ def population(nodes: Float, log_evidence: Float, scale: float) -> tuple[Line, L
 
     limits = (nodes[0], nodes[-1]), (0.25 * step, 0.5 * (nodes[-1] - nodes[0]))
     axes, found = narrowed(density, tuple(np.linspace(*limit, POPULATION_POINTS) for limit in limits))
-    weight = np.exp(found - found.max())
-    weight[:, [0, -1]] *= 0.5
-    mean, spread = _lines(weight / weight.sum(), axes)
+    mean, spread = lines(masses(found), axes, np.asarray)
     return mean, spread

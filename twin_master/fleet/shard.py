@@ -148,8 +148,7 @@ class _Unpacked:
         if self.wing is not None:
             return ReducedModelSource(scenario, self.wing).open()
         if seed is not None:
-            mission = scenario.mission.model_copy(update={"seed": seed})
-            scenario = scenario.model_copy(update={"mission": mission})
+            scenario = scenario.under(seed)
         source: AssetSource = scenario.asset.source(scenario)
         if isinstance(source, FmuSource):
             source.use(self._folder)  # packed already

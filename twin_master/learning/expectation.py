@@ -74,20 +74,31 @@ class LearntExpectation:
     rewards: RewardModel
     policy: Float
 
-    def filtered(self, carried: Sequence[Carried], observed: Float) -> Expected:
-        """Return what is expected of T turns given the observations up to each; observed is (T, G)."""
-        rows = zip(carried, observed, strict=True)
-        return stacked(self._known(self.learning.hypotheses(turn), turn, seen) for turn, seen in rows)
+    def filtered(self, carried: Sequence[Carried], beliefs: Float, observed: Float) -> Expected:
+        """Return what is expected of T turns given the observations up to each.
 
-    def smoothed(self, carried: Sequence[Carried], observed: Float) -> Expected:
-        """Return what is expected of T turns given all observations; observed is (T, G)."""
-        rows, own = zip(carried, observed, strict=True), self.learning.smoothed_hypotheses(carried)
+        Parameters
+        ----------
+        carried : sequence of Carried
+            Of each turn.
+        beliefs : (T, S)
+            About the state, which may be those of more than the model alone.
+        observed : (T, G)
+            What the sensors say, SI.
+        """
+        rows = zip(carried, beliefs, observed, strict=True)
+        return stacked(self._known(self.learning.hypotheses(turn), turn, *row) for turn, *row in rows)
+
+    def smoothed(self, carried: Sequence[Carried], beliefs: Float, observed: Float) -> Expected:
+        """Return what is expected of T turns given all observations, see `filtered`."""
+        rows, own = zip(carried, beliefs, observed, strict=True), self.learning.smoothed_hypotheses(carried)
         last = (self.learning.hypotheses(carried[-1], weight) for weight in own)
         return stacked(self._known(found, *row) for found, row in zip(last, rows, strict=True))
 
-    def predicted(self, carried: Sequence[Carried], horizon: int) -> Expected:
-        """Return what is expected after each of T turns of the H turns to come."""
-        return stacked(self._ahead(turn, horizon) for turn in carried)
+    def predicted(self, carried: Sequence[Carried], beliefs: Float, horizon: int) -> Expected:
+        """Return what is expected after each of T turns, of given filtered beliefs, of the H to come."""
+        rows = zip(carried, beliefs, strict=True)
+        return stacked(self._ahead(turn, belief, horizon) for turn, belief in rows)
 
     def of_marginals(
         self, learnt: Mapping[str, Learnt], joint: Float, controls: slice, seen: Float | None
@@ -140,14 +151,14 @@ class LearntExpectation:
         matrix = self.learning.model.transition.matrix
         return np.asarray(np.einsum("su,usn->sn", self.policy, matrix))
 
-    def _known(self, hypotheses: Hypotheses, turn: Carried, seen: Float) -> Expected:
+    def _known(self, hypotheses: Hypotheses, turn: Carried, belief: Float, seen: Float) -> Expected:
         u = slice(turn.control_index, turn.control_index + 1)
-        found = self._of(hypotheses, hypotheses.weight[None, :, :, None], u, seen)
+        found = self._of(hypotheses, _believing(hypotheses.weight, belief)[None, :, :, None], u, seen)
         return Expected(**{name: values[0] for name, values in vars(found).items()})
 
-    def _ahead(self, turn: Carried, horizon: int) -> Expected:
+    def _ahead(self, turn: Carried, belief: Float, horizon: int) -> Expected:
         hypotheses = self.learning.hypotheses(turn)
-        rows, coming = hypotheses.weight, np.empty((horizon, *hypotheses.weight.shape))
+        rows, coming = _believing(hypotheses.weight, belief), np.empty((horizon, *hypotheses.weight.shape))
         step = self.learning.model.transition.matrix[turn.control_index]
         for h in range(horizon):
             rows, step = rows @ step, self._closed_loop
@@ -189,6 +200,19 @@ class LearntExpectation:
             mean + center, deviation, quantiles[:, 0] + center, quantiles[:, 1] + center, noise,
             *rewards,
         )  # fmt: skip
+
+
+def _believing(weight: Float, belief: Float) -> Float:
+    """Return p(k | D) of a joint belief (K, S) under another belief about the state (S,): (K, S)."""
+    own, apart = weight.sum(axis=0), np.tile(weight.sum(axis=1, keepdims=True), len(belief))
+    return np.asarray(belief * np.divide(weight, own, out=apart, where=own > 0.0))
+
+
+def joined(parts: Sequence[Expected]) -> Expected:
+    """Return what is expected of turns one after the other."""
+    return Expected(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
+    )
 
 
 def stacked(parts: Iterable[Expected]) -> Expected:

@@ -19,6 +19,7 @@ from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.library_source import LibraryBelief
+from twin_master.assets.parameter import read_calibration
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario
@@ -58,6 +59,8 @@ class SamplingGrid:
         Value of each control input under each control.
     load, parameters : dict of str to float
         What else is set; parameters but the uncertain one.
+    others : dict of str to tuple of float
+        Parameters that are others at each draw.
     settling_steps : int
         Steps from a fresh start at every point; 0 for an FMU without memory.
     step_timeout : float
@@ -73,6 +76,7 @@ class SamplingGrid:
     controls: Mapping[str, Mapping[str, float]]
     load: Mapping[str, float] = field(default_factory=dict)
     parameters: Mapping[str, float] = field(default_factory=dict)
+    others: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     settling_steps: int = 0
     step_timeout: float = STEP_TIMEOUT
 
@@ -151,7 +155,7 @@ class GridSampler:
     def _start(self, index: int) -> None:
         grid = self._grid
         draw, state, control = grid.point(index)
-        setting = dict(grid.parameters)
+        setting = dict(grid.parameters) | {name: values[draw] for name, values in grid.others.items()}
         if grid.parameter:
             setting[grid.parameter] = grid.draws[draw]
         try:
@@ -359,16 +363,20 @@ def grid_of_scenario(
     if any(given.values()) or {*swept} - {draws.name}:
         raise MissionInputError(said("library.scenario", name=draws.name))
     fixed = {name: value for name, value in flown.parameters().items() if name != draws.name}
+    values = swept.get(draws.name, tuple(draws.values.tolist()))
+    found = read_calibration(scenario.calibration)
+    others = {} if found is None else found.given(draws.name, np.array(values))
     return SamplingGrid(
         fmu=str(folder / FMU_COPY),
         binding=str(folder / BINDING_COPY),
         role=scenario.observation.role,
         parameter=draws.name,
-        draws=swept.get(draws.name, tuple(draws.values.tolist())),
+        draws=values,
         states=states,
         controls={control.name: dict(control.values) for control in scenario.control},
         load=dict(scenario.asset.constant_load),
         parameters=fixed,
+        others={name: tuple(at.tolist()) for name, at in others.items() if name in binding.parameter},
         settling_steps=settling_steps,
         step_timeout=flown.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )

@@ -102,7 +102,8 @@ def gap_of(history: History, skipped: int, knowledge: Knowledge) -> dict[str, An
         joint = known_control(left.filtered, left.control_index, sensors.control_count)
         expected = expected_of(sensors, knowledge.rewards, joint, None, quantiles=False)
     else:
-        expected = learns.filtered([turn.concluded.carried for turn in left.turns], left.observed)
+        carried = [turn.concluded.carried for turn in left.turns]
+        expected = learns.filtered(carried, left.filtered, left.observed)
     residual = (left.observed - expected.mean) / expected.noise
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
@@ -204,17 +205,24 @@ def replay(
     return found, last
 
 
+def in_turn(given: Sequence[BelievedModel]) -> list[BelievedModel]:
+    """Return the models that are believed one after the other.
+
+    One that was adopted from an earlier turn on than one before it takes its place altogether.
+    """
+    return [
+        model
+        for index, model in enumerate(given)
+        if all(later.from_turn > model.from_turn for later in given[index + 1 :])
+    ]
+
+
 def filtered_again(
     seen: Mapping[int, Reading], given: Sequence[BelievedModel], lag: int | None = None,
     settled: tuple[int, bytes] = (-1, b""),
 ) -> History:  # fmt: skip
     """Return the turns that a twin filters of what was seen in each, from a settled state on."""
-    # A model that was adopted from an earlier turn on than one before it takes its place altogether.
-    models = [
-        model
-        for index, model in enumerate(given)
-        if all(later.from_turn > model.from_turn for later in given[index + 1 :])
-    ]
+    models = in_turn(given)
     at = max(
         index for index, model in enumerate(models) if not index or model.from_turn <= max(settled[0], 0)
     )

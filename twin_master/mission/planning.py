@@ -162,28 +162,32 @@ class ComparedPolicy:
 
 def promised(scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy) -> ComparedPolicy:
     """Return what a policy on the belief brings in simulated missions."""
-    returns = _simulated(scenario, problem, lambda belief, _turn: policy.decide(belief))
+    returns = _simulated(scenario, problem, lambda belief, *_: policy.decide(belief))
     return ComparedPolicy("planned on the belief", returns)
 
 
 def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPolicy, ...]:
-    """Return what rules bring that are simpler than a plan on the belief, with the same beliefs.
+    """Return what rules bring that are simpler than a plan on the belief.
 
-    Inspection by the clock takes the first action that inspects, and decides as QMDP between.
+    The mode of the policy is decided on the belief that the scenario names. Inspection by the clock takes the
+    first action that inspects, and decides as QMDP between.
     """
     known = value_iteration(problem.transition, problem.reward, problem.discount)
 
     def by_the_clock(every: int) -> Decide:
-        def rule(belief: Float, turn: int) -> Index:
+        def rule(belief: Float, _filtered: Float, turn: int) -> Index:
             if turn % every == 0:
                 return np.full(len(belief), scenario.readings[0][0])
             return np.asarray(np.argmax(belief @ known.action_value, axis=1))
 
         return rule
 
+    ahead = scenario.planner.decide_on == "predicted"
     rules: dict[str, Decide] = {
-        "mode of the policy by states": lambda belief, _turn: np.argmax(belief @ known.policy, axis=1),
-        "QMDP": lambda belief, _turn: np.argmax(belief @ known.action_value, axis=1),
+        "mode of the policy by states": lambda belief, filtered, _turn: np.argmax(
+            (belief if ahead else filtered) @ known.policy, axis=1
+        ),
+        "QMDP": lambda belief, *_: np.argmax(belief @ known.action_value, axis=1),
     }
     for every in PERIODS if scenario.readings else ():
         rules[f"inspection every {every} {scenario.mission.step_name}s"] = by_the_clock(every)
@@ -195,7 +199,7 @@ def _simulated(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Fl
     first = scenario.control_names.index(scenario.mission.first_control)
     return simulated_returns(
         problem,
-        lambda belief, turn: rule(belief, turn) if turn else np.full(len(belief), first),
+        lambda belief, now, turn: rule(belief, now, turn) if turn else np.full(len(belief), first),
         MISSIONS,
         scenario.mission.steps,
         generator(scenario.mission.seed, "damage"),

@@ -361,8 +361,9 @@ def _policy(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
     return BeliefPolicy(np.vstack(kept), np.repeat(np.arange(len(kept)), [len(each) for each in kept]))
 
 
-Decide = Callable[[Float, int], Index]
-"""Returns the controls (B,) for the beliefs (B, S) before a turn, of that number from 0."""
+Decide = Callable[[Float, Float, int], Index]
+"""Returns the controls (B,) of a turn for the beliefs (B, S) of its states and of those of the turn before,
+given all observations up to that one, and for its number from 0."""
 
 
 def simulated_returns(
@@ -378,9 +379,10 @@ def simulated_returns(
     chance = generator.random((turns + 1, 2, missions))
     states = _drawn(np.tile(problem.prior, (missions, 1)), chance[turns, 0])
     belief = np.tile(problem.prior, (missions, 1))
+    filtered = belief.copy()
     total, weight = np.zeros(missions), np.ones(missions)
     for turn in range(turns):
-        control = decide(belief, turn)
+        control = decide(belief, filtered, turn)
         total += weight * np.einsum("bs,sb->b", belief, problem.reward[:, control])
         weight *= problem.discount[control]
         for chosen in np.unique(control).tolist():
@@ -393,8 +395,47 @@ def simulated_returns(
             told = likelihood[:, states[rows] if problem.moves_first else before].T
             seen = _drawn(told, chance[turn, 1, rows])
             after = problem.following(belief[rows], chosen, seen)
+            now = after if problem.moves_first else belief[rows] * likelihood[seen]
+            filtered[rows] = now / now.sum(axis=1, keepdims=True)
             belief[rows] = after / after.sum(axis=1, keepdims=True)
     return total
+
+
+LIVES = 200
+"""That are drawn of each twin."""
+
+
+def leaving_probability(
+    problem: DecisionProblem, policy: BeliefPolicy, belief: Float, control: int, turns: int,
+    generator: np.random.Generator,
+) -> Float:  # fmt: skip
+    """Return the share of lives in which a policy leaves a control within some turns: (B,).
+
+    Parameters
+    ----------
+    problem : DecisionProblem
+        Whose state is observed before it moves.
+    policy : BeliefPolicy
+    belief : (B, S)
+        Before the first of the turns.
+    control : int
+        In force until it is left.
+    turns : int
+        In which is decided, the first one by the belief that is given.
+    generator : numpy.random.Generator
+        The lives of all twins share what chance brings.
+    """
+    result, chance = np.empty(len(belief)), generator.random((turns - 1, LIVES))
+    for twin, own in enumerate(belief):
+        rows = np.tile(own, (LIVES, 1))
+        left = policy.decide(rows) != control
+        for uniform in chance[: 0 if left.all() else None]:
+            seen = _drawn(rows @ problem.likelihood[control].T, uniform)
+            after = problem.following(rows, control, seen)
+            rows = after / after.sum(axis=1, keepdims=True)
+            left |= policy.decide(rows) != control
+        result[twin] = left.mean()
+    return result
 
 
 def _drawn(rows: Float, uniform: Float) -> Index:

@@ -121,7 +121,7 @@ class Calibration(FileSection):
     parameter: Name
     source: Literal["static_test", "normal", "fixed", "file"]
     file: str | None = None
-    """The calibration of a wing (`calibration.nc`), for the source `file`."""
+    """A calibration (`calibration.nc`): beside `mean` and `standard_deviation` for all else that it tells."""
     method: Literal["particle_filter", "exact"] = "exact"
     curve: Literal["published", "design"] = "published"
     draws: Count = 100
@@ -134,7 +134,7 @@ class Calibration(FileSection):
         """Yield what a source needs, or does not take."""
         source, given = self.source, bool(self.file)
         yield source == "file" and not given, said("scenario.calibration_file")
-        yield source != "file" and given, said("scenario.no_calibration_file", source=source)
+        yield source not in ("file", "normal") and given, said("scenario.no_calibration_file", source=source)
         for key, sources in (("mean", ("normal", "fixed")), ("standard_deviation", ("normal",))):
             missing = source in sources and getattr(self, key) is None
             yield missing, f"calibration source `{source}` needs `{key}`"
@@ -261,6 +261,10 @@ class Scenario(Section):
         """Return the scenario with the paths of the copies inside a run folder."""
         return self.model_copy(update={name: part.portable() for name, part in self._files().items()})
 
+    def under(self, seed: int) -> Self:
+        """Return the scenario under another seed of the run."""
+        return self.model_copy(update={"mission": self.mission.model_copy(update={"seed": seed})})
+
     def _files(self) -> dict[str, FileSection]:
         return {"asset": self.asset, "belief": self.belief, "calibration": self.calibration}
 
@@ -293,8 +297,14 @@ class Scenario(Section):
             yield min(divisors) <= 0.0, said("scenario.normaliser", norm=norm)
         levels = {factor.name: len(factor.levels) for factor in self.state}
         yield from self.transition.faults_among(controls, levels)
+        loads = {control.name: control.values for control in self.control}
         for action in self.action:
             yield unknown(action.control, controls, "action.control", "control")
+            same = loads.get(action.name, loads[action.control]) == loads[action.control]
+            taken = not same or action.name in (action.control, *controls[: -len(self.action)])
+            yield taken, f"action `{action.name}` needs a name of its own, and a control has it"
+            free = action.cost > 0.0 and rewards.control_weight == 0.0
+            yield free, said("scenario.free_action", name=action.name)
             for state in (*action.inspects, *action.repairs):
                 yield unknown(state, states, f"action.{action.name}", "state")
 

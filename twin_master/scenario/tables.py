@@ -233,7 +233,7 @@ def with_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
                 continue
             made[key] = dict(table[key]) | {k: dict(table[key][k]) for k in kinds if k in table[key]}
             entries += [made[key][kind] for kind in kinds if made[key].get(kind)]
-        made["rewards"], weight = rewards, rewards.get("control_weight", 1.0)
+        made["rewards"], weight = rewards, rewards.get("control_weight", 1.0) or 1.0
         for action in table["action"]:
             name, base = action["name"], action["control"]
             if name not in names:
@@ -242,7 +242,7 @@ def with_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
             rewards["control"].setdefault(name, rewards["control"][base] - action["cost"] / weight)
             for entry in entries:
                 entry.setdefault(name, entry[base])
-    except (KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError):
+    except (KeyError, TypeError, ValueError, AttributeError):
         return table
     return made
 

@@ -14,6 +14,7 @@ from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, ab
 from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
 from discrepancy.fits.screening import Screen, grid
 from discrepancy.judgement.conclusion import named_effects
+from discrepancy.location.locate import locate
 from discrepancy.search.starts import pairs
 from discrepancy.search_settings import SEARCH
 from discrepancy.workflow import patch_draws
@@ -274,6 +275,20 @@ def test_intervals_cover_under_the_right_model():
     np.testing.assert_allclose(leverage, np.diag(covariance), rtol=1e-6, atol=1e-9)
     rows = np.concatenate([item.sensitivity.reshape(-1, item.sensitivity.shape[2]) for item in items])
     np.testing.assert_allclose(rows @ rows.T, covariance, rtol=1e-5, atol=1e-8)
+
+
+def test_noise_without_a_record_is_what_the_fit_leaves():
+    """And nothing is found in it."""
+    told = 0
+    for seed in range(20):
+        problem = kit.closed_problem(seed=seed, samples=150, gain_deviation=0.02)
+        bare = {name: replace(item, noise=None) for name, item in problem.campaign.channels.items()}
+        unknown = kit.problem_of(replace(problem.campaign, channels=bare), problem.model)
+        found = residual_set(unknown, kit.fitted(unknown))
+        for data, item in zip(problem.trials, found.trials, strict=True):
+            np.testing.assert_allclose(item.noise_deviation, data.deviation, rtol=0.25)
+        told += any(cell.significant for cell in locate(found).cells)
+    assert told <= 2
 
 
 def test_held_out_trials_move_nothing_that_is_shared():

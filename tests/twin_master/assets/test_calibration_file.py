@@ -119,6 +119,11 @@ def test_the_option_stands_over_the_scenario(file, tmp_path):
     assert (scenario.calibration.source, scenario.calibration.file) == ("file", str(file))
     assert scenario.calibration.draws == loaded.scenario.calibration.draws
     assert scenario.asset.parameters == loaded.scenario.asset.parameters  # the truth stays the scenario's
+    named = '[calibration]\nparameter = "young_modulus_factor"\nmean = 1.0\nstandard_deviation = 0.01\n'
+    learnt = written(tmp_path, f"format = 1\n{named}", name="learnt.toml")
+    tailored = resolve_scenario(loaded, Overrides(calibration=file, learnt=learnt))
+    assert (tailored.asset.kind, tailored.calibration.source) == ("calibration", "normal")
+    asset_source(tailored).check()
     mine = load_scenario(scenario_with(tmp_path, "other.nc"))
     assert resolve_scenario(mine, Overrides(calibration=file)).calibration.file == str(file)
     pump = load_scenario("pump_wear")

@@ -5,6 +5,7 @@ import itertools
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,29 @@ import pytest
 import xarray as xr
 from scipy.optimize import brentq
 
+from calibration.result.file import result_bytes
+from calibration.result.record import Calibration, ParameterPrior
 from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
+from reporting.progress import SilentProgress
 from scenarios import asset_scripts
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, merged, table_of
+from tests.twin_master.runs import (
+    check_same,
+    cut_off_after,
+    figures_of,
+    loaded_from,
+    merged,
+    table_of,
+    written,
+)
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
-from twin_master.assets.resolution import Overrides
+from twin_master.assets.resolution import Overrides, asset_source
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.library.grid import grid_of_scenario
 from twin_master.library.sampling import sample_library
 from twin_master.network.inference import known_control
-from twin_master.scenario.reading import LoadedScenario
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from uav_twin import fly, load_scenario, prepare_twin, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
@@ -220,6 +232,46 @@ def test_what_the_twin_knows_is_what_the_equations_say(believed, tmp_path):
     error = np.nanmean(-np.abs(seen - shown[:, 4, 1]) / NOISE, axis=1).mean()
     found, _ = known.rewards.expectation(believes, seen)
     assert (found[0], found[2]) == pytest.approx((health[:, 4, 1].mean(), error), rel=1e-7)
+
+
+@pytest.mark.parametrize("way", ["asset", "library", "swept", "learnt"])
+def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchanger, tmp_path, way):
+    """By the formula of the heat exchanger and a regression; in the asset all else is at its mean."""
+    folder = Path(shutil.copytree(heat_exchanger, tmp_path / "system"))
+    with (folder / "binding.toml").open("a") as binding:
+        binding.write('[parameter.specific_heat]\nvariable = "specific_heat"\nunit = "J/(kg.K)"\n')
+    one, two = np.random.default_rng(3).standard_normal((2, 400))
+    samples = np.column_stack([6000.0 + 80.0 * one, 4186.0 + 120.0 * one + 20.0 * two])
+    named = [("conductance", "W/K", 6e3), ("specific_heat", "J/(kg.K)", 4e3)]
+    priors = tuple(ParameterPrior(*row, 600.0, 1e3, 9e3, "model.toml") for row in named)
+    told = ("exchanger 7", "exchanger", "0" * 64, "Gaussian", priors, samples, samples)
+    (tmp_path / "c.nc").write_bytes(result_bytes(Calibration(*told, None, (), (), "test", 1, {})))
+    loaded, given = load_scenario(folder / "fouling.toml"), Overrides(calibration=tmp_path / "c.nc")
+    if way in ("library", "swept"):
+        grid = ["conductance=5600:6400:17"] if way == "swept" else []
+        asked = grid_of_scenario(loaded, tmp_path / "made", grid, overrides=given)
+        given = replace(given, library=sample_library(asked, tmp_path / "l.nc", workers=1).path)
+    elif way == "learnt":
+        learnt = (
+            'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100.0\nstandard_deviation = 30.0\n'
+        )
+        given = replace(given, learnt=written(tmp_path, learnt))
+    known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
+    assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
+    flown = known.scenario.asset.source(known.scenario).parameters()
+    assert flown == {"conductance": 6100.0, "specific_heat": pytest.approx(samples[:, 1].mean())}
+    for true, of in ((4000.0, "under other parameters"), (samples[:, 1].mean(), "")) * (way == "library"):
+        table = merged(known.scenario.to_dict(), {"asset": {"parameters": {"specific_heat": float(true)}}})
+        source = asset_source(parse_scenario(table, "exchanger"))
+        source.prepare(tmp_path / f"{true:g}", SilentProgress())
+        assert source.origin.model == f"observation library of it {of}".strip()
+        assert source.origin.differ == bool(of)
+    draw, fouling, flow = np.meshgrid(
+        known.draws.values, [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2], indexing="ij"
+    )
+    passed = draw / (1.0 + fouling * draw) / ((slope * draw + offset) * flow)
+    shown = 20.0 + 60.0 * (1.0 - np.exp(-np.stack([0.5 * passed, passed], axis=-1)))
+    np.testing.assert_allclose(known.predicted, shown, rtol=1e-4 if way == "swept" else 1e-12)
 
 
 @pytest.mark.long

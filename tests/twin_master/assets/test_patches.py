@@ -10,8 +10,10 @@ import pytest
 
 from fe.runtime.patch import (
     BoucWen,
+    LoadPlace,
     LocalStiffnessLoss,
     ModelPatch,
+    PointMass,
     Primitive,
     SensorDrift,
     SensorGain,
@@ -25,6 +27,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError
 from twin_master.store.writing import open_run
+from twin_master.workflow import check_scenario
 from uav_twin import fly as new_run
 from uav_twin import load_scenario, resume
 
@@ -71,6 +74,17 @@ def test_what_changes_within_a_mission_is_no_model_of_the_twin(tmp_path):
             check_model_patch(patch, 24)
     offset = SensorDrift("strain[1]", 1e-5, 1.0, 0.0)
     check_model_patch(parse_patch(write_patch(tmp_path, offset).read_bytes()), 24)
+
+
+@pytest.mark.parametrize(
+    "primitive",
+    [LocalStiffnessLoss(0.3, end, 0.3) for end in (5, -1)] + [PointMass(1, 2.2), LoadPlace(-2, 0)],
+)
+def test_a_place_beside_the_wing_is_refused(primitive, tmp_path):
+    write_patch(tmp_path, primitive)
+    for lines, belief in ((PATCH, ""), ("", PATCH)):
+        with pytest.raises(MissionInputError, match=r"m from the root, and the wing is 1\.828 m long"):
+            check_scenario(load_scenario(scenario_of(tmp_path, lines, belief=belief)))
 
 
 def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):

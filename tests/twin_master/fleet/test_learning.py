@@ -1,5 +1,6 @@
 """What a fleet teaches, against enumeration, closed forms and the truth."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,10 @@ from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import _noisier, learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
-from twin_master.fleet.reading import attention
+from twin_master.fleet.reading import Outcomes, attention, leaving
 from twin_master.fleet.report import write_fleet_report
-from twin_master.mission.preparation import kept_knowledge
+from twin_master.mission.preparation import keep_knowledge, kept_knowledge
+from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
@@ -104,21 +106,31 @@ def test_evidence_is_that_of_the_filter():
         np.testing.assert_allclose(nodes[:, node], expected, rtol=1e-12)
 
 
-def test_a_grid_has_the_moments_of_a_beta():
+@pytest.mark.parametrize(
+    "counts",
+    [
+        ((0, 50),),
+        ((2, 0), (400, 3600)),
+        ((0, 200), (7, 60), (90, 270)),
+        ((3, 20), (7, 60), (30, 90), (9, 900)),
+    ],
+)
+def test_a_grid_has_the_moments_of_a_beta(counts):
+    """Between the bounds, which cut some off; of four probabilities with few points for each."""
     from scipy.stats import beta
-
-    counts = ((3, 50), (400, 3600))
 
     def log_likelihood(points: np.ndarray) -> np.ndarray:
         sums = [a * np.log(points[:, k]) + b * np.log1p(-points[:, k]) for k, (a, b) in enumerate(counts)]
         return np.asarray(np.sum(sums, axis=0))
 
-    grid = refined(log_likelihood, 2)
+    grid = refined(log_likelihood, len(counts))
     for (a, b), marginal in zip(counts, grid.marginals, strict=True):
         exact = beta(a + 1, b + 1)
-        assert marginal.mean == pytest.approx(exact.mean(), rel=2e-4)
-        assert marginal.standard_deviation == pytest.approx(exact.std(), rel=5e-3)
-        np.testing.assert_allclose(marginal.interval(), exact.interval(0.95), rtol=4e-3)
+        low, high = exact.cdf([LOWEST, HIGHEST])
+        draws = exact.ppf(low + (high - low) * (np.arange(20_000) + 0.5) / 20_000)
+        assert marginal.mean == pytest.approx(draws.mean(), abs=0.02 * draws.std())
+        assert marginal.standard_deviation == pytest.approx(draws.std(), rel=2e-2)
+        np.testing.assert_allclose(marginal.interval(), np.quantile(draws, [0.025, 0.975]), rtol=2e-2)
 
 
 def groups_of(counts: list[tuple[int, int]]) -> list[Grid]:
@@ -133,7 +145,9 @@ def test_groups_share_what_a_dense_sum_says():
     found = shared(grids)
     low, high = logit(np.array([LOWEST, HIGHEST]))
     m, kappa = np.meshgrid(
-        logistic(np.linspace(low, high, 121)), np.geomspace(3.0, 3000.0, 13), indexing="ij"
+        logistic(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
+        10.0 ** (np.log10(3.0) + (np.arange(120) + 0.5) / 40.0),
+        indexing="ij",
     )
     a, b = m * kappa, (1.0 - m) * kappa
     weight = np.prod([betabinom.pmf(n, n + k, a, b) for n, k in counts], axis=0)
@@ -225,6 +239,7 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
         assert rate["lower_95"] < rate["mean"] < rate["upper_95"]
     scenario = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
     assert scenario.transition.probability["3g"] == record["probability"]["3g"]["mean"]
+    assert scenario.truth.probability == {"2g": 0.05, "3g": 0.1}
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
     found = scenario.observation.standard_deviation
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
@@ -298,6 +313,33 @@ def test_true_rates_may_differ_from_those_believed(tmp_path):
         load_fleet(path)
 
 
+def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(grown, tmp_path):
+    fleet, folder = grown
+    (group,), (name,) = open_fleet(folder).values(), open_fleet(folder)
+    scenario, home = fleet.groups[0].scenarios[0], tmp_path / "groups" / name
+    knowledge = kept_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
+    for place, control in enumerate((1, 0)):
+        (home / str(place)).mkdir(parents=True)
+        always = BeliefPolicy(np.ones((1, 25)), np.array([control]))
+        keep_knowledge(home / str(place), replace(knowledge, policy=always))
+    table = scenario.portable().to_dict()
+    record = {"name": name, "files": ["a.fmu", "b.fmu"], "scenarios": [table, table]}
+    two = group.isel(twin=slice(2))
+    control = two["control_index"].values[:, -1]
+    np.testing.assert_array_equal(leaving(tmp_path, record, two), [control[0] != 1, control[1] != 0])
+
+
+def test_turns_that_were_not_flown_take_no_part_in_the_figures():
+    """Of an asset that ended behind its first turn, and of one that failed."""
+    nan, state = np.nan, np.zeros((3, 3, 1))
+    mean = np.array([[3.0, 1.0, 2.0], [4.0, nan, nan], [9.0, 9.0, nan]])
+    stored = {"status": [1, 3, 2], "early": [0, 1, 1], "delay": [nan, 2.0, nan], "credible": [0.5, 1.0, nan]}
+    found = Outcomes.of(stored | {"mean": mean[..., None], "state": state, "log_evidence": -mean})
+    assert (found.bias[0].value, found.evidence.value, found.credible.value) == (3.0, -3.0, 0.75)
+    assert found.rms[0].value == pytest.approx(np.sqrt((14.0 / 3.0 + 16.0) / 2.0))
+    assert (found.early.value, found.within.value) == (0.5, 1.0)
+
+
 def test_the_report_names_who_needs_attention(grown):
     fleet, folder = grown
     text = write_fleet_report(folder).read_text()
@@ -322,6 +364,8 @@ def test_the_report_names_who_needs_attention(grown):
     knowledge = kept_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
     model, policy = knowledge.model, knowledge.plan.control_index
     belief = np.eye(model.states.size)
+    always = replace(knowledge, policy=BeliefPolicy(np.ones((1, len(belief))), np.array([1])))
+    assert [attention(always, belief, control).tolist() for control in (1, 0)] == [[0.0] * 25, [1.0] * 25]
     found = attention(knowledge, belief, 1)
     assert (found[policy != 1] == 1.0).all()
     # By enumeration of whole lives: the damage moves under the control in force as long as it is kept.

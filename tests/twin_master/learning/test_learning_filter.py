@@ -208,13 +208,21 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
     return mean, np.sqrt(np.tensordot(share, (values - mean) ** 2, axes=weight.ndim))
 
 
-def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation):
+@pytest.mark.parametrize("other", [None, np.array([0.2, 0.7, 0.1])])
+def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation, other):
+    """Where the model does not decide alone, the belief about the state is `other`."""
     carried, seen, rewards = (
         [turn.carried for turn in turns],
         observations(),
         RewardModel(sensors(), *SETTINGS),
     )
-    filtered, smoothed = expectation.filtered(carried, seen), expectation.smoothed(carried, seen)
+    believed = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
+    if other is not None:
+        believed = (np.tile(other, (STEPS, 1)),) * 2
+    filtered, smoothed = (
+        of(carried, belief, seen)
+        for of, belief in zip((expectation.filtered, expectation.smoothed), believed, strict=True)
+    )
     value = sensors().value_per_draw
     whole = enumerated(STEPS)
     for t in range(STEPS):
@@ -222,6 +230,8 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
         for found, table, axis in ((filtered, until, t), (smoothed, whole, t)):
             others = tuple(n for n in range(table.ndim - 2) if n != axis)
             weight = table.sum(axis=(*others, table.ndim - 1))  # (S, E)
+            if other is not None:
+                weight *= (other / weight.sum(axis=1))[:, None]
             shown = value[:, :, CONTROLS[t]].swapaxes(0, 1)  # (S, E, G)
             mean, deviation = moments(shown, weight)
             np.testing.assert_allclose(found.mean[t], mean, atol=1e-8)
@@ -237,7 +247,7 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
 
 
 def test_predicted_follows_the_scenario_through_the_policy(turns, expectation):
-    found = expectation.predicted([turns[2].carried], 2)
+    found = expectation.predicted([turns[2].carried], [turns[2].filtered], 2)
     table = enumerated(3).sum(axis=(0, 1, 4))  # (S, E)
     table = table / table.sum()
     matrix, value = model().transition.matrix, sensors().value_per_draw
@@ -288,7 +298,9 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     assert (noise.lower, noise.upper) == pytest.approx(np.sqrt(squared.ppf([0.05, 0.95])))
     row = design[-1]
     rewards = RewardModel(sensor, 9.0, (0.0, 0.0), 0.8)
-    found = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]])).filtered(carried, seen[:, None])
+    found = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]])).filtered(
+        carried, [turn.filtered for turn in estimates], seen[:, None]
+    )
     spread = 0.5 * np.sqrt(scale2 * row @ covariance @ row)
     assert found.mean[-1, 0] == pytest.approx(shown[-1] + 0.5 * row @ mean)
     assert found.standard_deviation[-1, 0] == pytest.approx(spread)

@@ -25,7 +25,7 @@ ARRAYS = ("row", "control_index", "state", "filtered", "log_evidence")
 
 def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[Knowledge, StatelessAsset]:
     scenario = load_scenario(name).scenario
-    planner = scenario.planner.model_copy(update={"decide_on": decide_on})
+    planner = scenario.planner.model_copy(update={"decide_on": decide_on, "policy": "mode"})
     mission = scenario.mission.model_copy(update={"steps": 35})
     knowledge, source = of_library(name, library_file, planner=planner, mission=mission, notice=None)
     asset = source.open()
@@ -41,7 +41,12 @@ def same(first: Flights, second: Flights) -> bool:
 
 @pytest.mark.parametrize(
     ("name", "decide_on"),
-    [("level_turns", "filtered"), ("growing_damage", "predicted"), ("failing_gauges", "filtered")],
+    [
+        ("level_turns", "filtered"),
+        ("growing_damage", "predicted"),
+        ("failing_gauges", "filtered"),
+        ("inspected_wing", "predicted"),
+    ],
 )
 def test_each_twin_flies_what_it_flies_alone(name, decide_on, library_file):
     knowledge, asset = known(name, library_file, decide_on)

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from benchmarks.study_planning import PROBLEMS, tiger
-from twin_master.network.belief_planning import DecisionProblem, plan_on_belief, simulated_returns
-from twin_master.network.planner import value_iteration
+from twin_master.network import belief_planning
+from twin_master.network.belief_planning import (
+    DecisionProblem,
+    leaving_probability,
+    plan_on_belief,
+    simulated_returns,
+)
+from twin_master.network.planner import BeliefPolicy, value_iteration
 from twin_master.network.transition import TransitionModel
 
 
@@ -103,11 +109,31 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first):
     problem = drawn(6, 4, moves_first)
     plan = plan_on_belief(problem, gap=1e-3)
     rng = np.random.default_rng(0)
-    total = simulated_returns(problem, lambda belief, _turn: plan.policy.decide(belief), 4000, 40, rng)
+    total = simulated_returns(problem, lambda belief, *_: plan.policy.decide(belief), 4000, 40, rng)
     error = 4.0 * total.std() / np.sqrt(len(total))
     assert plan.lower - error <= total.mean() <= plan.upper + error
     known = value_iteration(problem.transition, problem.reward, problem.discount)
     assert plan.upper <= problem.prior @ known.value + 1e-9
+
+
+def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypatch):
+    monkeypatch.setattr(belief_planning, "LIVES", 4000)
+    problem, rng = drawn(8, 4, moves_first=False), np.random.default_rng(1)
+    policy = BeliefPolicy(
+        0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]]), np.array([1, 0, 2])
+    )
+
+    def leaves(belief: np.ndarray, turns: int) -> float:
+        if policy.decide(belief) != 1:
+            return 1.0
+        after = problem.following(belief, 1) if turns > 1 else np.zeros((0, 4))
+        return float(sum(row.sum() * leaves(row / row.sum(), turns - 1) for row in after))
+
+    beliefs = rng.dirichlet(np.ones(4), 5)
+    exact = [leaves(belief, 4) for belief in beliefs]
+    found = leaving_probability(problem, policy, beliefs, 1, 4, rng)
+    np.testing.assert_allclose(found, exact, atol=0.03)
+    assert sum(0.05 < value < 0.95 for value in exact) > 1
 
 
 def test_the_difference_of_two_rules_varies_little_from_mission_to_mission():
@@ -117,7 +143,7 @@ def test_the_difference_of_two_rules_varies_little_from_mission_to_mission():
     def returns(values: np.ndarray) -> np.ndarray:
         rng = np.random.default_rng(0)
         return simulated_returns(
-            problem, lambda belief, _turn: np.argmax(belief @ values, axis=1), 1000, 20, rng
+            problem, lambda belief, *_: np.argmax(belief @ values, axis=1), 1000, 20, rng
         )
 
     first, second = returns(known), returns(known + np.array([0.3, 0.0, 0.0]))

@@ -12,20 +12,22 @@ from matplotlib.figure import Figure
 
 from tests.conftest import synthetic_library
 from twin_master.assets.resolution import Overrides
+from twin_master.network.planner import BeliefPolicy
 from twin_master.report.reading import Run, read_run
 from twin_master.scenario.schema import Scenario
 from uav_twin import fly, load_scenario
 
 
-def flown(place: Path, **mission: int) -> Run:
+def flown(place: Path, policy: BeliefPolicy | None = None, **mission: int) -> Run:
     """Fly the paper's mission, of another length, with the wing of a strain library, and read the run."""
     loaded = load_scenario("paper_level_turns")
     section = loaded.scenario.mission.model_copy(update=mission)
     loaded = replace(loaded, scenario=loaded.scenario.model_copy(update={"mission": section}))
-    place.mkdir(parents=True)
+    place.mkdir(parents=True, exist_ok=True)
     library = place / "UAVconfig.json"
     library.write_text(json.dumps(synthetic_library()), encoding="utf-8")
-    return read_run(fly(loaded, place / "run", Overrides(strain_library=library), report=False).folder)
+    given = Overrides(strain_library=library)
+    return read_run(fly(loaded, place / "run", given, policy=policy, report=False).folder)
 
 
 def stored(run: Run, place: Path) -> Path:

@@ -205,7 +205,9 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     beginning.start()
     words = ("watch", scenario.path, "--observations", address(broker), "--out", watch.folder, "--turns", 1)
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")  # the first attempt fails, and the wish is kept
-    assert "refuses the twin" in command(*words, "--no-report", "--replace").stderr
+    failed = command(*words, "--no-report", "--replace").stderr
+    assert "refuses the twin" in failed
+    assert "Nothing was observed yet: once this is mended" in failed
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
     done = command(*words, "--no-report", "--resume")
     beginning.join()
