@@ -30,6 +30,8 @@ NOTICE_KINDS = ("alarm", "gauge_left_out")
 CREDIBILITY = 0.9
 """Probability of the set of states in which the true one is looked for."""
 _TOLERANCE = 1e-9
+WITHIN = 2
+"""Turns within which the fallback is to come."""
 
 FLOWN, FAILED, ENDED = 1, 2, 3
 """Values of `status`; 0 has not flown yet."""
@@ -108,7 +110,9 @@ def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float
         fallback = find_fallback(knowledge.model.states, plan.control_index, first, *course)
         early[twin] = fallback.early_step is not None
         if fallback.called_for_step is not None:
-            delay[twin] = np.inf if fallback.delay is None else fallback.delay
+            late = turns - fallback.called_for_step <= WITHIN  # so that nobody knows whether it would come
+            never = np.nan if late else np.inf
+            delay[twin] = never if fallback.delay is None else fallback.delay
     return delay, early
 
 

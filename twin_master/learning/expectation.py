@@ -208,6 +208,13 @@ def _believing(weight: Float, belief: Float) -> Float:
     return np.asarray(belief * np.divide(weight, own, out=apart, where=own > 0.0))
 
 
+def joined(parts: Sequence[Expected]) -> Expected:
+    """Return what is expected of turns one after the other."""
+    return Expected(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
+    )
+
+
 def stacked(parts: Iterable[Expected]) -> Expected:
     """Return what is expected of several turns, which become the leading axis."""
     found = [vars(part) for part in parts]

@@ -28,7 +28,7 @@ from reporting.errors import DamagedFileError, ReportingError
 from reporting.json_file import read_json
 from reporting.record_json import plain
 from twin_master.errors import RunFolderError, TwinMasterError
-from twin_master.learning.expectation import Expected, expected_of
+from twin_master.learning.expectation import Expected, expected_of, joined
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, kept_knowledge
 from twin_master.network.estimator import Learnt
@@ -212,8 +212,7 @@ class Flight:
         for turn, own, seen in zip(turns, joint, observed, strict=True):
             u = slice(turn["control_index"], turn["control_index"] + 1)
             parts.append(self.knowledge.expectation.of_marginals(_learnt(turn), own[None, :, u], u, seen))
-        together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
-        return Belief(joint.sum(axis=-1), Expected(**together), decided)
+        return Belief(joint.sum(axis=-1), joined(parts), decided)
 
     def predicted(self, turn: Record) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""

@@ -314,7 +314,7 @@ class Watch:
         first = max(0, turns - last)
         found, _ = replay(self._path, self.models, None, first_turn=first)
         flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
-        return MissionResult(self.scenario, self.models[-1].knowledge, flight)
+        return MissionResult(self.scenario, self.models[-1].knowledge, flight, models=self.models)
 
     def told(self, first: int) -> list[tuple[int, Notice]]:
         """Return what the operator was told in the turns from `first` on, each sentence once.
