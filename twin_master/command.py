@@ -6,30 +6,24 @@ import shlex
 import signal
 import sys
 import time
+import traceback
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
+from twin_master.fleet.command import engine_of, fly_and_show
+from twin_master.sentences import said
 from twin_master.viewer.command import shown
 
 if TYPE_CHECKING:
     from twin_master.scenario.schema import Scenario
-    from twin_master.watch.folder import Watch
-
-import traceback
-from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING
-
-from twin_master.fleet.command import engine_of, fly_and_show
-from twin_master.sentences import said
-
-if TYPE_CHECKING:
     from twin_master.store.writing import RunOutcome
+    from twin_master.watch.folder import Watch
 
 
 def run(

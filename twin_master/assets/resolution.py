@@ -1,13 +1,13 @@
 """What is flown: the scenario with the command line's overrides, and where its asset comes from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
-from reporting.toml_file import NotNegative, Number, checked, read_toml
+from reporting.toml_file import checked, read_toml
 from twin_master.assets.asset_source import AssetSource, PairedSource
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
@@ -16,7 +16,7 @@ from twin_master.network.memory import check_scenario_fits
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import PerSensor, Probability, Section
+from twin_master.scenario.section import Section
 from twin_master.sentences import said
 
 
@@ -47,6 +47,8 @@ class Overrides:
         SSP file to fly in the place of the scenario's asset.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
     seed: int | None = None
     fmu: Path | None = None
     binding: Path | None = None
@@ -65,15 +67,12 @@ def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
     Raises
     ------
     MissionInputError
-        A key is no such field.
+        A key is no such field, or holds no such thing.
     """
     if isinstance(given, Overrides):
         return given
-    values, known = dict(given or {}), [item.name for item in fields(Overrides)]
-    if unknown := [key for key in values if key not in known]:
-        raise MissionInputError(said("assets.overrides", known=", ".join(known), names=", ".join(unknown)))
-    paths = [item.name for item in fields(Overrides) if item.type == Path | None]
-    return Overrides(**values | {key: Path(values[key]) for key in paths if values.get(key) is not None})
+    where = "what differs from the scenario"
+    return checked(Overrides, dict(given or {}), where, MissionInputError, what="`Overrides`")
 
 
 def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
@@ -105,7 +104,8 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         apply_learnt(table, overrides.learnt, overrides.learnt_group)
     if overrides.seed is not None:
         table["mission"]["seed"] = overrides.seed
-    return parse_scenario(table, str(loaded.path))
+    beside = f" with {overrides.learnt}" if overrides.learnt else ""
+    return parse_scenario(table, f"{loaded.path}{beside}")
 
 
 def _check_overrides(overrides: Overrides, kind: str) -> None:
@@ -190,52 +190,16 @@ def believed_source(scenario: Scenario) -> AssetSource:
     return source
 
 
-class LearntTransition(Section):
-    """Probabilities to worsen, as in a scenario."""
-
-    probability: dict[str, Probability | dict[str, Probability]]
-
-
-class LearntObservation(Section):
-    """Noise of the sensors, as in a scenario."""
-
-    standard_deviation: PerSensor
-
-
-class LearntCalibration(Section):
-    """Distribution of the parameter over the assets: what a new one begins with."""
-
-    parameter: str
-    mean: Number
-    standard_deviation: NotNegative
-
-
-class LearntTables(Section):
-    """What takes the place of the tables of a scenario."""
-
-    transition: LearntTransition | None = None
-    observation: LearntObservation | None = None
-    calibration: LearntCalibration | None = None
-
-
-class LearntFile(LearntTables):
-    """A whole file: what holds for a new asset, and for each group that it was learnt from."""
+class LearntFile(Section):
+    """What takes the place of tables of a scenario: for a new asset, and for groups of assets."""
 
     format: Literal[1]
     source: dict[str, Any] = Field(default_factory=dict)
-    group: dict[str, LearntTables] = Field(default_factory=dict)
-
-
-def load_learnt(path: Path | str) -> LearntFile:
-    """Read a file that `uav-twin fleet learn` wrote.
-
-    Raises
-    ------
-    MissionInputError
-        It cannot be read, or is none.
-    """
-    table = read_toml(path, MissionInputError, what="file of what was learnt")
-    return checked(LearntFile, table, str(path), MissionInputError, what="a file of what was learnt")
+    transition: dict[str, Any] | None = None
+    observation: dict[str, Any] | None = None
+    calibration: dict[str, Any] | None = None
+    """Distribution of the parameter over the assets: what a new one begins with."""
+    group: dict[str, dict[str, dict[str, Any]]] = Field(default_factory=dict)
 
 
 def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) -> None:
@@ -255,22 +219,24 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
     MissionInputError
         The file is none, or is of other controls or another parameter.
     """
-    found = load_learnt(path)
-    learnt: LearntTables = found.group.get(group or "", found)
-    moves, given = table["transition"]["kind"], table["calibration"]
-    if learnt.transition is not None:
-        own, names = learnt.transition.probability, sorted(entry["name"] for entry in table["control"])
-        if sorted(own) != names or moves != "independent_worsening":
+    content = read_toml(path, MissionInputError, what="file of what was learnt")
+    found = checked(LearntFile, content, str(path), MissionInputError, what="a file of what was learnt")
+    learnt = found.group.get(
+        group or "", found.model_dump(include={"transition", "observation", "calibration"})
+    )
+    truth, given = table["truth"], table["calibration"]
+    if moves := learnt.get("transition"):
+        own, names = moves.get("probability", {}), sorted(entry["name"] for entry in table["control"])
+        kind = table["transition"]["kind"]
+        if sorted(own) != names or kind != "independent_worsening":
             both = {"own": own, "names": names}
-            raise MissionInputError(said("assets.learnt_controls", path=path, **both, kind=moves))
-        if table["truth"]["kind"] == "random_growth":
-            table["truth"]["probability"] = (
-                table["truth"]["probability"] or table["transition"]["probability"]
-            )
-    if learnt.calibration is not None and learnt.calibration.parameter != given["parameter"]:
-        of = learnt.calibration.parameter, given["parameter"]
-        raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))
-    anew = {"calibration": {"draws": given["draws"], "source": "normal", "file": given["file"]}}
-    for name in LearntTables.model_fields:
-        if (part := getattr(learnt, name)) is not None:
-            table[name] = anew.get(name, table[name]) | part.model_dump()
+            raise MissionInputError(said("assets.learnt_controls", path=path, **both, kind=kind))
+        if truth["kind"] == "random_growth":
+            truth["probability"] = truth["probability"] or table["transition"]["probability"]
+    if drawn := learnt.get("calibration"):
+        if drawn.get("parameter") != given["parameter"]:
+            of = drawn.get("parameter"), given["parameter"]
+            raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))
+        table["calibration"] = {"draws": given["draws"], "file": given["file"], "source": "normal"}
+    for name, part in learnt.items():
+        table[name] |= part or {}

@@ -25,7 +25,7 @@ from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.watch.growing import GrowingFile, Pipe, Place, first_line, found, holds, rotated
-from twin_master.watch.intake import MISSING, Feed
+from twin_master.watch.intake import GIVEN, MISSING, Feed
 from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 Observations = Iterable[Mapping[str, Any]] | str | Path
@@ -130,10 +130,7 @@ class CsvFeed(RecordedFeed):
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
         super().__init__(path, scenario, follow=follow)
         # A file that was begun a moment ago may have no header yet.
-        self._read_header(path, *(reversed(rotated(path)) if follow else ()))
-
-    def _read_header(self, *files: Path) -> None:
-        """Take the columns of the first of these files whose header is whole, or else of the first."""
+        files = [path, *(reversed(rotated(path)) if follow else ())]
         try:
             headers = [first_line(file) for file in files]
             names = _cells(next((line for line in headers if line.endswith(b"\n")), headers[0]))
@@ -162,8 +159,7 @@ class CsvFeed(RecordedFeed):
     def opened(self, place: Place | None) -> BinaryIO:
         """Return the file that a place is in, after its columns were taken."""
         file = super().opened(place)
-        with suppress(MissionInputError):
-            self._read_header(Path(file.name))
+        self.content(first_line(Path(file.name)), 0)
         return file
 
     def content(self, line: bytes, begin: int) -> Content | None:
@@ -252,26 +248,23 @@ class FolderFeed(RecordedFeed):
         if record is None and line.endswith(b"\n"):
             number = self.path.read_bytes()[:begin].count(b"\n") + 1
             return Refused(f"line {number} of {self.path.name} was changed or is damaged")
-        if record is None or not _came(record):
+        if record is None or "observed" not in record:
             return None
         try:
             observed, control = array_of(record["observed"]), int(record["control_index"])
-            turn = int(record.get("observation_turn", record["turn"]))
-        except (KeyError, TypeError, ValueError):
+            turn, told = int(record.get("observation_turn", record["turn"])), GIVEN
+            if "intake" in record:
+                told = int(record["intake"]["given"][turn - int(record["turn"]) - 1])
+        except (KeyError, TypeError, ValueError, IndexError):
             return Refused("the line has another layout")
+        if told == MISSING:  # a turn for which nothing came
+            return None
         count, width = self.scenario.observation.count, self.scenario.row_width
         if len(observed) not in (count, width) or control >= len(self.scenario.control):
             return Refused("it is of an asset with other sensors or controls")
         row = np.full(width, np.nan)  # it may have been recorded without covariances
         row[: len(observed)] = observed
-        return Message(row, control, turn=turn)
-
-
-def _came(record: Mapping[str, Any]) -> bool:
-    """Return whether a line of a journal is of something observed, not of a turn for which nothing came."""
-    given = record.get("intake", {}).get("given", "")
-    predicted = given.endswith(str(MISSING)) and record.get("observation_turn") == record.get("turn")
-    return "observed" in record and not predicted
+        return Message(row, control, turn=turn, assumed=told != GIVEN)
 
 
 def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFeed | RunFeed | FolderFeed:

@@ -37,8 +37,8 @@ REJECTED_KEPT = 10_000
 _TEXT_KEPT = 200
 SNAPSHOT_TURNS = 32
 """Turns between two lines of the journal that also hold the state of the twin."""
-MISSING, _ASSUMED, _GIVEN = 0, 1, 2
-"""Of a turn: not received; received; received with its control."""
+MISSING, _ASSUMED, GIVEN = 0, 1, 2
+"""Of a turn: not received; received with a control that was assumed and may be corrected; with its own."""
 
 
 class Feed:
@@ -205,6 +205,9 @@ class Intake:
             kept = lines[: self.counts.rejected] if again else lines  # those behind are read again
             kept = [line for line in kept if line.endswith("\n")]  # not cut off by a kill
             self._kept = len(kept)
+            untold = max(len(kept) - self.counts.rejected, 0)  # behind the last turn
+            self.counts.rejected += untold
+            self.counts.received += untold
             if kept != lines:
                 atomic_write_text(self._rejected, "".join(kept))
 
@@ -326,7 +329,8 @@ class Intake:
     def _sort(self, twin: Twin, message: Message) -> None:
         """Take in a message: the next turn, one ahead with the gap before it, or one that was before."""
         turn, most = self._turn_of(twin, message), self._section.longest_gap
-        ahead, given = turn - twin.turns, _ASSUMED if message.control is None else _GIVEN
+        ahead, told = turn - twin.turns, message.control is not None and not message.assumed
+        given = GIVEN if told else _ASSUMED
         if ahead > most:
             raise Refused(said("watch.ahead", turn=turn, ahead=ahead, next=twin.turns, most=most))
         if turn < twin.first_kept and ahead < 0:
@@ -341,7 +345,7 @@ class Intake:
         if not np.array_equal(before[both], message.observed[both]):
             raise Refused(f"it contradicts what was received of turn {turn} before")
         another = message.control not in (None, twin.control_of(turn))
-        if another and self._given[ahead] != MISSING:
+        if another and self._given[ahead] == GIVEN:
             raise Refused(f"it contradicts the control of turn {turn}")
         merged = np.where(np.isnan(before), message.observed, before)
         if not another and np.array_equal(merged, before, equal_nan=True):

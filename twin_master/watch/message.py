@@ -46,10 +46,13 @@ class Message(Reading):
         Its turn, if it says so.
     time : float or None
         Its time [s], if it says so.
+    assumed : bool
+        Whether its control was not told where it was recorded.
     """
 
     turn: int | None = None
     time: float | None = None
+    assumed: bool = False
 
 
 Fed = tuple[Message | Refused | None, str]

@@ -108,10 +108,11 @@ def motion(kind: Kind, ours: OurFmus) -> Shown:
     """The modal integrator: a release, loads that jump, health that changes on the way."""
     model, given = ours.model(kind.file), kind.parameters
     damping = [given.get(f"damping_{name}", model.damping[k]) for k, name in enumerate(("alpha", "beta"))]
-    now = ModalIntegrator(model, model.nominal, *damping)
-    tip, at_start = given.get("initial_tip_displacement", 0.0), model.load_coefficients(model.nominal)
+    begin = model.vector(dict(ChainMap(*kind.start.values())))
+    now = ModalIntegrator(model, begin, *damping)
+    tip, at_start = given.get("initial_tip_displacement", 0.0), model.load_coefficients(begin)
     state = now.released(tip, at_start, TIP_FORCE) if tip else now.at_rest(at_start)
-    health, shown = dict.fromkeys(model.regions, 0.0), []
+    health, shown = dict.fromkeys(model.regions, 0.0) | kind.start.get("health", {}), []
     for row in kind.rows:
         vector = model.vector(row)
         if health != (health := {name: row[name] for name in model.regions}):

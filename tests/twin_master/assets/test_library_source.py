@@ -18,6 +18,7 @@ from calibration.result.file import result_bytes
 from calibration.result.record import Calibration, ParameterPrior
 from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
+from reporting.progress import SilentProgress
 from scenarios import asset_scripts
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
@@ -30,12 +31,12 @@ from tests.twin_master.runs import (
     written,
 )
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
-from twin_master.assets.resolution import Overrides
+from twin_master.assets.resolution import Overrides, asset_source
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.library.grid import grid_of_scenario
 from twin_master.library.sampling import sample_library
 from twin_master.network.inference import known_control
-from twin_master.scenario.reading import LoadedScenario
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from uav_twin import fly, load_scenario, prepare_twin, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
@@ -259,6 +260,12 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
     assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
     flown = known.scenario.asset.source(known.scenario).parameters()
     assert flown == {"conductance": 6100.0, "specific_heat": pytest.approx(samples[:, 1].mean())}
+    for true, of in ((4000.0, "under other parameters"), (samples[:, 1].mean(), "")) * (way == "library"):
+        table = merged(known.scenario.to_dict(), {"asset": {"parameters": {"specific_heat": float(true)}}})
+        source = asset_source(parse_scenario(table, "exchanger"))
+        source.prepare(tmp_path / f"{true:g}", SilentProgress())
+        assert source.origin.model == f"observation library of it {of}".strip()
+        assert source.origin.differ == bool(of)
     draw, fouling, flow = np.meshgrid(
         known.draws.values, [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2], indexing="ij"
     )

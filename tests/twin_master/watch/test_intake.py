@@ -103,6 +103,8 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
     even = np.arange(24) % 2 == 0
     halves = [message(np.where(lost, np.nan, strains[50]), turn=50) for lost in (even, ~even)]
     assert same(watched(knowledge, [*parts, *halves])[0], expected)
+    halves[0] = halves[0].replace(b'"control": "3g", ', b"")  # the other one corrects what was assumed
+    assert same(watched(knowledge, [*parts, *halves])[0], expected)
 
 
 def test_what_was_refused_behind_the_last_turn_is_refused_once_when_it_is_read_again(knowledge, tmp_path):
@@ -116,8 +118,10 @@ def test_what_was_refused_behind_the_last_turn_is_refused_once_when_it_is_read_a
     whole = rejected.read_text()
     for cut in ("", '{"message": 7, "rea'):  # a kill may leave half a line
         rejected.write_text(whole + cut)
-        intake_of(knowledge, [], rejected).restore(json.loads(states[0]))  # a live one keeps all
+        live = intake_of(knowledge, [], rejected)
+        live.restore(json.loads(states[0]))  # it keeps all
         assert rejected.read_text() == whole
+        assert (live.counts.rejected, live.counts.received) == (3, 4)
         rejected.write_text(whole + cut)
         again = intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario))
         again.restore(json.loads(states[0]))

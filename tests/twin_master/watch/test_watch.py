@@ -175,17 +175,18 @@ def test_another_file_is_read_from_its_beginning(watch, mission, plain, tmp_path
     counts = ran(watch, CsvFeed(tmp_path / "1.csv", watch.scenario))
     assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 8, 2 + 1 + 7)
     counts = ran(watch, CsvFeed(plain, watch.scenario))
-    assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 13, 2 + 37)
+    assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 13, 2 + 1 + 7 + 37)
     assert belief_of(watch) == mission.filtered[-1].tolist()
 
 
 def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, plain, tmp_path):
-    """Into a gap, for which another control was assumed; each line says what was told."""
+    """Another control was assumed, for a gap and with one gauge alone; each line says what was told."""
     controls = mission.control_index.copy()
-    controls[20] = 1 - controls[20]
+    controls[[20, 30]] = 1 - controls[[20, 30]]
     header, *rows = write_csv(tmp_path / "m.csv", mission.observed, controls).read_text().split()
+    part = f"30,,{rows[30].split(',')[2]}{',' * 23}"  # one gauge, and no control
     (tmp_path / "late.csv").write_text(
-        "\n".join([header, *rows[:20], *rows[21:25], rows[20], *rows[25:], ""])
+        "\n".join([header, *rows[:20], *rows[21:25], rows[20], *rows[25:30], part, *rows[30:], ""])
     )
     first, second = begun(base, tmp_path / "first"), begun(base, tmp_path / "second")
     for watch, source, stops in (
@@ -193,7 +194,7 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
         (second, first.folder, (22, 23, None)),
     ):
         counts = ran(watch, file_feed(source, watch.scenario), *stops)
-        assert (counts.late, counts.rejected, counts.missing) == (1, 0, 0)
+        assert (counts.late, counts.rejected, counts.missing) == (2, 0, 0)
     assert belief_of(second) == belief_of(first)
     late = [*rows[:20], *rows[21:25], rows[20], rows[25].replace(",", ",,", 1), *rows[26:30], rows[25]]
     (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
