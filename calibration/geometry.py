@@ -135,7 +135,7 @@ def read_lengths(path: Path) -> Lengths:
     if lost:
         lacks = " and ".join(lost)
         raise ExperimentFileError(said("geometry.no_row", table=table, lacks=lacks, known=PUBLISHED_NAMES))
-    lengths = {column: table.positive_numbers(column, _USER) for column in ("designed", "manufactured")}
+    lengths = {column: table.numbers(column, _USER, positive=True) for column in ("designed", "manufactured")}
     for column, values in lengths.items():
         for row in np.flatnonzero(values < 10.0):
             where = f"{table.name}, line {table.lines[row]}: {column}"

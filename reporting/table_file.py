@@ -82,7 +82,9 @@ class TextTable:
             raise self.errors.layout(lacks)
         return self.columns[column]
 
-    def numbers(self, column: str, needed_by: str, *, empty_allowed: bool = False) -> FloatArray:
+    def numbers(
+        self, column: str, needed_by: str, *, empty_allowed: bool = False, positive: bool = False
+    ) -> FloatArray:
         """Return a column as numbers; NaN stands for an empty cell where it is allowed.
 
         Raises
@@ -90,47 +92,25 @@ class TextTable:
         errors.layout
             There is no such column, or a cell is no number.
         errors.value
-            A cell is NaN or infinite.
+            A cell is NaN or infinite, or where they must be `positive` zero or less.
         """
-        cells = self.cells(column, needed_by)
-        return np.array(
-            [
-                np.nan if empty_allowed and not cell else self.number(column, row, empty_allowed)
-                for row, cell in enumerate(cells)
-            ]
-        )
-
-    def positive_numbers(self, column: str, needed_by: str) -> FloatArray:
-        """Return a column as positive numbers; errors as `numbers`, and `errors.value` for another."""
-        return np.array(
-            [self.positive_number(column, row) for row, _ in enumerate(self.cells(column, needed_by))]
-        )
-
-    def positive_number(self, column: str, row: int) -> float:
-        """Return a cell as a positive number; rows count from 0, errors as `positive_numbers`."""
-        value = self.number(column, row)
-        if value <= 0.0:
-            place, cell = self._place(column, row), self.columns[column][row]
-            raise self.errors.value(said("table.not_positive", place=place, cell=cell))
-        return value
-
-    def number(self, column: str, row: int, empty_allowed: bool = False) -> float:
-        """Return a cell as a number; rows count from 0, errors as `numbers`."""
-        cell = self.columns[column][row]
-        try:
-            value = plain_number(cell)
-        except ValueError:
-            came = repr(cell) if cell else "nothing"
-            place = self._place(column, row)
-            raise self.errors.layout(said("table.no_number", place=place, came=came)) from None
-        if not isfinite(value):
-            remedy = (
-                "; leave the cell of a reading empty that is to be left out"
-                if empty_allowed
-                else ", and a finite number is needed"
-            )
-            raise self.errors.value(f"{self._place(column, row)} holds {cell}{remedy}.")
-        return value
+        found = np.full(len(self), np.nan)
+        remedy = "; leave the cell of a reading empty that is to be left out"
+        for row, cell in enumerate(self.cells(column, needed_by)):
+            if empty_allowed and not cell:
+                continue
+            try:
+                found[row] = value = plain_number(cell)
+            except ValueError:
+                place, came = self._place(column, row), repr(cell) if cell else "nothing"
+                raise self.errors.layout(said("table.no_number", place=place, came=came)) from None
+            if not isfinite(value):
+                advice = remedy if empty_allowed else ", and a finite number is needed"
+                raise self.errors.value(f"{self._place(column, row)} holds {cell}{advice}.")
+            if positive and value <= 0.0:
+                place = self._place(column, row)
+                raise self.errors.value(said("table.not_positive", place=place, cell=cell))
+        return found
 
     def _place(self, column: str, row: int) -> str:
         return f"{self.name}, line {self.lines[row]}: column {column!r}"

@@ -1,7 +1,5 @@
 """`uav-twin calibrate`, all three steps of a wing in order, and `ringdown`, `simulate` and `campaign`."""
 
-import csv
-import io
 import json as json_text
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -13,6 +11,7 @@ import typer
 from fe.runtime.state import DigitalState
 from reporting import terminal
 from reporting.files import atomic_write_text, refuse_filled
+from reporting.table_file import table_text
 from uav_twin import parts
 from uav_twin.discrepancy_run import one_thread
 from uav_twin.options import show
@@ -140,24 +139,14 @@ def calibrate_ringdown(
     trials = parts.fit_trials(parts.read_records(data), free=fitted, start=start)
     if extremes:
         trials = parts.refine_by_extremes(trials)
-    frequencies, ratios = parts.PUBLISHED_FREQUENCIES, parts.PUBLISHED_DAMPING_RATIOS
+    kinds: tuple[tuple[str, str, Literal["frequency", "damping_ratio"], Any], ...] = (
+        ("natural frequency", "Hz", "frequency", parts.PUBLISHED_FREQUENCIES),
+        ("damping ratio", "1", "damping_ratio", parts.PUBLISHED_DAMPING_RATIOS),
+    )
     rows = [
-        row
+        (f"mode {mode + 1}, {what}", unit, *parts.average(trials, name, mode), paper[mode])
         for mode in (0, 1)
-        for row in (
-            (
-                f"mode {mode + 1}, natural frequency",
-                "Hz",
-                *parts.average(trials, "frequency", mode),
-                frequencies[mode],
-            ),
-            (
-                f"mode {mode + 1}, damping ratio",
-                "1",
-                *parts.average(trials, "damping_ratio", mode),
-                ratios[mode],
-            ),
-        )
+        for what, unit, name, paper in kinds
     ]
     headings = ("figure", "unit", "found", "between trials", "standard error", "paper")
     printed, written = (
@@ -166,9 +155,8 @@ def calibrate_ringdown(
     )
     terminal.print_table(headings, printed)
     if out is not None:
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows((headings, *written))
-        atomic_write_text(out / "ringdown.csv", text.getvalue())
+        columns = zip(*written, strict=True)
+        atomic_write_text(out / "ringdown.csv", table_text(dict(zip(headings, columns, strict=True))))
         parts.save_figure(parts.ring_down_figure(trials), out / "figures", "ringdown")
 
 

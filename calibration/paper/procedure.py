@@ -129,7 +129,9 @@ def read_published_results(path: Path) -> PaperSamples:
         If a value is not positive and finite.
     """
     table = lab_table(path, STEP_FOLDER / RESULTS_FILE)
-    columns = np.array([table.positive_numbers(name, "the authors' step 3") for name in _RESULT_COLUMNS])
+    columns = np.array(
+        [table.numbers(name, "the authors' step 3", positive=True) for name in _RESULT_COLUMNS]
+    )
     first, second = columns[5:7, 0].tolist()
     pairs = columns[3:5].T
     damping = [damping_coefficients((f1, f2), (first, second)) for f1, f2 in pairs.tolist()]

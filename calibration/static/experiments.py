@@ -132,7 +132,9 @@ def read_measurements(path: Path) -> LoadDisplacementData:
         If a value is not positive and finite, or load over displacement shows other units.
     """
     table = lab_table(path, MEASUREMENTS_FILE)
-    load, displacement = (table.positive_numbers(name, "a load test") for name in ("load", "displacement"))
+    load, displacement = (
+        table.numbers(name, "a load test", positive=True) for name in ("load", "displacement")
+    )
     _refuse_other_units(table.name, load, displacement)
     run = np.concatenate([[0], np.cumsum(np.diff(load) < 0.0)])
     rest = [table.columns[name] for name in table.columns if name not in ("load", "displacement")]

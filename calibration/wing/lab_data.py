@@ -103,7 +103,9 @@ def read_weighed_mass(file: Path) -> Reading:
     table = lab_table(file, WEIGHED_MASS_FILE)
     if len(table) != 1:
         raise ExperimentFileError(said("readings.mass", file=file, came=len(table)))
-    mass, deviation = (float(table.positive_numbers(name, "a weighing")[0]) for name in _WEIGHED_COLUMNS)
+    mass, deviation = (
+        float(table.numbers(name, "a weighing", positive=True)[0]) for name in _WEIGHED_COLUMNS
+    )
     for wrong, unit in ((mass < 10.0, "kg"), (mass > 1e5, "mg")):
         if wrong:
             raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like {unit}: give it in g.")

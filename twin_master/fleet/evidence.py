@@ -5,13 +5,13 @@ in any order, shard by shard. What the twins decided takes no part, for they dec
 """
 
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 
 from fe.compilation import compiled
-from reporting.arrays import Float, Index, Unsigned
+from reporting.arrays import Float, Index
 from twin_master.errors import FleetError
+from twin_master.network.kernels import Lists, apply_blocks
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model, factor_tables
@@ -20,48 +20,37 @@ from twin_master.scenario.schema import Scenario
 
 @compiled
 def _on_points(
-    prior: Float,
-    start: Unsigned,
-    source: Unsigned,
-    probability: Float,
-    control: Index,
-    likelihood: Float,
-    result: Float,
+    prior: Float, lists: Lists, probability: Float, control: Index, likelihood: Float, result: Float
 ) -> None:
     """Fill result (B, P) with the log evidence of B twins for probabilities (P, non-zeros) of P points.
 
     The likelihood (B, T, S) is scaled so that the largest of a row is 1.
     """
     twins, steps, size = likelihood.shape
-    belief, following = np.empty(size), np.empty(size)
+    levels, first_row, start, source, _, _ = lists
+    belief, work = np.empty(size), np.empty(size)
     for twin in range(twins):
         for point in range(len(probability)):
-            belief[:] = prior
-            result[twin, point] = 0.0
+            own = levels, first_row, start, source, probability[point], probability[point]
+            belief[:], result[twin, point] = prior, 0.0
             for t in range(steps):
+                if t > 0:
+                    apply_blocks(own, control[twin, t - 1], belief, belief, work)
                 total = 0.0
                 for state in range(size):
-                    value = belief[state]
-                    if t > 0:
-                        row = control[twin, t - 1] * size + state
-                        value = 0.0
-                        for k in range(start[row], start[row + 1]):
-                            value += belief[source[k]] * probability[point, k]
-                    following[state] = value * likelihood[twin, t, state]
-                    total += following[state]
+                    belief[state] *= likelihood[twin, t, state]
+                    total += belief[state]
                 if total <= 0.0:
                     result[twin, point] = -np.inf
                     break
                 result[twin, point] += np.log(total)
                 for state in range(size):
-                    belief[state] = following[state] / total
+                    belief[state] /= total
 
 
 @dataclass(frozen=True)
 class Worsening:
     """The K probabilities to worsen of a scenario, and what its transitions make of them.
-
-    An entry of the joint table is a product over the factors of the state, each linear in its probability.
 
     Attributes
     ----------
@@ -69,19 +58,21 @@ class Worsening:
         One for each probability: the control, and the factor where each has its own.
     assumed : (K,)
         What the scenario assumes.
-    start, source
-        Of the predecessor lists of all states.
-    factors : for each factor of the state
-        For each entry (non-zeros,) the number of its probability p, and what it is where p is 0, and 1.
+    lists : Lists
+        Predecessors of the levels of each factor of the state.
+    place : (non-zeros,)
+        Number of the probability of each entry of the lists, which is linear in it.
+    ends : (2, non-zeros)
+        The entry where its probability is 0, and 1.
     prior : (S,)
         p(D_0).
     """
 
     names: tuple[str, ...]
     assumed: Float
-    start: Unsigned
-    source: Unsigned
-    factors: tuple[tuple[Index, Float, Float], ...]
+    lists: Lists
+    place: Index
+    ends: Float
     prior: Float
 
     @classmethod
@@ -95,41 +86,39 @@ class Worsening:
         """
         if scenario.transition.kind != "independent_worsening":
             raise FleetError("probabilities are learnt of transitions of the kind `independent_worsening`.")
-        given, keys, assumed = scenario.transition.probability, [], []
-        for control in scenario.control_names:
-            entry = given[control]
-            named = entry if isinstance(entry, dict) else {None: entry}
-            keys += [(control, name) for name in named]
-            assumed += list(named.values())
+        given = scenario.transition.probability
+        each = {c: entry if isinstance(entry, dict) else {"": entry} for c, entry in given.items()}
+        assumed = {(c, name): value for c in scenario.control_names for name, value in each[c].items()}
 
-        def at(probability: float) -> Scenario:
+        def lists_at(probability: float) -> Lists:
             same = {"probability": dict.fromkeys(scenario.control_names, probability)}
             transition = scenario.transition.model_copy(update=same)
-            return scenario.model_copy(update={"transition": transition})
+            tables = factor_tables(scenario.model_copy(update={"transition": transition}))
+            return predecessor_lists(
+                [np.stack([rows[name] for rows in tables.values()]) for name in scenario.state_names]
+            )
 
-        model = build_graphical_model(at(0.5))
-        _, _, start, source, *_ = predecessor_lists([model.transition.matrix])
-        shape, size = model.states.shape, model.states.size
-        row = np.repeat(np.arange(len(start) - 1), (start[1:] - start[:-1]).astype(np.int64))
-        in_force, to = np.divmod(row, size)
-        before, after = np.unravel_index(source.astype(np.int64), shape), np.unravel_index(to, shape)
-
-        never, always = factor_tables(at(0.0)), factor_tables(at(1.0))
-        factors = []
-        for name, *ends in zip(scenario.state_names, before, after, strict=True):
-            own = [(control, name) if (control, name) in keys else (control, None) for control in never]
-            limits = [
-                np.stack([tables[control][name] for control in never])[in_force, *ends]
-                for tables in (never, always)
+        lists, other, keys = lists_at(0.25), lists_at(0.75), [*assumed]
+        rows = np.array(
+            [
+                keys.index((control, name if name in each[control] else ""))
+                for name, levels in zip(scenario.state_names, lists[0].tolist(), strict=True)
+                for control in scenario.control_names
+                for _ in range(levels)
             ]
-            factors.append((np.array([keys.index(key) for key in own])[in_force], *limits))
-        names = tuple(control if name is None else f"{control}, {name}" for control, name in keys)
-        return cls(names, np.array(assumed), start, source, tuple(factors), model.prior)
+        )
+        count = (lists[2][1:] - lists[2][:-1]).astype(np.int64)
+        slope = 2.0 * (other[4] - lists[4])
+        return cls(
+            tuple(f"{control}, {name}" if name else control for control, name in keys),
+            np.array([*assumed.values()]), lists, np.repeat(rows, count),
+            lists[4] + slope * [[-0.25], [0.75]], build_graphical_model(scenario).prior,
+        )  # fmt: skip
 
     def probability(self, points: Float) -> Float:
         """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""
-        shares = (never + points[:, k] * (always - never) for k, never, always in self.factors)
-        return np.asarray(reduce(np.multiply, shares))
+        share = points[:, self.place]
+        return np.asarray((1.0 - share) * self.ends[0] + share * self.ends[1])
 
 
 def scaled_likelihood(model: GaussianSensorModel, observed: Float, control: Index) -> tuple[Float, Float]:
@@ -164,10 +153,7 @@ def transition_evidence(worsening: Worsening, points: Float, likelihood: Float, 
         Controls in force.
     """
     result = np.empty((len(control), len(points)))
-    _on_points(
-        worsening.prior, worsening.start, worsening.source, worsening.probability(points), control,
-        likelihood, result,
-    )  # fmt: skip
+    _on_points(worsening.prior, worsening.lists, worsening.probability(points), control, likelihood, result)
     return result
 
 

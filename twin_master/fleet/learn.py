@@ -3,10 +3,10 @@
 For people, and as `learnt.toml`, with which a scenario is flown.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,15 +19,17 @@ from reporting.words import counted
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
-from twin_master.fleet.flight import GROUPS, fleet_config, source_of
+from twin_master.fleet.flight import fleet_config, source_of
 from twin_master.fleet.posterior import POINTS, Grid, Line, masses, narrowed, population, refined, shared
-from twin_master.fleet.reading import noticed
-from twin_master.fleet.store import has_flown, open_group
-from twin_master.mission.preparation import Knowledge, kept_knowledge
+from twin_master.fleet.reading import Known, known_twins, noticed
+from twin_master.fleet.store import open_group
+from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
-from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 NOISE_TWINS = 100
 """Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""
@@ -44,23 +46,30 @@ class _Lessons:
 
     Attributes
     ----------
-    name : str
     worsening : Worsening
         The probabilities and what was assumed of them.
     grid : Grid
         Their likelihood.
-    flown : frozenset of str
+    flown : set of str
         The controls under which a turn was followed by another.
-    counts, figures : dict
-        Of the record, before and behind the probabilities.
+    record : dict
+        Of the group, but for the probabilities.
     """
 
-    name: str
     worsening: Worsening
     grid: Grid
-    flown: frozenset[str]
-    counts: dict[str, int]
-    figures: dict[str, Any]
+    flown: set[str]
+    record: dict[str, Any]
+
+    def told(self, lines: Sequence[Line], flown: set[str]) -> dict[str, Any]:
+        """Return the record, with the posteriors of the probabilities, and the controls that have flown."""
+        told = zip(self.worsening.names, self.worsening.assumed.tolist(), lines, strict=True)
+        return self.record | {
+            "probability": {
+                name: {"assumed": assumed, "flown": name.partition(", ")[0] in flown, **line.figures}
+                for name, assumed, line in told
+            }
+        }
 
 
 def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
@@ -75,36 +84,28 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     """
     folder, progress = Path(folder), progress or SilentProgress()
     config = fleet_config(folder)
-    records = config["fleet"]["groups"]
-    found = []
+    records, found = config["fleet"]["groups"], dict[str, _Lessons]()
     with progress.stage("Learning", total=len(records), unit="groups") as stage:
         for record in records:
-            if parts := list(_seen(folder, record)):
-                found.append(_lessons(record["name"], parts))
+            group = open_group(folder, record["name"])
+            if parts := list(known_twins(folder, record, group)):
+                found[record["name"]] = _lessons(record, group, parts)
             stage.advance()
     if not found:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
-    names = found[0].worsening.names
-    alike = {lessons.worsening.names for lessons in found} == {names} and len(names) <= 2
-    together = shared([lessons.grid for lessons in found]) if alike and len(found) > 1 else None
-    lines = [lessons.grid.marginals for lessons in found] if together is None else together.groups
-    everywhere = {control for lessons in found if together is not None for control in lessons.flown}
-    groups = {}
-    for lessons, own in zip(found, lines, strict=True):
-        told = zip(lessons.worsening.names, lessons.worsening.assumed.tolist(), own, strict=True)
-        probability = {
-            name: {
-                "assumed": assumed,
-                "flown": name.partition(", ")[0] in lessons.flown | everywhere,
-                **line.figures,
-            }
-            for name, assumed, line in told
-        }
-        groups[lessons.name] = {**lessons.counts, "probability": probability, **lessons.figures}
+    together, names = None, next(iter(found.values())).worsening.names
+    if len(found) > 1 and len(names) <= 2 and {each.worsening.names for each in found.values()} == {names}:
+        together = shared([lessons.grid for lessons in found.values()])
+    lines = [lessons.grid.marginals for lessons in found.values()] if together is None else together.groups
+    everywhere = set().union(*(lessons.flown for lessons in found.values() if together is not None))
+    groups = {
+        name: lessons.told(own, lessons.flown | everywhere)
+        for (name, lessons), own in zip(found.items(), lines, strict=True)
+    }
     source = {
         "fleet": config["fleet"]["name"],
         "seed": config["fleet"]["seed"],
-        "twins": sum(lessons.counts["twins"] for lessons in found),
+        "twins": sum(group["twins"] for group in groups.values()),
         "config": hash_record({key: config[key] for key in ("kind", "format", "fleet")}),
         "program": config["provenance"]["versions"].get("uav-twin", ""),
     }
@@ -122,82 +123,50 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     return result
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What some twins of a group saw, what they knew, and under which controls turns were followed."""
-
-    knowledge: Knowledge
-    observed: Float
-    control: Index
-    folder: Path
-    real: bool
-    flown: frozenset[str]
-    alarmed: int
+Seen = tuple[Knowledge, Float, Index]
+"""What twins know, what they saw (B, T, G + I), and the control in force (B, T)."""
 
 
-def _lessons(name: str, parts: list[_Seen]) -> _Lessons:
+def _lessons(record: dict[str, Any], group: "xr.Dataset", parts: Sequence[Known]) -> _Lessons:
     """Learn the noise first, for what else is learnt rests on it, then the rates, then the population."""
-    worsening = Worsening.of(parts[0].knowledge.scenario)
+    _, home, known = parts[0]
+    worsening, controls = Worsening.of(known.scenario), known.scenario.control_names
     if (count := len(worsening.names)) > max(POINTS):
-        raise FleetError(said("fleet.probabilities", group=name, count=count, most=max(POINTS)))
-    nodes = _nodes(parts)
-    noise = _noise(parts[0], worsening, nodes)
-    seen = []
-    for part in parts:
-        model = _noisier(part.knowledge.sensor_model, noise.mean)
-        likelihood = scaled_likelihood(model, part.observed, part.control)[0]
-        evidence = transition_evidence(worsening, _possible(worsening)[None], likelihood, part.control)
+        raise FleetError(said("fleet.probabilities", group=record["name"], count=count, most=max(POINTS)))
+    given = group["control_index"].values.astype(np.int64)
+    # Behind the end of a recording nothing is observed, so that any control says the same.
+    observed, control = group["observed"].values.astype(np.float64), np.maximum(given, 0)
+    seen: list[Seen] = [(knowledge, observed[rows], control[rows]) for rows, _, knowledge in parts]
+    nodes = _nodes(home, known, real="recordings" in record) if len(parts) == 1 else None
+    noise = _noise(seen, worsening, nodes)
+    likely = []
+    for knowledge, shown, in_force in seen:
+        likelihood = scaled_likelihood(_noisier(knowledge.sensor_model, noise.mean), shown, in_force)[0]
+        evidence = transition_evidence(worsening, _possible(worsening)[None], likelihood, in_force)
         explained = np.isfinite(evidence[:, 0])
-        seen.append((likelihood[explained], part.control[explained]))
-    twins = sum(len(control) for _, control in seen)
+        likely.append((likelihood[explained], in_force[explained]))
+    twins = sum(len(in_force) for _, in_force in likely)
     if not twins:
-        raise FleetError(said("fleet.unexplained", group=name))
+        raise FleetError(said("fleet.unexplained", group=record["name"]))
 
     def log_likelihood(points: Float) -> Float:
-        return np.asarray(sum(transition_evidence(worsening, points, *some).sum(axis=0) for some in seen))
+        return np.asarray(sum(transition_evidence(worsening, points, *some).sum(axis=0) for some in likely))
 
-    grid = refined(log_likelihood, count)
-    figures: dict[str, Any] = {"noise_factor": noise.figures}
+    grid, rows = refined(log_likelihood, count), np.concatenate([rows for rows, *_ in parts])
+    alarmed = int(np.sum(noticed(group, "alarm")[rows] > 0))
+    told = {"twins": twins, "left_out": len(rows) - twins, "alarmed": alarmed, "noise_factor": noise.figures}
     if nodes is not None:
         learnt = np.array([marginal.mean for marginal in grid.marginals])
-        at_nodes = _noisier(parts[0].knowledge.sensor_model, noise.mean, nodes)
-        each = node_evidence(worsening, learnt, at_nodes, parts[0].observed, parts[0].control)
-        draws = parts[0].knowledge.draws
-        mean, spread = population(nodes.values, each, draws.standard_deviation)
-        figures["population"] = {"parameter": draws.name, "mean": mean.figures, "spread": spread.figures}
-    left_out = sum(len(part.control) for part in parts) - twins
-    counts = {"twins": twins, "left_out": left_out, "alarmed": sum(part.alarmed for part in parts)}
-    return _Lessons(
-        name, worsening, grid, frozenset().union(*(part.flown for part in parts)), counts, figures
-    )
+        each = node_evidence(worsening, learnt, _noisier(known.sensor_model, noise.mean, nodes), *seen[0][1:])
+        mean, spread = population(nodes.values, each, known.draws.standard_deviation)
+        told["population"] = {"parameter": known.draws.name, "mean": mean.figures, "spread": spread.figures}
+    followed = np.unique(given[rows, :-1][given[rows, 1:] >= 0])
+    return _Lessons(worsening, grid, {controls[index] for index in followed}, told)
 
 
 def _possible(worsening: Worsening) -> Float:
     """Return what is assumed, so that any worsening may happen."""
     return worsening.assumed.clip(1e-3, 0.9)
-
-
-def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
-    """Yield the twins of a group that flew, those together that share what they know."""
-    group = open_group(folder, record["name"])
-    flown = has_flown(group["status"].values)
-    alarmed = noticed(group, "alarm")[flown] > 0
-    observed = group["observed"].values[flown].astype(np.float64)
-    # Behind the end of a recording nothing is observed, so that any control says the same.
-    given = group["control_index"].values[flown].astype(np.int64)
-    for place, table in enumerate(record["scenarios"]):
-        own = folder / GROUPS / record["name"]
-        mine = np.arange(len(flown))
-        if record["files"]:
-            own, mine = own / str(place), np.flatnonzero(flown == place)
-        if len(mine):
-            scenario = Scenario.model_validate(table).moved(own)
-            followed = np.unique(given[mine][:, :-1][given[mine][:, 1:] >= 0])
-            yield _Seen(
-                kept_knowledge(own, scenario), observed[mine], np.maximum(given[mine], 0), own,
-                "recordings" in record, frozenset(scenario.control_names[index] for index in followed),
-                int(alarmed[mine].sum()),
-            )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -209,18 +178,18 @@ class _Nodes:
     predicted: Float
 
 
-def _nodes(parts: list[_Seen]) -> _Nodes | None:
+def _nodes(folder: Path, known: Knowledge, *, real: bool) -> _Nodes | None:
     """Return values of the parameter about its calibration; None where it is fixed, or no model tells."""
-    draws, model = parts[0].knowledge.draws, parts[0].knowledge.model
-    if draws.standard_deviation <= 0.0 or len(parts) > 1:
+    draws = known.draws
+    if draws.standard_deviation <= 0.0:
         return None
     deviations = np.linspace(-NODE_DEVIATIONS, NODE_DEVIATIONS, NODES)
     values = draws.mean + draws.standard_deviation * deviations
     prior = np.exp(-0.5 * deviations**2)
-    source = source_of(parts[0].knowledge.scenario, real=parts[0].real)
-    source.prepare(parts[0].folder, SilentProgress())
+    source = source_of(known.scenario, real=real)
+    source.prepare(folder, SilentProgress())
     given = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
-    predicted = source.observation_table(given, model)
+    predicted = source.observation_table(given, known.model)
     if len(predicted) != NODES:  # a library has draws of its own
         return None
     return _Nodes(values, prior / prior.sum(), predicted)
@@ -238,31 +207,34 @@ def _noisier(model: GaussianSensorModel, factor: float, nodes: _Nodes | None = N
     )
 
 
-def _noise(part: _Seen, worsening: Worsening, nodes: _Nodes | None) -> Line:
+def _noise(seen: Sequence[Seen], worsening: Worsening, nodes: _Nodes | None) -> Line:
     """Return the posterior of the factor on the assumed noise, uniform in its logarithm before the data.
 
     The parameter of an asset is the same in all its turns: a twin that draws it anew in each takes a part of
     the noise for it.
     """
-    observed, control = part.observed[:NOISE_TWINS], part.control[:NOISE_TWINS]
     assumed = _possible(worsening)
-
-    def log_density(axes: tuple[Float, ...]) -> Float:
-        return np.array([log_likelihood(float(factor)) for factor in np.exp(axes[0])])
+    some = [(one, shown[:NOISE_TWINS], control[:NOISE_TWINS]) for one, shown, control in seen[:NOISE_TWINS]]
 
     def log_likelihood(factor: float) -> float:
-        model = _noisier(part.knowledge.sensor_model, factor, nodes)
-        if nodes is None:
-            scaled, common = scaled_likelihood(model, observed, control)
-            evidence = transition_evidence(worsening, assumed[None], scaled, control)[:, 0] + common
-        else:
-            each = node_evidence(worsening, assumed, model, observed, control)
-            best = each.max(axis=1, keepdims=True)
-            evidence = best[:, 0] + np.log(np.exp(each - best) @ nodes.prior)
-        return float(evidence[np.isfinite(evidence)].sum())
+        total = 0.0
+        for knowledge, observed, control in some:
+            model = _noisier(knowledge.sensor_model, factor, nodes)
+            if nodes is None:
+                scaled, common = scaled_likelihood(model, observed, control)
+                evidence = transition_evidence(worsening, assumed[None], scaled, control)[:, 0] + common
+            else:
+                each = node_evidence(worsening, assumed, model, observed, control)
+                best = each.max(axis=1, keepdims=True)
+                evidence = best[:, 0] + np.log(np.exp(each - best) @ nodes.prior)
+            total += float(evidence[np.isfinite(evidence)].sum())
+        return total
 
     bound = np.log(LARGEST_NOISE)
-    (axis,), found = narrowed(log_density, (np.linspace(-bound, bound, NOISE_POINTS),))
+    (axis,), found = narrowed(
+        lambda axes: np.array([log_likelihood(float(factor)) for factor in np.exp(axes[0])]),
+        (np.linspace(-bound, bound, NOISE_POINTS),),
+    )
     return Line(axis, masses(found), np.exp)
 
 

@@ -1,6 +1,6 @@
 """What stands in the store of a fleet, as figures with their errors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from twin_master.fleet.flight import GROUPS, fleet_config
-from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, has_flown, open_group
+from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, WITHIN, has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.belief_planning import leaving_probability
 from twin_master.scenario.schema import Scenario
@@ -18,10 +18,6 @@ from twin_master.seeds import generator
 
 if TYPE_CHECKING:
     import xarray as xr
-
-
-WITHIN = 2
-"""Turns within which the fallback is to come."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,8 @@ class Outcomes:
     Attributes
     ----------
     within : Estimated
-        Share of the called-for fallbacks that came within `WITHIN` steps; NaN without any.
+        Share of the called-for fallbacks that came within `WITHIN` steps, as far as these were flown; NaN
+        without any.
     early : Estimated
         Share of missions with a fallback before the damage could be seen.
     rms, bias : tuple of Estimated
@@ -61,18 +58,19 @@ class Outcomes:
 
     @classmethod
     def of(cls, stored: Mapping[Any, Any]) -> "Outcomes":
-        """Return those of the twins that flew to their end, from the variables of the store."""
-        flown = np.flatnonzero(np.asarray(stored["status"]) == FLOWN)
+        """Return those of the twins that have flown, some until their assets ended, of the store."""
+        flown = has_flown(np.asarray(stored["status"]))
         kept = {
             name: np.asarray(stored[name])[flown].astype(np.float64)
             for name in ("delay", "early", "credible", "mean", "state", "log_evidence")
         }
-        error = kept["mean"] - kept["state"]  # (N, T, F)
+        error = np.ma.masked_invalid(kept["mean"] - kept["state"])  # (N, T, F), some turns were not flown
+        squared, bias = ((error**power).mean(axis=1).filled(np.nan).T for power in (2, 1))
         return cls(
             within=_share(kept["delay"][~np.isnan(kept["delay"])] <= WITHIN),
             early=_share(kept["early"] > 0.0),
-            rms=tuple(_root(_mean(own)) for own in (error**2).mean(axis=1).T),
-            bias=tuple(_mean(own) for own in error.mean(axis=1).T),
+            rms=tuple(_root(_mean(own)) for own in squared),
+            bias=tuple(_mean(own) for own in bias),
             evidence=_mean(np.nanmean(kept["log_evidence"], axis=1)),
             credible=_mean(kept["credible"]),
         )
@@ -150,10 +148,12 @@ def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     return np.asarray(np.maximum(1.0 - belief @ stays, 0.0))
 
 
-def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
-    """Return the probability that each twin of a group leaves its control soon, see `attention`: (B,).
+Known = tuple[NDArray[np.int64], Path, Knowledge]
+"""The rows of twins in the store, the folder of what they know, and that."""
 
-    It is NaN of twins that have not flown.
+
+def known_twins(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Iterator[Known]:
+    """Yield the twins of a group that have flown, those together that share what they know.
 
     Parameters
     ----------
@@ -169,16 +169,25 @@ def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Flo
     RunFolderError
         What the twins know is missing or damaged.
     """
-    own, flown = folder / GROUPS / record["name"], has_flown(group["status"].values)
-    chance = np.full(group.sizes["twin"], np.nan)
-    if len(flown):
-        scenario = Scenario.model_validate(record["scenarios"][0])
-        knowledge = kept_knowledge(own / "0" if record["files"] else own, scenario)
-        belief = group["belief"].values.astype(np.float64)
-        control = group["control_index"].values[np.arange(len(chance)), last_turns(group)]
-        for index in np.unique(control[flown]):
-            mine = flown[control[flown] == index]
-            chance[mine] = attention(knowledge, belief[mine], int(index))
+    flown, own = has_flown(group["status"].values), folder / GROUPS / record["name"]
+    for place, table in enumerate(record["scenarios"]):
+        rows = flown[flown == place] if record["files"] else flown
+        home = own / str(place) if record["files"] else own
+        if len(rows):
+            yield rows, home, kept_knowledge(home, Scenario.model_validate(table).moved(home))
+
+
+def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
+    """Return the probability that each twin of a group leaves its control soon, see `attention`: (B,).
+
+    It is NaN of twins that have not flown. Parameters and errors are those of `known_twins`.
+    """
+    chance, belief = np.full(group.sizes["twin"], np.nan), group["belief"].values.astype(np.float64)
+    control = group["control_index"].values[np.arange(len(chance)), last_turns(group)]
+    for rows, _, knowledge in known_twins(folder, record, group):
+        for index in np.unique(control[rows]).tolist():
+            mine = rows[control[rows] == index]
+            chance[mine] = attention(knowledge, belief[mine], index)
     return chance
 
 
@@ -194,7 +203,7 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
     alarmed, left_out = (int(np.sum(noticed(group, kind) > 0)) for kind in NOTICE_KINDS)
     found |= {"raised an alarm": alarmed} if group.attrs.get("gives_notice") else {}
     found |= {"left a gauge out": left_out} if left_out else {}
-    if not found["flown"]:
+    if not len(has_flown(status)):
         return found
     study = Outcomes.of(group)
     if not np.isnan(study.bias[0].value):  # of real assets nobody knows the truth

@@ -26,8 +26,8 @@ from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND, WATCHED_KIND, fleet_config, told_of
 from twin_master.fleet.learn import LESSONS_NAME, lesson_rows
-from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
-from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, has_flown, open_group
+from twin_master.fleet.reading import figure_rows, group_figures, last_turns, leaving, noticed
+from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, has_flown, open_group
 from twin_master.fleet.watching import STATE_NAME, counts_of, read_standing
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.report.reading import printed_factors

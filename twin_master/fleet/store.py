@@ -30,6 +30,8 @@ NOTICE_KINDS = ("alarm", "gauge_left_out")
 CREDIBILITY = 0.9
 """Probability of the set of states in which the true one is looked for."""
 _TOLERANCE = 1e-9
+WITHIN = 2
+"""Turns within which the fallback is to come."""
 
 FLOWN, FAILED, ENDED = 1, 2, 3
 """Values of `status`; 0 has not flown yet."""
@@ -108,7 +110,9 @@ def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float
         fallback = find_fallback(knowledge.model.states, plan.control_index, first, *course)
         early[twin] = fallback.early_step is not None
         if fallback.called_for_step is not None:
-            delay[twin] = np.inf if fallback.delay is None else fallback.delay
+            late = turns - fallback.called_for_step <= WITHIN  # so that nobody knows whether it would come
+            never = np.nan if late else np.inf
+            delay[twin] = never if fallback.delay is None else fallback.delay
     return delay, early
 
 
@@ -135,7 +139,7 @@ def in_credible_set(
     for axis, factor in enumerate(model.states.factors):
         distance = np.abs(np.asarray(factor.levels) - true_state[:, axis, None])  # (T, levels)
         level_distance = np.abs(model.states.coordinates[:, axis] - true_state[:, axis, None])
-        nearest &= level_distance <= distance.min(axis=1, keepdims=True) + _TOLERANCE
+        nearest &= level_distance <= distance.min(axis=1, keepdims=True) + factor.slack
     descending = -np.sort(-probability, axis=1)
     reached = np.cumsum(descending, axis=1) >= credibility - _TOLERANCE
     least = descending[np.arange(len(descending)), np.argmax(reached, axis=1)]

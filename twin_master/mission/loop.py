@@ -205,17 +205,24 @@ def replay(
     return found, last
 
 
+def in_turn(given: Sequence[BelievedModel]) -> list[BelievedModel]:
+    """Return the models that are believed one after the other.
+
+    One that was adopted from an earlier turn on than one before it takes its place altogether.
+    """
+    return [
+        model
+        for index, model in enumerate(given)
+        if all(later.from_turn > model.from_turn for later in given[index + 1 :])
+    ]
+
+
 def filtered_again(
     seen: Mapping[int, Reading], given: Sequence[BelievedModel], lag: int | None = None,
     settled: tuple[int, bytes] = (-1, b""),
 ) -> History:  # fmt: skip
     """Return the turns that a twin filters of what was seen in each, from a settled state on."""
-    # A model that was adopted from an earlier turn on than one before it takes its place altogether.
-    models = [
-        model
-        for index, model in enumerate(given)
-        if all(later.from_turn > model.from_turn for later in given[index + 1 :])
-    ]
+    models = in_turn(given)
     at = max(
         index for index, model in enumerate(models) if not index or model.from_turn <= max(settled[0], 0)
     )

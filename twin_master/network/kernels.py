@@ -38,7 +38,7 @@ def _exp(value: float) -> float:
 
 
 @_counting_nothing
-def _apply(lists: Lists, control: int, before: Float, after: Float, work: Float) -> None:
+def apply_blocks(lists: Lists, control: int, before: Float, after: Float, work: Float) -> None:
     """Apply every block to numbers (S,) as they are; `work` (S,) is lost.
 
     The first axis is applied and becomes the last, so that after all blocks the order is as before.
@@ -166,7 +166,7 @@ def backward_pass(
         for t in range(steps - 2, -1, -1):
             now, later, in_force = smoothed[twin, t], smoothed[twin, t + 1], control[twin, t]
             before, log_now, low = filtered[twin, t], log_filtered[twin, t], False
-            _apply(forward, in_force, before, forecast, work[0])
+            apply_blocks(forward, in_force, before, forecast, work[0])
             for state in range(size):
                 low |= later[state] > 0.0 and forecast[state] < SAFE
                 ratio[state] = later[state] / max(forecast[state], SAFE)
@@ -183,7 +183,7 @@ def backward_pass(
                     ratio[state] = _exp(log_ratio[state])
                 _move(backward, in_force, ratio, log_ratio, now, log_back, work)
             else:
-                _apply(backward, in_force, ratio, now, work[0])
+                apply_blocks(backward, in_force, ratio, now, work[0])
             for state in range(size):
                 if low:
                     now[state] = _exp(log_now[state] + (log_back[state] + best))
@@ -210,7 +210,7 @@ def sweep(
     later, work, change, iterations = np.empty(len(value)), np.empty(len(value)), np.inf, 0
     while True:
         for control in range(len(discount)):
-            _apply(backward, control, value, later, work)
+            apply_blocks(backward, control, value, later, work)
             for state in range(len(value)):
                 first[state, control] = reward[state, control] + discount[control] * later[state]
         if change <= limit or iterations == most:

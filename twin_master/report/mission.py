@@ -197,9 +197,8 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
         found.append(Band(np.arange(float(first), first + len(middle)), middle, *ends))
     _draw(axes, found[0], found[1], None if run.truth is None else factor.scale * run.truth[:, index], now)
     margin = 0.075 * (factor.levels[-1] - factor.levels[0]) or 6.0
-    axes.set_ylim(factor.levels[0] - margin, factor.levels[-1] + margin)
     axes.set_yticks(factor.levels, [short_number(level) for level in factor.levels])
-    axes.set_ylabel(factor.label)
+    axes.set(ylim=(factor.levels[0] - margin, factor.levels[-1] + margin), ylabel=factor.label)
     return capital(factor.title)
 
 
@@ -213,14 +212,8 @@ def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
     axes.plot(turn[later], observation[later], **_DOT, markerfacecolor="none", label="observed later")
     lost = turn[seen & np.isnan(observation)]
     if len(lost):
-        where = axes.get_xaxis_transform()
-        axes.plot(
-            lost,
-            np.full(len(lost), 0.04),
-            **{**_DOT, "marker": "x"},
-            transform=where,
-            label="lost",
-        )
+        look = {**_DOT, "marker": "x", "transform": axes.get_xaxis_transform()}
+        axes.plot(lost, np.full(len(lost), 0.04), **look, label="lost")
     truth = run.get(f"truth/{sensors.quantity}")
     _draw(
         axes, *_bands(run, "quantity", sensor, now, sensors.scale),

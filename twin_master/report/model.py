@@ -70,10 +70,8 @@ def _pair_panel(axes: Axes, load: Float, displacement: Float, stiffness: Mapping
         load, 1.0e3 * displacement, linestyle="none", marker="o", markersize=3.2, color=style.OBSERVED,
         label="measured",
     )  # fmt: skip
-    axes.set_xlim(0.0, reach[-1])
+    axes.set(xlim=(0.0, reach[-1]), xlabel="tip load (N)", ylabel="tip displacement (mm)")
     axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("tip load (N)")
-    axes.set_ylabel("tip displacement (mm)")
     axes.legend(loc="upper left")
     style.panel_label(axes, "a", "Measurements")
 
@@ -105,12 +103,10 @@ def _density_panel(axes: Axes, run: Run, label: str) -> None:
     truth = true_value(run)
     if truth is not None:
         axes.axvline(truth, **style.TRUTH_LINE, label="truth")
-    axes.set_xlim(low, high)
     axes.set_ylim(bottom=0.0)
     unit = run.tree["calibration/draw_value"].attrs.get("units", "1")
-    title = parameter_title(run.scenario.calibration.parameter)
-    axes.set_xlabel(title + ("" if unit == "1" else f" ({unit})"))
-    axes.set_ylabel("density")
+    title = parameter_title(run.scenario.calibration.parameter) + ("" if unit == "1" else f" ({unit})")
+    axes.set(xlim=(low, high), xlabel=title, ylabel="density")
     axes.legend(loc="upper right", handlelength=1.5)
     style.panel_label(axes, label, "The uncertain parameter")
 
@@ -288,11 +284,10 @@ def _residual_panel(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck
         np.arange(run.steps + 1) - 0.5, np.arange(count + 1) + 0.5, np.ma.masked_invalid(check.residual.T),
         cmap="PuOr_r", vmin=-4.0, vmax=4.0, rasterized=check.residual.size > _MOST_CELLS,
     )  # fmt: skip
-    axes.set_xlabel(run.step)
-    axes.set_ylabel(run.sensors.word)
+    ticks = np.arange(1, count + 1, 4 if count > 8 else 1)
+    axes.set(xlabel=run.step, ylabel=run.sensors.word, yticks=ticks)
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     run.number_steps(axes.xaxis)
-    axes.set_yticks(np.arange(1, count + 1, 4 if count > 8 else 1))
     style.panel_label(axes, "a", "Standardised residuals")
     style.color_bar(figure, image, "standard deviations", ax=axes, pad=0.015, fraction=0.03, extend="both")
 
@@ -305,10 +300,9 @@ def _coverage_panel(axes: Axes, run: Run, check: PredictiveCheck) -> None:
     axes.plot(
         number, 100.0 * check.coverage, linestyle="none", marker="o", color=style.PAST, label="coverage"
     )
-    axes.set_xlabel(run.sensors.word)
-    axes.set_ylabel("within 95 % interval (%)")
-    axes.set_ylim(max(-4.0, 100.0 * min(np.nanmin(check.coverage, initial=1.0), low) - 6.0), 104.0)
-    axes.set_xlim(0.2, len(number) + 0.8)
+    least = max(-4.0, 100.0 * min(np.nanmin(check.coverage, initial=1.0), low) - 6.0)
+    axes.set(xlabel=run.sensors.word, ylabel="within 95 % interval (%)")
+    axes.set(xlim=(0.2, len(number) + 0.8), ylim=(least, 104.0))
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     axes.grid(axis="y")
     style.panel_label(axes, "b", f"Coverage of each {run.sensors.word}")
@@ -323,9 +317,7 @@ def _transform_panel(axes: Axes, check: PredictiveCheck) -> None:
         edges[:-1], count * _PIT_BINS / total, width=0.92 / _PIT_BINS, align="edge", color=style.PAST,
         alpha=0.75, linewidth=0,
     )  # fmt: skip
-    axes.set_xlim(0.0, 1.0)
-    axes.set_xlabel("probability integral transform")
-    axes.set_ylabel("density")
+    axes.set(xlim=(0.0, 1.0), xlabel="probability integral transform", ylabel="density")
     style.panel_label(axes, "c", "All observations")
 
 

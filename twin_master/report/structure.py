@@ -91,15 +91,9 @@ def design_of(folder: Path) -> WingDesign | None:
 
 def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
     """Draw a wing after its last turn: regions by belief, gauges by reading and by residual (G,)."""
-    measured = run.sensors.scale * run.observed[-1]
+    measured, sensors = run.sensors.scale * run.observed[-1], run.sensors
     shown: tuple[tuple[str, str, Float, str, dict[str, Any]], ...] = (
-        (
-            "a",
-            f"Measured {run.sensors.quantity}",
-            measured,
-            f"{run.sensors.quantity} ({run.sensors.unit})",
-            {},
-        ),
+        ("a", f"Measured {sensors.quantity}", measured, f"{sensors.quantity} ({sensors.unit})", {}),
         ("b", "Measured less expected", residual, "standard deviations", _RESIDUALS),
     )
     with style.publication_style():

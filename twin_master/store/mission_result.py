@@ -13,6 +13,7 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.record_json import plain
 from reporting.words import capital, parameter_title
+from twin_master.mission.loop import BelievedModel, in_turn
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Truth
 from twin_master.mission.turns import History
@@ -189,6 +190,8 @@ class MissionResult:
         What the sensors really did; None where nobody knows.
     units : dict of str to str
         Units of control inputs, monitors and parameters; those that are missing are dimensionless.
+    models : sequence of BelievedModel
+        What the twin believed one after the other, where it was taught; the last is that of `knowledge`.
     """
 
     scenario: Scenario
@@ -196,6 +199,15 @@ class MissionResult:
     flight: History
     truth: Truth | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    models: Sequence[BelievedModel] = ()
+
+    @property
+    def spans(self) -> list[tuple[Knowledge, slice]]:
+        """What the twin knew, and in which of the turns."""
+        models = in_turn(self.models)[1:]
+        ends = [max(0, model.from_turn - self.flight.first_turn) for model in models]
+        known = [model.knowledge for model in in_turn(self.models)[:-1]] + [self.knowledge]
+        return [*zip(known, map(slice, [0, *ends], [*ends, len(self.flight.turns)]), strict=True)]
 
     @property
     def state_unit(self) -> str:

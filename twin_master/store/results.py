@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.groups import Group, Variable
 from reporting.table_file import table_text
-from twin_master.learning.expectation import expected_of
+from twin_master.learning.expectation import Expected, expected_of, joined
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import SensorStatus, Truth
+from twin_master.mission.turns import History
 from twin_master.network.inference import known_control
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
@@ -122,21 +125,16 @@ def _observed(result: MissionResult) -> Iterator[Entry]:
 
 def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]]:
     """Yield the groups of the beliefs filtered, smoothed and predicted."""
-    flight, learns, known = result.flight, result.knowledge.expectation, result.knowledge
-    states, observed, horizon = known.model.states, flight.observed, flight.predicted.shape[1]
-    ahead = flight.predicted[..., None] * known.plan.policy  # (T, H, S, U), eqs. (37)-(39)
-    flown_under, so_far = (flight.control_index, len(known.model.controls)), "observations up to the step"
-    for name, belief, joint, given in (
-        ("filtered", flight.filtered, known_control(flight.filtered, *flown_under), so_far),
-        ("smoothed", flight.smoothed, known_control(flight.smoothed, *flown_under), "all observations"),
-        ("predicted", flight.predicted, ahead, f"{so_far}, through the policy"),
+    flight, known = result.flight, result.knowledge
+    states, observed, so_far = known.model.states, flight.observed, "observations up to the step"
+    for name, belief, given in (
+        ("filtered", flight.filtered, so_far),
+        ("smoothed", flight.smoothed, "all observations"),
+        ("predicted", flight.predicted, f"{so_far}, through the policy"),
     ):
         flown = name != "predicted"
-        if learns is None:
-            expected = expected_of(known.sensor_model, known.rewards, joint, observed if flown else None)
-        else:
-            belief_now = flight.smoothed if name == "smoothed" else flight.filtered
-            expected = getattr(learns, name)(flight.carried, belief_now, observed if flown else horizon)
+        parts = [_expected(own, flight, name, belief, part) for own, part in result.spans]
+        expected = joined([part for part, _ in parts])
         values = {
             "probability": belief,
             "mean": states.mean(belief),
@@ -159,10 +157,29 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]
             }
             told = "predicted" if known.plan.on_belief is not None else result.scenario.planner.decide_on
             words["decided_on"] = _DECIDED_ON[told]
-            words["how"] = "that the twin assumes" if learns is None else "that the twin has learnt"
+            words["how"] = "that the twin assumes" if known.learning is None else "that the twin has learnt"
         elif name == "predicted":
-            values["control_probability"] = joint.sum(axis=-2)
+            values["control_probability"] = np.concatenate([asked for _, asked in parts])
         yield name, made.group(name, _plain(values), words)
+
+
+def _expected(
+    known: Knowledge, flight: History, name: str, belief: Float, part: slice
+) -> tuple[Expected, Float]:
+    """Return what is expected in some turns, and the probability of each control there."""
+    learns, given, seen, more = known.expectation, belief[part], None, tuple[Any, ...]()
+    if name == "predicted":
+        asked = known.asked(flight.unexplained[part])
+        joint = given[..., None] * asked[:, None]  # (T, H, S, U), eqs. (37)-(39)
+        given, more = flight.filtered[part], (asked, belief.shape[1])
+    else:
+        seen = flight.observed[part]
+        joint, more = known_control(given, flight.control_index[part], len(known.model.controls)), (seen,)
+    if learns is None:
+        expected = expected_of(known.sensor_model, known.rewards, joint, seen)
+    else:
+        expected = getattr(learns, name)(flight.carried[part], given, *more)
+    return expected, joint.sum(axis=-2)
 
 
 def _learnt(result: MissionResult) -> Iterator[Entry]:

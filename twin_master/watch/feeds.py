@@ -130,10 +130,7 @@ class CsvFeed(RecordedFeed):
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
         super().__init__(path, scenario, follow=follow)
         # A file that was begun a moment ago may have no header yet.
-        self._read_header(path, *(reversed(rotated(path)) if follow else ()))
-
-    def _read_header(self, *files: Path) -> None:
-        """Take the columns of the first of these files whose header is whole, or else of the first."""
+        files = [path, *(reversed(rotated(path)) if follow else ())]
         try:
             headers = [first_line(file) for file in files]
             names = _cells(next((line for line in headers if line.endswith(b"\n")), headers[0]))
@@ -162,8 +159,7 @@ class CsvFeed(RecordedFeed):
     def opened(self, place: Place | None) -> BinaryIO:
         """Return the file that a place is in, after its columns were taken."""
         file = super().opened(place)
-        with suppress(MissionInputError):
-            self._read_header(Path(file.name))
+        self.content(first_line(Path(file.name)), 0)
         return file
 
     def content(self, line: bytes, begin: int) -> Content | None:

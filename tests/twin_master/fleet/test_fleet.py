@@ -22,8 +22,10 @@ from twin_master.fleet.flight import group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Estimated, group_figures
 from twin_master.fleet.shard import Engine, unflown
+from twin_master.fleet.store import _fallbacks
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.preparation import kept_knowledge
+from twin_master.mission.side_by_side import Flights
 from twin_master.store.writing import open_run
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, open_fleet
@@ -210,6 +212,20 @@ def test_figures_are_those_of_the_flights(library_file, tmp_path):
         found = figures[name]
         assert isinstance(found, Estimated)
         assert found.value == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure(library_file, tmp_path):
+    fleet = growing(library_file, count=1)
+    folder, (group,) = fly_fleet(fleet, tmp_path / "fleet").folder, fleet.groups
+    knowledge = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
+    flights = Flights.empty(knowledge, 5)
+    flights.state[:], flights.control_index[:, :7] = 0.0, 1  # seven turns, then the asset ends
+    for twin, (called, left) in enumerate([(1, 9), (4, 9), (5, 9), (5, 6), (9, 9)]):
+        flights.state[twin, called:, 0] = 0.8
+        flights.control_index[twin, left:7] = 0
+    delay, early = _fallbacks(knowledge, flights)
+    np.testing.assert_array_equal(delay, [np.inf, np.inf, np.nan, 1.0, np.nan])
+    assert not early.any()
 
 
 def test_the_command_line(library_file, tmp_path):

@@ -15,9 +15,9 @@ from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import _noisier, learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
-from twin_master.fleet.reading import attention
+from twin_master.fleet.reading import Outcomes, attention, leaving
 from twin_master.fleet.report import write_fleet_report
-from twin_master.mission.preparation import kept_knowledge
+from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import parse_scenario
@@ -311,6 +311,33 @@ def test_true_rates_may_differ_from_those_believed(tmp_path):
     path.write_text(path.read_text().replace("growing_damage", "level_turns"))
     with pytest.raises(FleetError, match=r"truth\.probability"):
         load_fleet(path)
+
+
+def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(grown, tmp_path):
+    fleet, folder = grown
+    (group,), (name,) = open_fleet(folder).values(), open_fleet(folder)
+    scenario, home = fleet.groups[0].scenarios[0], tmp_path / "groups" / name
+    knowledge = kept_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
+    for place, control in enumerate((1, 0)):
+        (home / str(place)).mkdir(parents=True)
+        always = BeliefPolicy(np.ones((1, 25)), np.array([control]))
+        keep_knowledge(home / str(place), replace(knowledge, policy=always))
+    table = scenario.portable().to_dict()
+    record = {"name": name, "files": ["a.fmu", "b.fmu"], "scenarios": [table, table]}
+    two = group.isel(twin=slice(2))
+    control = two["control_index"].values[:, -1]
+    np.testing.assert_array_equal(leaving(tmp_path, record, two), [control[0] != 1, control[1] != 0])
+
+
+def test_turns_that_were_not_flown_take_no_part_in_the_figures():
+    """Of an asset that ended behind its first turn, and of one that failed."""
+    nan, state = np.nan, np.zeros((3, 3, 1))
+    mean = np.array([[3.0, 1.0, 2.0], [4.0, nan, nan], [9.0, 9.0, nan]])
+    stored = {"status": [1, 3, 2], "early": [0, 1, 1], "delay": [nan, 2.0, nan], "credible": [0.5, 1.0, nan]}
+    found = Outcomes.of(stored | {"mean": mean[..., None], "state": state, "log_evidence": -mean})
+    assert (found.bias[0].value, found.evidence.value, found.credible.value) == (3.0, -3.0, 0.75)
+    assert found.rms[0].value == pytest.approx(np.sqrt((14.0 / 3.0 + 16.0) / 2.0))
+    assert (found.early.value, found.within.value) == (0.5, 1.0)
 
 
 def test_the_report_names_who_needs_attention(grown):

@@ -79,6 +79,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     assert asked["decided_by"] == "gauge 5 off"
     assert asked["hypotheses"]["gauge 5 off"] > 0.9
     assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
+    assert watch.told(asked["turn"])[0] == watch.told(0)[0]  # the first alarm also in that of the last turns
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
@@ -110,6 +111,10 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     run = open_run(noticing.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
     assert {"gap_after_patch_15", "gap_before_patch_15"} <= {*figures_of(noticing.folder)}
+    believed, controls = run["filtered"]["probability"].values, run["observed"]["control_index"].values
+    for part, model in zip((slice(15), slice(15, None)), noticing.models, strict=True):
+        expected, _ = model.knowledge.sensor_model.moments(known_control(believed[part], controls[part], 2))
+        np.testing.assert_allclose(run["filtered"]["quantity_mean"].values[part], expected, rtol=1e-12)
     shutil.rmtree(folder)
     flight = viewed(noticing)
     (picture,) = flight.pictures
