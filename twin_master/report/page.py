@@ -17,7 +17,7 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Page, ReportFigure, Words
 from reporting.words import counted, listing, parameter_title, small
 from twin_master.assets.asset_source import calibrated_with
-from twin_master.assets.structure_source import FIELD_NAME
+from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.errors import RunFolderError
 from twin_master.report import mission as course
 from twin_master.report import model as tailored
