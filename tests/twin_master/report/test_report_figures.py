@@ -22,7 +22,7 @@ from twin_master.report.mission import (
     mission_figure,
     policy_figure,
 )
-from twin_master.report.model import calibration_figure, check_figure, measured, predictive_check
+from twin_master.report.model import calibration_figure, measured, predictive_check
 from twin_master.report.reading import short_number
 from twin_master.report.structure import planform_figure, planform_of
 
@@ -66,17 +66,6 @@ def test_bands_are_the_stored_intervals(run):
     loss = panel(figure, "region 2").collections[0].get_paths()[0].vertices
     assert loss[:, 1].min() >= 0.0
     assert loss[:, 1].max() <= 80.0
-
-
-def test_steps_of_a_watch_have_their_numbers(run):
-    late = replace(run, tree=run.tree.isel({"step": slice(37, None)}, missing_dims="ignore"))
-    figure = mission_figure(late, 5)
-    for title, names in (("region 1", ("as seen at the time", "past")), ("Gauge 17", ("observed", "past"))):
-        for name in names:
-            assert_array_equal(line(panel(figure, title), name)[:, 0], range(37, 43))
-    assert_array_equal(line(panel(figure, "Health reward"), "prediction")[:, 0], range(43, 53))
-    assert panel(figure, "Control: flown").patches[-1].get_center()[0] == 52
-    assert panel(check_figure(late, predictive_check(late)), "Standardised").get_xlim() == (36.5, 49.5)
 
 
 def test_control_bars_have_the_height_of_the_probability(run):
