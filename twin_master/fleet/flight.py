@@ -10,8 +10,6 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
@@ -20,7 +18,7 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
-from twin_master.fleet.shard import Engine, Kit, Piece, ShardResult, flown, unflown, with_parameters
+from twin_master.fleet.shard import Engine, Piece, ShardResult, flown, unflown, with_parameters
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store, sizes_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
@@ -261,26 +259,17 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
     """Check that the model holds where the true assets are."""
     from fe.wing.design import wing_structure
 
-    name, regions = "young_modulus_factor", scenario.state_names
-    ranges = wing_structure(regions, 0).ranges
-    own = scenario.asset.true_parameters.get(name, 1.0)
-    found = {name: (np.array([member.parameters.get(name, own) for member in group.members]), "assets")}
+    name, asset = "young_modulus_factor", scenario.asset.true_parameters
+    ranges = wing_structure(scenario.state_names, 0).ranges
+    true = {name: ([member.parameters.get(name, asset.get(name, 1.0)) for member in group.members], "assets")}
     if scenario.truth.kind == "scripted":
-        steps = f"{scenario.mission.step_name}s"
-        states = scenario.scripted_history().T
-        found |= {region: (values, steps) for region, values in zip(regions, states, strict=True)}
-    for what, (values, of) in found.items():
+        history = zip(scenario.state_names, scenario.scripted_history().T.tolist(), strict=True)
+        true |= {region: (values, f"{scenario.mission.step_name}s") for region, values in history}
+    for what, (values, of) in true.items():
         low, high = ranges[what]
-        outside = values[(values < low - 1e-12) | (values > high + 1e-12)]
-        if len(outside):
-            told = {
-                "what": what,
-                "count": len(outside),
-                "number": len(values),
-                "of": of,
-                "example": outside[0],
-            }
-            raise FleetError(said("fleet.outside", low=low, high=high, **told))
+        if outside := [value for value in values if not low - 1e-12 <= value <= high + 1e-12]:
+            told = {"what": what, "count": len(outside), "number": len(values), "of": of}
+            raise FleetError(said("fleet.outside", low=low, high=high, example=outside[0], **told))
 
 
 def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
@@ -299,7 +288,7 @@ def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-    return pickle.dumps(Kit(scenario.portable().to_dict(), files, wing), pickle.HIGHEST_PROTOCOL)
+    return pickle.dumps((scenario.portable().to_dict(), files, wing), pickle.HIGHEST_PROTOCOL)
 
 
 def group_folder(folder: Path, group: Group, place: int) -> Path:

@@ -196,24 +196,7 @@ def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
     return Grid(axes, found - _uniform(axes))
 
 
-@dataclass(frozen=True)
-class Shared:
-    """Probabilities of groups that come from one Beta distribution each, whose m and kappa are inferred.
-
-    Attributes
-    ----------
-    mean, concentration : tuple of Line
-        m, and log10 kappa, for each of the K probabilities.
-    groups : tuple of tuple of Line
-        The K probabilities of each group.
-    """
-
-    mean: tuple[Line, ...]
-    concentration: tuple[Line, ...]
-    groups: tuple[tuple[Line, ...], ...]
-
-
-def shared(grids: Sequence[Grid]) -> Shared:
+def shared(grids: Sequence[Grid]) -> tuple[list[dict[str, float]], list[tuple[Line, ...]]]:
     """Infer Beta(m kappa, (1 - m) kappa) of one or two probabilities over groups, and each group under it.
 
     m is uniform in its log odds between the bounds of a probability, and kappa in its logarithm, from 3 to
@@ -224,6 +207,11 @@ def shared(grids: Sequence[Grid]) -> Shared:
     ----------
     grids : sequence of Grid
         Log likelihood of each group, of the same K = 1 or 2 probabilities.
+
+    Returns
+    -------
+    tuple of two lists
+        Figures of m and of log10 kappa for each of the K probabilities; the probabilities of each group.
     """
     from scipy.special import betaln
 
@@ -252,7 +240,16 @@ def shared(grids: Sequence[Grid]) -> Shared:
         joint /= joint.sum()
         groups.append(lines(joint.reshape((FINE,) * count), own, logistic))
     found = lines(hyper, (odds, digits) * count, logistic, np.asarray)
-    return Shared(found[::2], found[1::2], tuple(groups))
+    figures = [
+        {
+            "mean": mean.mean,
+            "standard_deviation": mean.standard_deviation,
+            "log10_concentration": size.mean,
+            "log10_concentration_standard_deviation": size.standard_deviation,
+        }
+        for mean, size in zip(found[::2], found[1::2], strict=True)
+    ]
+    return figures, groups
 
 
 def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:

@@ -142,7 +142,7 @@ def test_groups_share_what_a_dense_sum_says():
 
     counts = [(3, 47), (6, 44), (2, 48), (9, 41), (4, 46)]
     grids = groups_of(counts)
-    found = shared(grids)
+    (found,), groups = shared(grids)
     low, high = logit(np.array([LOWEST, HIGHEST]))
     m, kappa = np.meshgrid(
         logistic(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
@@ -152,22 +152,22 @@ def test_groups_share_what_a_dense_sum_says():
     a, b = m * kappa, (1.0 - m) * kappa
     weight = np.prod([betabinom.pmf(n, n + k, a, b) for n, k in counts], axis=0)
     weight /= weight.sum()
-    assert found.mean[0].mean == pytest.approx(float((weight * m).sum()), rel=1e-3)
-    assert found.concentration[0].mean == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
-    for (n, k), (marginal,) in zip(counts, found.groups, strict=True):
+    assert found["mean"] == pytest.approx(float((weight * m).sum()), rel=1e-3)
+    assert found["log10_concentration"] == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
+    for (n, k), (marginal,) in zip(counts, groups, strict=True):
         exact = float((weight * (a + n) / (kappa + n + k)).sum())
         assert marginal.mean == pytest.approx(exact, rel=2e-3)
         for bound, reached in zip(marginal.interval(), (0.025, 0.975), strict=True):
             below = float((weight * beta.cdf(bound, a + n, b + k)).sum())
             assert below == pytest.approx(reached, abs=4e-3)
-    means = [marginal.mean for (marginal,) in found.groups]
+    means = [marginal.mean for (marginal,) in groups]
     assert np.std(means) < 0.8 * np.std([n / (n + k) for n, k in counts])
 
 
 @pytest.mark.parametrize("few", [(1, 249), (13, 237)])
 def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few):
     many = (22_500, 427_500)
-    large, _ = shared(groups_of([many, few])).groups
+    large, _ = shared(groups_of([many, few]))[1]
     p, n = many[0] / sum(many), sum(many)
     deviation = np.sqrt(p * (1.0 - p) / n)
     assert large[0].mean == pytest.approx(p, abs=0.1 * deviation)
@@ -177,7 +177,7 @@ def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few):
 
 def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet():
     counts = [(3, 47), (6, 44), (12, 38)]
-    single = shared(groups_of(counts))
+    _, single = shared(groups_of(counts))
     pairs = [
         refined(
             lambda p, seen=((a, 5), (b, 95)): (
@@ -187,8 +187,8 @@ def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet()
         )
         for a, b in counts
     ]
-    both = shared(pairs)
-    for one, two in zip(single.groups, both.groups, strict=True):
+    _, both = shared(pairs)
+    for one, two in zip(single, both, strict=True):
         assert two[0].mean == pytest.approx(one[0].mean, rel=2e-2)
 
 
