@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-
 def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
     """Return what B twins conclude of B recordings: beliefs and controls are those of a watch of each."""
     flights, most = Flights.empty(knowledge, len(recordings)), knowledge.scenario.mission.steps
