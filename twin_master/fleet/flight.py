@@ -217,16 +217,17 @@ def _check(fleet: Fleet) -> None:
     wrong = []
     for group in fleet.groups:
         means = {name: spread.mean for name, spread in group.spreads.items()}
-        names = group.files or ("",)
-        for name, scenario in zip(names, group.scenarios, strict=True):
+        several = len(group.scenarios) > 1
+        for place, scenario in enumerate(group.scenarios):
             try:
                 _check_group(group, scenario)
                 source_of(with_parameters(scenario, means), real=bool(group.observations)).check()
             except IN_FLIGHT as error:
-                wrong.append(f"{group.name} {name}".rstrip() + f": {error}")
-        for path in group.recordings:
+                asset = f" {group.members[place].name}" if several else ""
+                wrong.append(f"{group.name}{asset}: {error}")
+        for path in [member.file for member in group.members if group.observations]:
             try:
-                file_feed(path, group.scenarios[0])
+                file_feed(path or Path(), group.scenarios[0])
             except IN_FLIGHT as error:
                 wrong.append(f"{group.name}: {error}")
     if wrong:
@@ -292,9 +293,8 @@ def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
 
 
 def group_folder(folder: Path, group: Group, place: int) -> Path:
-    """Return where what the twins of a group know is kept, or one of them where each has files of its own."""
-    own = folder / GROUPS / group.name
-    return own / str(place) if group.files else own
+    """Return where what the twins of a group know is kept, those of one of its scenarios."""
+    return folder / GROUPS / group.name / str(place)
 
 
 def _fly(
@@ -318,10 +318,10 @@ def _fly(
         for number, members in left:
             group = fleet.groups[number]
             try:
-                packed = kit(number, members[0].row if group.files else 0)
-                ready = _recorded(group, members)
+                packed = kit(number, members[0].place)
+                ready = tuple(_recorded(group, member) for member in members)
             except IN_FLIGHT as error:
-                if not group.files:
+                if len(group.scenarios) == 1:
                     raise
                 keep(number, members, unflown(members[0], str(error)))  # of one asset with a file of its own
             else:
@@ -353,19 +353,16 @@ def _fly(
     return len(whole), len(left)
 
 
-def _recorded(group: Group, members: Sequence[Member]) -> tuple[Member, ...]:
-    """Return members with what their real assets have shown: workers need no files."""
-    if not group.recordings:
-        return tuple(members)
-    scenario = group.scenarios[0]
-    feeds = (file_feed(group.recordings[member.row], scenario) for member in members)
-    pairs = zip(members, feeds, strict=True)
-    return tuple(replace(member, recording=tuple(feed.messages(None))) for member, feed in pairs)
+def _recorded(group: Group, member: Member) -> Member:
+    """Return a member with what its real asset has shown: workers need no files."""
+    if not group.observations or member.file is None:
+        return member
+    return replace(member, recording=tuple(file_feed(member.file, group.scenarios[0]).messages(None)))
 
 
 def _shards(fleet: Fleet) -> Iterator[tuple[int, Sequence[Member]]]:
-    """Yield all shards in their order: twins that share all files, no more of them than a shard holds."""
+    """Yield all shards in their order: twins that share a scenario, no more of them than a shard holds."""
     for number, group in enumerate(fleet.groups):
-        size = 1 if group.files else fleet.head.shard
+        size = fleet.head.shard if len(group.scenarios) == 1 else 1
         for first in range(0, len(group.members), size):
             yield number, group.members[first : first + size]

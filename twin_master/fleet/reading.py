@@ -120,6 +120,12 @@ def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
     return last
 
 
+def severity(scenario: Scenario, mean: Float) -> Float:
+    """Return how badly off assets are by the means of their states (..., F): the sum of shares of ranges."""
+    low, high = np.array([(factor.levels[0], factor.levels[-1]) for factor in scenario.state]).T
+    return np.asarray(((mean - low) / np.where(high > low, high - low, 1.0)).sum(axis=-1))
+
+
 def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     """Return the probability that twins leave a control within the steps that are predicted: (B,).
 
@@ -169,12 +175,12 @@ def known_twins(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") ->
     RunFolderError
         What the twins know is missing or damaged.
     """
-    flown, own = has_flown(group["status"].values), folder / GROUPS / record["name"]
-    for place, table in enumerate(record["scenarios"]):
-        rows = flown[flown == place] if record["files"] else flown
-        home = own / str(place) if record["files"] else own
-        if len(rows):
-            yield rows, home, kept_knowledge(home, Scenario.model_validate(table).moved(home))
+    flown = has_flown(group["status"].values)
+    places = np.array([place for *_, place in record["members"]])[flown]
+    for place in np.unique(places).tolist():
+        rows, table = flown[places == place], record["scenarios"][place]
+        home = folder / GROUPS / record["name"] / str(place)
+        yield rows, home, kept_knowledge(home, Scenario.model_validate(table).moved(home))
 
 
 def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:

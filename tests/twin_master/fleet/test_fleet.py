@@ -158,7 +158,7 @@ def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
         fly_fleet(fleet, fleet_file.parent / "out")
     lines = str(caught.value).splitlines()
     assert lines[0].startswith("3 of the assets cannot fly")
-    assert [line.split(":")[0] for line in lines[1:]] == ["north a.fmu", "north b.fmu", "south"]
+    assert [line.split(":")[0] for line in lines[1:]] == ["north a", "north b", "south"]
     assert not (fleet_file.parent / "out").exists()
 
 

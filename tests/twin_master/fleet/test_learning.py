@@ -16,7 +16,7 @@ from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import _noisier, learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
-from twin_master.fleet.reading import Outcomes, attention, leaving
+from twin_master.fleet.reading import Outcomes, attention, leaving, severity
 from twin_master.fleet.report import write_fleet_report
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.network.planner import BeliefPolicy
@@ -304,10 +304,17 @@ def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(gr
         always = BeliefPolicy(np.ones((1, 25)), np.array([control]))
         keep_knowledge(home / str(place), replace(knowledge, policy=always))
     table = scenario.portable().to_dict()
-    record = {"name": name, "files": ["a.fmu", "b.fmu"], "scenarios": [table, table]}
+    record = {"name": name, "members": [["a", 3, 0], ["b", 4, 1]], "scenarios": [table, table]}
     two = group.isel(twin=slice(2))
     control = two["control_index"].values[:, -1]
     np.testing.assert_array_equal(leaving(tmp_path, record, two), [control[0] != 1, control[1] != 0])
+
+
+def test_states_of_other_units_count_alike_for_who_is_badly_off():
+    table = tiny(EACH).to_dict()
+    table["state"][1]["levels"] = [1.0, 1.5, 4.0]
+    found = severity(parse_scenario(table, "units"), np.array([[0.4, 1.0], [0.1, 4.0]]))
+    np.testing.assert_allclose(found, [1.0, 1.25])
 
 
 def test_turns_that_were_not_flown_take_no_part_in_the_figures():
