@@ -38,6 +38,8 @@ CAMPAIGN_FILE = "campaign.toml"
 """Name of the file that describes a campaign, in its folder."""
 TABLE_ERRORS = TableErrors(layout=CampaignFileError, value=CampaignDataError)
 """What a table of a campaign raises."""
+LATE = 1.5
+"""Intervals after a release from rest within which its first sample is."""
 _REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
 
 
@@ -234,7 +236,14 @@ def _times(section: schema.TrialSection, table: TextTable, user: str) -> tuple[F
     start = section.start or 0.0
     if section.kind not in (TrialKind.STATIC, TrialKind.FLIGHT):
         cells = table.cells("time", user)
-        return check_sampling(table.numbers("time", user), cells, user, table.name), start
+        time = check_sampling(table.numbers("time", user), cells, user, table.name)
+        late = (
+            section.release is not None and section.release.at_rest and time[0] > LATE * (time[1] - time[0])
+        )
+        if section.release is not None and (late or time[0] < 0.0):
+            which = "late_release" if late else "before_release"
+            raise CampaignDataError(said(f"campaign.{which}", file=table.name, user=user, first=time[0]))
+        return time, start
     table.refuse_repeated([*zip(*table.columns.values(), strict=True)], "row", _REPEATED)
     if "time" not in table.columns:
         return np.full(len(table), start), start

@@ -77,6 +77,12 @@ def nearly_even(time: FloatArray) -> bool:
     return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0)) if len(steps) else True
 
 
+def digit_of(values: FloatArray) -> float:
+    """Return the least difference of two readings (N,) that differ; 0 where all are alike."""
+    distinct = np.unique(values)
+    return float(np.diff(distinct).min()) if len(distinct) > 1 else 0.0
+
+
 def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
     """Return what a reader has to know of uneven stamps, by trial; None where all are even."""
     uneven = {name: time for name, time in times.items() if not is_even(time)}

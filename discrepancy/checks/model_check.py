@@ -19,8 +19,9 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
+from discrepancy.campaign.sampling import digit_of
 from discrepancy.catalogue.entry import Setting
-from discrepancy.checks.quality import rest_faults
+from discrepancy.checks.quality import is_still, rest_faults, roughness
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.normal_equations import normal_equations
@@ -73,6 +74,8 @@ MATTERS = 0.3
 """Difference between two readings of an input from which on it is said, in deviations of the noise (rms)."""
 _VISIBLE = 0.01  # share of the largest prediction of its kind below which a channel tells nothing
 _ABOVE_NOISE = 5.0
+_AGREE = 0.9  # share of the pairs of loads whose slopes have one sign
+_NOTHING = 1e9  # data over prediction from which on the model shows rounding alone
 _FLOOR = 0.02  # of a prediction: what any model may be off without the channel being another one
 
 
@@ -98,6 +101,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
         trial.name: observe(model, campaign, trial, ModelPatch(), prior_mean(campaign, model, trial)).values
         for trial in campaign.trials
     }
+    faults += _dead(campaign, predictions)
     scales = _scales(campaign, predictions)
     swaps = list(_swaps(campaign, predictions))
     exchanged = {name for pair, _ in swaps for name in pair}
@@ -177,6 +181,19 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
             yield fault(FaultKind.UNDERSAMPLED, samples=samples, least=LEAST_SAMPLES, **told)
 
 
+def _dead(campaign: Campaign, predictions: dict[str, FloatArray]) -> Iterator[DataFault]:
+    """Yield channels that stand still under loads that would show; `check_data` tells the others."""
+    for trial in campaign.trials:
+        for column, name in enumerate(trial.channels):
+            if trial.is_dynamic or not is_still(trial, name):
+                continue
+            having = (item for item in campaign.trials if name in item.channels)
+            digit = digit_of(np.concatenate([i.values[:, i.channels.index(name)] for i in having]))
+            least = _ABOVE_NOISE * max(campaign.channels[name].noise_in(trial), digit)
+            if digit and np.ptp(predictions[trial.name][:, column]) > least:
+                yield fault(FaultKind.DEAD, name, trial.name)
+
+
 # ---------------------------------------------------------------- scales
 
 
@@ -192,17 +209,21 @@ def _scales(campaign: Campaign, predictions: dict[str, FloatArray]) -> dict[tupl
             used = trial.used[:, column]
             data, model = trial.values[used, column], predictions[trial.name][used, column]
             expected = _amplitude(model, trial)
-            noise = channel.noise_in(trial)
+            rough = roughness(data) if trial.is_dynamic and len(data) > 6 else 0.0
+            noise = channel.noise_in(trial) or rough
             sizes = zip(channels, whole, strict=True)
             largest = max(size for other, size in sizes if other.quantity is channel.quantity)
             if expected <= _VISIBLE * largest or expected == 0.0:
                 continue
-            scale = _slope(data, model) if not trial.is_dynamic else _dynamic_scale(data, model, trial, used)
-            shown = float(np.median(data) * np.sign(np.median(model)))
-            if scale < 0.0 and not trial.is_dynamic and shown > 2.0 * channel.offset_deviation:
-                continue  # a reversed channel would show the other sign: this slope is a temperature's, say
-            # What stays in the noise has no scale, unless the noise itself is beyond what the model shows.
-            if abs(scale) * expected > _ABOVE_NOISE * noise and np.isfinite(scale) and scale != 0.0:
+            if trial.is_dynamic:
+                scale = _dynamic_scale(data, model, trial, used)
+                # what stays in the noise has no scale, unless noise and data are in other units
+                size = abs(scale) * expected
+                if max(size, expected if size > _ABOVE_NOISE * rough else 0.0) <= _ABOVE_NOISE * noise:
+                    continue
+            else:
+                scale = _static_scale(data, model, noise, channel.offset_deviation)
+            if 0.0 < abs(scale) < _NOTHING:
                 result[channel.name, trial.name] = scale
     return result
 
@@ -215,16 +236,26 @@ def _amplitude(values: FloatArray, trial: Trial) -> float:
     return float(np.max(np.abs(values)))
 
 
-def _slope(data: FloatArray, model: FloatArray) -> float:
-    """Return the median slope of data over prediction between two loads, or a plain ratio at one load."""
+def _static_scale(data: FloatArray, model: FloatArray, noise: float, zero: float) -> float:
+    """Return the median slope of data over prediction between two loads, or a plain ratio at one load.
+
+    0 where it cannot be told: beside noise and the deviation of the channel's zero, where pairs of loads do
+    not agree in its sign, or where the data have the model's sign and it has not: it is a temperature's, say.
+    """
     rows = np.linspace(0, len(data) - 1, min(len(data), 400)).round().astype(int)
     one, other = np.triu_indices(len(rows), 1)
     rise, run = (values[rows][one] - values[rows][other] for values in (data, model))
     # Rows that differ by their health alone would tell the noise over next to nothing.
     far = np.abs(run) > 0.2 * np.max(np.abs(model))
+    shown, expected = float(np.median(data)), float(np.median(model))
     if not far.any():
-        return float(np.median(data) / np.median(model)) if np.median(model) else 0.0
-    return float(np.median(rise[far] / run[far]))
+        return shown / expected if expected and abs(shown) > _ABOVE_NOISE * max(noise, zero) else 0.0
+    slopes = rise[far] / run[far]
+    slope = float(np.median(slopes))
+    told = max(abs(slope), 1.0) * np.median(np.abs(run[far])) > _ABOVE_NOISE * noise
+    alike = np.mean(slopes * slope > 0.0) > _AGREE
+    another = slope < 0.0 and shown * np.sign(expected) > 2.0 * zero
+    return slope if told and alike and not another else 0.0
 
 
 def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: BoolArray) -> float:
@@ -232,13 +263,18 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: Bool
     centred = data - np.median(data)
     # Robust against outliers, but not against a decaying record whose quiet end is most of it.
     ratio = float(np.quantile(np.abs(centred), 0.95) / np.quantile(np.abs(model - np.median(model)), 0.95))
-    if trial.kind is not TrialKind.RINGDOWN or trial.release is None or not trial.release.at_rest:
-        return ratio
+    return ratio * _begins_as(data, model, trial)
+
+
+def _begins_as(data: FloatArray, model: FloatArray, trial: Trial) -> float:
+    """Return -1 where a release from rest begins on the other side than predicted, else 1."""
+    if trial.release is None or not trial.release.at_rest:
+        return 1.0
     # Before the first return through zero no error of frequency matters.
     crossing = np.flatnonzero(np.sign(model) != np.sign(model[0]))
     until = max(int(crossing[0]) if crossing.size else len(model), 3)
     # each sample has one vote, as heavy as the prediction: none of a single wrong reading decides
-    return ratio * (float(np.sign(np.sign(centred[:until]) @ model[:until])) or 1.0)
+    return float(np.sign(np.sign(data - np.median(data))[:until] @ model[:until])) or 1.0
 
 
 # ---------------------------------------------------------------- signs
@@ -305,9 +341,7 @@ def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial)
     noise = channel.noise_in(trial)
     if trial.is_dynamic:
         # Amplitudes only: a small error of frequency would outweigh what the places of two gauges differ by.
-        first = slice(max(len(data) // 50, 3))
-        sign = 1.0 if float(data[first] @ model[first]) >= 0.0 else -1.0
-        rest = np.asarray(sign * np.std(data) - np.std(model))
+        rest = np.asarray(_begins_as(data, model, trial) * np.std(data) - np.std(model))
         deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * np.std(model))
     else:
         rest = data - model

@@ -1,14 +1,16 @@
 """Single readings that cannot be right: found by their neighbours or repeats, and left out with a remark."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import maximum_filter1d
 
 from discrepancy.campaign.noise import repeated
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
+from discrepancy.campaign.sampling import digit_of, is_even
 from discrepancy.sentences import said
 
 LARGEST_SHARE = 0.03
@@ -64,7 +66,7 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
             column = trial.channels.index(name)
             values, used = trial.values[:, column], trial.used[:, column]
             if trial.is_dynamic:
-                found = sample_outliers(values, used)
+                found = sample_outliers(values, used, None if is_even(trial.time) else trial.time)
             elif trial.name in by_repeats:
                 found = by_repeats[trial.name] & used
             else:
@@ -73,8 +75,10 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
                 yield trial, name, found
 
 
-def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolArray:
-    """Return which samples of an even record are isolated outliers, (N,); see `mark_outliers`.
+def sample_outliers(
+    values: FloatArray, used: BoolArray | None = None, time: FloatArray | None = None
+) -> BoolArray:
+    """Return which samples of a record are isolated outliers, (N,); see `mark_outliers`.
 
     Parameters
     ----------
@@ -82,6 +86,8 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
         The record.
     used : (N,) ndarray of bool, optional
         Samples that count; the others are bridged and never reported.
+    time : (N,) ndarray, optional
+        Of the samples, where they are not even [s].
     """
     count, size = len(values), float(np.max(np.abs(values), initial=0.0))
     used = np.ones(count, dtype=bool) if used is None else used
@@ -92,25 +98,31 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
     # squares of readings of any size stay in range
     clean = np.where(used, values / size, np.interp(rows, rows[used], values[used] / size))
     judged = clean.copy()
-    shapes = [shape for shape in _SHAPES if 4 * shape[0] + 4 <= count]
-    shape = min(shapes, key=lambda item: _scatter(_rest(clean, item)))
-    edge = _EDGE if shape[1] == _SHAPES[0][1] else shape[0]
+    weights = _weights if time is None else cache(partial(_uneven_weights, time))
+    known = _SHAPES if time is None else [shape for shape in _SHAPES if shape[1] == _SHAPES[0][1]]
+    shapes = [_Surroundings(weights, shape) for shape in known if 4 * shape[0] + 4 <= count]
+    around = min(shapes, key=lambda shape: _scatter(shape.rest(clean)))
+    width, degree = around.shape
+    # what rounding to digits leaves at least, which a record at rest does not show
+    rounding = digit_of(values[used] / size) * 12.0**-0.5 * float(np.linalg.norm(_weights(width, degree)))
+    edge = _EDGE if degree == _SHAPES[0][1] else width
     for _ in range(_PASSES):
-        rest = _rest(clean, shape)
-        share = np.abs(rest) / _scale(rest)
+        rest = around.rest(clean)
+        share = np.abs(rest) / _scale(rest, rounding)
         share[:edge] = share[-edge:] = 0.0
         # Only the worst of each neighbourhood: it spoils the prediction of the samples around it.
-        peaks = share == maximum_filter1d(share, 2 * shape[0] + 1, mode="constant")
+        peaks = share == maximum_filter1d(share, 2 * width + 1, mode="constant")
         new = np.flatnonzero((share > SIGNIFICANT) & peaks & ~suspects & ~events)
         if not new.size:
             break
-        event = np.array([_is_event(rest, int(index), shape) for index in new])
+        event = np.array([_is_event(rest, int(index), around.shape) for index in new])
         events[new[event]] = True
         suspects[new[~event]] = True
-        clean[new[~event]] -= rest[new[~event]]
+        clean[new[~event]] -= (rest / around.own(count))[new[~event]]
     # Judge again with clean neighbours, and let events stay: three of five in a row are no single readings.
-    rest = _rest(clean, shape)
-    found = used & suspects & (np.abs(judged - clean + rest) > SIGNIFICANT * _scale(rest))
+    rest = around.rest(clean)
+    far = np.abs((judged - clean) * around.own(count) + rest)
+    found = used & suspects & (far > SIGNIFICANT * _scale(rest, rounding))
     crowded = np.convolve(found, np.ones(5), mode="same") >= 3
     event = np.convolve(crowded, np.ones(5), mode="same") > 0
     result: BoolArray = found & ~event
@@ -137,7 +149,7 @@ def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
             continue
         rest = residual[rows, column]
         padded = np.pad(rest, 2, constant_values=np.nan)
-        around = np.lib.stride_tricks.sliding_window_view(padded, 5)[:, [0, 1, 3, 4]]
+        around = sliding_window_view(padded, 5)[:, [0, 1, 3, 4]]
         beside = rest - np.nanmedian(around, axis=1)
         alone = np.abs(rest) > 2.0 * np.nanmax(np.abs(around), axis=1)
         for end in (slice(0, _EDGE), slice(-_EDGE, None)):
@@ -170,16 +182,41 @@ def _patterns(width: int, degree: int) -> FloatArray:
     return np.stack([np.convolve(np.asarray(signal, dtype=float), weights, "valid") for signal in signals])
 
 
-def _rest(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return what a local polynomial through the neighbours leaves of each sample; zero at the edges.
+class _Surroundings:
+    """Local polynomials through the neighbours of the samples of a record.
 
-    `shape` is the half width of the neighbourhood and the degree.
+    Near the edges narrower neighbourhoods do; the wider overwrite the inside.
+
+    Parameters
+    ----------
+    weights : callable
+        What `_weights` does.
+    shape : (int, int)
+        Half width of the neighbourhood, and degree.
     """
-    rest = np.zeros(len(values))
-    # Near the edges narrower neighbourhoods do; the wider overwrite the inside.
-    for width, degree in [*((item, 5) for item in (3, 4, 6, 9, 13) if item < shape[0]), shape]:
-        rest[width : len(values) - width] = np.convolve(values, _weights(width, degree), mode="valid")
-    return rest
+
+    def __init__(self, weights: Callable[[int, int], FloatArray], shape: tuple[int, int]) -> None:
+        self.shape = shape
+        shapes = [*((item, 5) for item in (3, 4, 6, 9, 13) if item < shape[0]), shape]
+        self._weights = {item[0]: weights(*item) for item in shapes}
+
+    def rest(self, values: FloatArray) -> FloatArray:
+        """Return what they leave of each sample (N,), of one scatter where there is noise; zero at edges."""
+        rest = np.zeros(len(values))
+        for width, weights in self._weights.items():
+            if weights.ndim == 1:
+                inside = np.convolve(values, weights, mode="valid")
+            else:
+                inside = np.einsum("nw,nw->n", sliding_window_view(values, 2 * width + 1), weights)
+            rest[width : len(values) - width] = inside
+        return rest
+
+    def own(self, count: int) -> FloatArray:
+        """Return the share of each sample itself in its rest (count,)."""
+        own = np.ones(count)
+        for width, weights in self._weights.items():
+            own[width : count - width] = weights[..., width]
+        return own
 
 
 @lru_cache(maxsize=32)
@@ -193,17 +230,29 @@ def _weights(width: int, degree: int) -> FloatArray:
     return weights
 
 
+def _uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
+    """Return the same for each sample (N - 2 width, 2 width + 1), as sure as those of even samples are."""
+    places = sliding_window_view(time, 2 * width + 1) - time[width : len(time) - width, np.newaxis]
+    places /= np.max(np.abs(places), axis=1, keepdims=True)
+    basis = np.polynomial.polynomial.polyvander(np.delete(places, width, axis=1), degree)
+    # beside a wide gap the samples may tell less than the whole polynomial
+    inverse = np.linalg.inv(basis.transpose(0, 2, 1) @ basis + 1e-10 * np.eye(degree + 1))
+    weights = np.insert(-(basis @ inverse[..., :1])[..., 0], width, 1.0, axis=1)
+    size = np.linalg.norm(weights, axis=1, keepdims=True)
+    return np.asarray(weights * (np.linalg.norm(_weights(width, degree)) / size))
+
+
 def _scatter(rest: FloatArray) -> float:
     return _NORMAL * float(np.median(np.abs(rest[_EDGE:-_EDGE])))
 
 
-def _scale(rest: FloatArray) -> FloatArray:
+def _scale(rest: FloatArray, least: float) -> FloatArray:
     """Return the scatter that a sample is measured by: of the record or its surroundings, the larger."""
-    whole = max(_scatter(rest), 1e-300)
+    whole = max(_scatter(rest), least, 1e-300)
     inner = np.abs(rest[_EDGE:-_EDGE])
     if len(inner) <= 2 * _NEAR:
         return np.full(len(rest), whole)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(inner, _NEAR, mode="reflect"), 2 * _NEAR + 1)
+    windows = sliding_window_view(np.pad(inner, _NEAR, mode="reflect"), 2 * _NEAR + 1)
     near = np.pad(np.median(windows, axis=1), _EDGE, mode="edge")
     return np.maximum(whole, _NORMAL * near)
 

@@ -14,7 +14,7 @@ from scipy.stats import f as fisher
 from discrepancy.campaign.noise import MAINS, line_near, repeat_record, without_lines
 from discrepancy.campaign.noise_tests import lag_products
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, NoiseRecord, Trial
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.sampling import IntArray, digit_of
 from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
 
@@ -269,11 +269,15 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     channel, or more than 3 % of outliers in a record in time, as a fault of the data (`DataFault.fatal`).
     """
     faults: list[DataFault] = []
-    for channel in campaign.channels.values():
+    for name, channel in campaign.channels.items():
         faults += _noise_faults(campaign, channel)
+        still = [trial for trial in campaign.trials if name in trial.channels and is_still(trial, name)]
+        alive = any(name in trial.channels and trial not in still for trial in campaign.trials)
+        # A load may do nothing at a place: of a channel that moves elsewhere the model knows.
+        faults += (fault(FaultKind.DEAD, name, i.name) for i in still if i.is_dynamic or not alive)
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
-            faults += _record_faults(trial, name, trial.values[:, column], trial.used[:, column])
+            faults += _clipped(trial, name, trial.values[:, column], trial.used[:, column])
         if trial.is_dynamic:
             faults += held_faults(campaign, trial)
     faults += copy_faults(campaign)
@@ -317,49 +321,60 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
 # ---------------------------------------------------------------- records
 
 
-def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray) -> Iterator[DataFault]:
-    kept = values[used]
-    if len(kept) < 3:
+def is_still(trial: Trial, name: str) -> bool:
+    """Whether a channel shows one value throughout a trial that excites the structure."""
+    column = trial.channels.index(name)
+    used = trial.used[:, column]
+    if used.sum() < CLIPPED_RUN or np.ptp(trial.values[used, column]) > 0.0:
+        return False
+    return trial.is_dynamic or bool(np.ptp(_load(trial)[used]) > 0.0)
+
+
+def _load(trial: Trial) -> FloatArray:
+    return trial.load_factor if np.any(trial.load_factor) else trial.force
+
+
+def _clipped(trial: Trial, name: str, values: FloatArray, used: BoolArray) -> Iterator[DataFault]:
+    kept, load = values[used], None
+    if len(kept) < CLIPPED_RUN:
         return
-    load = trial.load_factor if np.any(trial.load_factor) else trial.force
-    excited = trial.is_dynamic or np.ptp(load[used]) > 0.0
-    if excited and np.ptp(kept) == 0.0:
-        yield fault(FaultKind.DEAD, name, trial.name)
-        return
-    loads = None
     if not trial.is_dynamic:
-        order = np.argsort(load[used], kind="stable")
-        kept, loads = kept[order], load[used][order]
+        order = np.argsort(_load(trial)[used], kind="stable")
+        kept, load = kept[order], _load(trial)[used][order]
     for extreme, side in ((float(kept.max()), "largest"), (float(kept.min()), "smallest")):
-        if run := clipped_run(kept, extreme, loads):
+        if run := clipped_run(kept, extreme, load):
             yield fault(FaultKind.CLIPPED, name, trial.name, run=run, side=side, extreme=extreme)
 
 
 def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:
     """Return the longest run of readings that stand at an extreme where they should not; 0 if there is none.
 
-    Records in time: a parabola through three samples on either side of the run must go beyond the extreme by
-    more than three digits (the least difference of two readings) and six deviations of the record's white
-    noise; a record of few digits is flat at its turning points too, but by a digit. Static readings, in the
-    order of their load: the run must span three loads, and nowhere else may two neighbours be alike.
+    A run is clipped where the record would have gone beyond the extreme by more than some digits (the least
+    difference of two readings) and six deviations of its scatter; a record of few digits is flat at its
+    turning points too, but by a digit. Records in time: three digits, by a parabola through three samples on
+    either side of the run, whose error grows with its length. Static readings, in the order of their load:
+    one and a half, by a line through all others; the run must span three loads.
     """
-    distinct = np.unique(values)
+    digit = digit_of(values)
     found: list[tuple[int, int]] = _runs(values == extreme).tolist()
     runs = [(start, stop) for start, stop in found if stop - start >= CLIPPED_RUN]
-    if len(distinct) < 3 or not runs:
+    if not runs:
         return 0
-    limit = 3.0 * float(np.diff(distinct).min()) + 6.0 * roughness(values) if load is None else 0.0
 
     def clipped(start: int, stop: int) -> bool:
         if load is not None:
-            outside = np.r_[np.diff(values[:start]), np.diff(values[stop:])]
-            several = np.unique(load[start:stop]).size >= CLIPPED_RUN
-            return bool(outside.size and np.all(outside != 0.0) and several)
+            others = np.delete(np.arange(len(values)), np.s_[start:stop])
+            if np.unique(load[start:stop]).size < CLIPPED_RUN or np.unique(load[others]).size < 2:
+                return False
+            line = np.polynomial.Polynomial.fit(load[others], values[others], 1)
+            beyond = float(np.max(np.abs(line(load[start:stop]) - extreme)))
+            return beyond > 1.5 * digit + 6.0 * float(np.std(values[others] - line(load[others])))
         beside = np.r_[start - 3 : start, stop : stop + 3]
         if beside[0] < 0 or beside[-1] >= len(values):
             return False
-        middle = 0.5 * (start + stop - 1)
-        parabola = np.polynomial.Polynomial.fit(beside - middle, values[beside], 2)
-        return bool(abs(parabola(0.0) - extreme) > limit)
+        places = beside - 0.5 * (start + stop - 1)
+        middle = np.linalg.pinv(np.vander(places, 3))[2]  # weights of the parabola's value there
+        far = abs(middle @ values[beside] - extreme)
+        return bool(far > 0.5 * np.abs(middle).sum() * (3.0 * digit + 6.0 * roughness(values)))
 
     return max((stop - start for start, stop in runs if clipped(start, stop)), default=0)

@@ -5,7 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.special import logsumexp, softmax
+from scipy.stats import multivariate_t
 
+from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.errors import DiscrepancyError
@@ -31,7 +34,8 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     Notes
     -----
     With a remainder the leverage is that of the trials' own unknowns: what is shared takes a few samples of
-    all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show.
+    all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show. The noise
+    of channels without a record is what the fitted trials leave of them.
     """
     fitted = _predicted(problem, found, found, sensitivities=sensitivities)
     if problem.campaign.held_out:
@@ -58,9 +62,11 @@ def _predicted(
     root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
     at, items = len(root), []
     total = at + sum(data.unknowns.size for data in problem.trials)
-    ones, counted = np.ones(len(problem.channel_names)), float(found.remainder is None)
+    counted = float(found.remainder is None)
+    precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(found.sums))
     for number, data in enumerate(problem.trials):
-        item = trial_rows(problem, number, adapted, adapted.candidate, ones)
+        item = trial_rows(problem, number, adapted, adapted.candidate, precision)
+        deviation = data.deviation / np.sqrt(precision[data.groups])
         local, shared = np.split(item.rows, [data.unknowns.size])
         factor, along = item.followed()
         own = solve_triangular(factor, local, trans="T")
@@ -75,7 +81,7 @@ def _predicted(
             leverage = np.minimum(taken + counted * carried, 1.0)
             variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
         if found.remainder is not None and data.trial.is_dynamic:
-            variance = variance + found.remainder.size[data.groups] ** 2
+            variance = variance + precision[data.groups] * found.remainder.size[data.groups] ** 2
         sensitive = None
         if sensitivities:
             sensitive = np.zeros((*shape, total))
@@ -89,8 +95,8 @@ def _predicted(
                 trial=replace(data.trial, used=data.weight > 0.0),  # after a gap a filter leaves out more
                 prediction=prediction,
                 residual=residual * data.deviation,  # what a remainder takes up is what is left
-                noise_deviation=data.deviation,
-                predictive_deviation=data.deviation * np.sqrt(np.maximum(variance, 1e-9)),
+                noise_deviation=deviation,
+                predictive_deviation=deviation * np.sqrt(np.maximum(variance, 1e-9)),
                 leverage=leverage.reshape(shape),
                 rates=np.gradient(prediction, data.trial.interval, axis=0) if data.trial.is_dynamic else None,
                 sensitivity=sensitive,
@@ -106,11 +112,8 @@ LEAST_RISE = 0.6
 """Rise of the misfit [nat] at the ends of a Gaussian 90 % interval below which the posterior is drawn from;
 NINETY^2 / 2 = 1.35 is expected."""
 SEED = 20211
-WALKERS, SWEEPS, BLOCKS, LARGEST_STRETCH = 12, 50, 5, 2.0
-"""Of the ensemble: members, moves of each in a block, largest number of blocks, and the largest stretch."""
-SETTLED = 0.15
-"""Share of its width by which an interval may differ between the last two blocks."""
-DOUBLINGS = 8
+ROUNDS, LOOKED_AT, KEPT = 5, 400, 1000
+"""Rounds, points of each at which a density is looked at, and draws that are kept."""
 
 
 def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
@@ -148,66 +151,38 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     rises = [energy(centre + side * NINETY * axis) for axis in axes.T for side in (-1.0, 1.0)]
     if min(rises) > LEAST_RISE:
         return fit
-    reached = np.stack([_reached(energy, centre, axis) for axis in axes.T], axis=1)
-    return replace(fit, draws=ensemble(energy, centre, reached))
+    return replace(fit, draws=drawn_from(energy, centre, axes))
 
 
-def _reached(energy: Callable[[FloatArray], float], centre: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return an axis, doubled while the misfit rises by less than at one deviation."""
-    for _ in range(DOUBLINGS):
-        if min(energy(centre - axis), energy(centre + axis)) > 0.5:
-            break
-        axis = 2.0 * axis
-    return axis
+def drawn_from(energy: Callable[[FloatArray], float], centre: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return equally weighted draws of a density: adaptive multiple importance sampling.
 
-
-def ensemble(energy: Callable[[FloatArray], float], centre: FloatArray, axes: FloatArray) -> FloatArray:
-    """Return draws by stretch moves of an ensemble (Goodman and Weare 2010, CAMCoS 5 (1), 65-80).
-
-    Blocks of moves are added until the central 90 % of the last two agree in every coordinate, at most
-    `BLOCKS`. Along a ridge that is bent and a hundred times longer than wide five blocks are too few, and
-    draws cover a part of it.
+    Points of each round are drawn of a Cauchy density, whose tails reach far beyond it, with the moments that
+    all points before tell; each is weighed by the densities of all rounds together (Cornuet, Marin, Mira and
+    Robert 2012, Scand. J. Statist. 39, 798-812). Along a ridge that is bent and a hundred times longer than
+    wide the draws cover a part of it.
 
     Parameters
     ----------
     energy : callable
         -ln of the density at a point (E,), infinite where it vanishes.
     centre : (E,) ndarray
-        Where the ensemble begins.
+        About which points are drawn at first.
     axes : (E, E) ndarray
-        Columns along which it is spread at first.
+        Columns along which they are spread then.
 
     Returns
     -------
-    (N, E) ndarray
-        Draws of all members in the last block.
+    (KEPT, E) ndarray
+        The same density gives the same draws.
     """
-    generator = np.random.default_rng(SEED)
-    size = len(centre)
-    count = max(WALKERS, 4 * size)
-    walkers = centre + generator.standard_normal((count, size)) @ axes.T
-    values = np.array([energy(walker) for walker in walkers])
-    stranded = ~np.isfinite(values)
-    walkers[stranded], values[stranded] = centre, energy(centre)
-    half = count // 2
-    block = np.empty((0, size))
-    for _ in range(BLOCKS):
-        before, kept = block, []
-        for _ in range(SWEEPS):
-            for moving, others in ((range(half), (half, count)), (range(half, count), (0, half))):
-                for index in moving:
-                    other = walkers[generator.integers(*others)]
-                    root = np.sqrt(LARGEST_STRETCH)
-                    stretch = (1.0 / root + generator.random() * (root - 1.0 / root)) ** 2
-                    proposal = other + stretch * (walkers[index] - other)
-                    value = energy(proposal)
-                    chance = (size - 1) * np.log(stretch) + values[index] - value
-                    if np.log(generator.random()) < chance:
-                        walkers[index], values[index] = proposal, value
-            kept.append(walkers.copy())
-        block = np.concatenate(kept)
-        if len(before):
-            old, new = (np.quantile(draws, (0.05, 0.95), axis=0) for draws in (before, block))
-            if np.all(np.abs(old - new) <= SETTLED * (new[1] - new[0])):
-                break
-    return block
+    generator, size = np.random.default_rng(SEED), len(centre)
+    mean, covariance = centre, axes @ axes.T
+    points, values, proposals = np.empty((0, size)), np.empty(0), []
+    for _ in range(ROUNDS):
+        proposals.append(multivariate_t(mean, covariance + 1e-12 * np.eye(size), df=1.0))
+        fresh = proposals[-1].rvs(LOOKED_AT, generator).reshape(LOOKED_AT, size)
+        points, values = np.concatenate((points, fresh)), np.append(values, [*map(energy, fresh)])
+        weight = softmax(-values - logsumexp([item.logpdf(points) for item in proposals], axis=0))
+        mean, covariance = weight @ points, np.atleast_2d(np.cov(points.T, aweights=weight))
+    return np.asarray(points[np.searchsorted(np.cumsum(weight)[:-1], stratified(generator, KEPT))])

@@ -15,7 +15,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.candidate import Candidate, Key, Point, Term
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
 from .filtered import Process, Solution
@@ -221,7 +221,9 @@ class ForceSearch:
         local = [np.zeros(data.unknowns.size) for data in self.problem.trials]
         for number, values in zip(self.numbers, found.local, strict=True):
             local[number] = values
-        return Point(np.clip(found.shared, -2.0, 2.0), tuple(local), np.zeros(0))
+        low, high = self.problem.shared.ends  # nothing would follow from a step beyond them
+        low, high = np.maximum(low + PARAMETER_STEP, -2.0), np.minimum(high - PARAMETER_STEP, 2.0)
+        return Point(np.clip(found.shared, low, high), tuple(local), np.zeros(0))
 
     # ---------------------------------------------------------------- what
 
@@ -341,11 +343,11 @@ class ForceSearch:
             if far.any():  # a value that it cannot reach is not its own
                 loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
                 found = replace(found, log_evidence=found.log_evidence - loss)
+            if settled:
+                return replace(found, effect=effect + step)
             # along the motion of its base, which follows the readings, a hypothesis looks better than it is
             if best is None or turn == 1 or found.log_evidence > best.log_evidence:
                 best = found
-            if settled:
-                break
             turns_back = step @ before < -0.5 * (before @ before)
             share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
             move = share * np.clip(step, -LONGEST_STEP, LONGEST_STEP)

@@ -232,12 +232,15 @@ class NamedStructure(AssetSource):
         check_names("the scenario calibrates the", self.where, rows, advice=self.advice["parameter"])
 
     def _check_ranges(self, parameters: Mapping[str, float]) -> None:
-        """Refuse levels, controls and `parameters` outside the ranges; raises `MissionInputError`.
+        """Refuse levels, controls, loads and `parameters` outside the ranges; raises `MissionInputError`.
 
         A name that the structure does not have is passed over.
         """
         scenario, ranges = self._scenario, self.design.ranges
         given = [(f"parameter {name}", name, value) for name, value in parameters.items()]
+        given += [(f"load {name}", name, value) for name, value in scenario.asset.constant_load.items()]
+        if (mean := scenario.calibration.mean) is not None:
+            given.append(("mean of the calibration", scenario.calibration.parameter, mean))
         given += [(f"level of {f.name}", f.name, level) for f in scenario.state for level in f.levels]
         given += [
             (f"{name} of the control {control.name}", name, value)
@@ -253,7 +256,7 @@ class NamedStructure(AssetSource):
         for what, name, value in given:
             low, high = ranges.get(name, (value, value))
             if not low <= value <= high:
-                what, ends = f"{what} is {value:g}, but {self.where}", (low, high)
+                what, ends = f"{what} is {value:.6g}, but {self.where}", (low, high)
                 raise MissionInputError(said("assets.outside", what=what, name=name, ends=ends))
 
 
@@ -284,7 +287,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
         return slice(0)
 
     def _fitted(self, binding: Binding, folder: Path) -> Binding:
-        if not self.section.binding:  # under a binding of one's own the names may be others
+        if "binding" not in self.section.own_files():  # whose names may be others
             self._check_ranges(self.section.parameters)
         self.check_model()
         return binding

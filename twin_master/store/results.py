@@ -167,18 +167,18 @@ def _expected(
     known: Knowledge, flight: History, name: str, belief: Float, part: slice
 ) -> tuple[Expected, Float]:
     """Return what is expected in some turns, and the probability of each control there."""
-    seen, learns, given = flight.observed[part], known.expectation, belief[part]
+    learns, given, seen, more = known.expectation, belief[part], None, tuple[Any, ...]()
     if name == "predicted":
-        joint = given[..., None] * known.plan.policy  # (T, H, S, U), eqs. (37)-(39)
-        given = flight.filtered[part]
+        asked = known.asked(flight.unexplained[part])
+        joint = given[..., None] * asked[:, None]  # (T, H, S, U), eqs. (37)-(39)
+        given, more = flight.filtered[part], (asked, belief.shape[1])
     else:
-        joint = known_control(given, flight.control_index[part], len(known.model.controls))
-    ahead = name == "predicted"
+        seen = flight.observed[part]
+        joint, more = known_control(given, flight.control_index[part], len(known.model.controls)), (seen,)
     if learns is None:
-        expected = expected_of(known.sensor_model, known.rewards, joint, None if ahead else seen)
+        expected = expected_of(known.sensor_model, known.rewards, joint, seen)
     else:
-        more = belief.shape[1] if ahead else seen
-        expected = getattr(learns, name)(flight.carried[part], given, more)
+        expected = getattr(learns, name)(flight.carried[part], given, *more)
     return expected, joint.sum(axis=-2)
 
 

@@ -11,9 +11,10 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
-from discrepancy.fits.predictive import ensemble, residual_set, with_draws
+from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
 from discrepancy.fits.screening import Screen, grid
 from discrepancy.judgement.conclusion import named_effects
+from discrepancy.location.locate import locate
 from discrepancy.search.starts import pairs
 from discrepancy.search_settings import SEARCH
 from discrepancy.workflow import patch_draws
@@ -150,23 +151,27 @@ def test_grids_hold_one_scale_and_every_level(effect):
     assert not magnitudes or all(any(row[effect.parameters[n].name] for n in magnitudes) for row in values)
 
 
-def test_ensembles_have_the_moments_of_a_gaussian_and_follow_a_bent_ridge():
-    """Spread a hundredth of what it should be at first."""
-    root = np.array([[1.0, 0.0], [0.9, 0.2]])
+@pytest.mark.parametrize("spread", [0.01, 1.0])
+def test_draws_have_the_moments_of_a_gaussian_of_a_box_and_of_a_bent_ridge(spread):
+    """Looked for at first as widely as they should be, or a hundred times closer."""
+    root = np.array([[1.0, 0.0, 0.0], [0.9, 0.2, 0.0], [0.0, 0.3, 2.0]])
     covariance = root @ root.T
 
     def gaussian(x):
         return 0.5 * float((x - 1.0) @ np.linalg.solve(covariance, x - 1.0))
 
-    draws, again = (ensemble(gaussian, np.ones(2), 0.01 * np.eye(2)) for _ in range(2))
-    np.testing.assert_allclose(draws.mean(axis=0), 1.0, atol=0.35)
-    np.testing.assert_allclose(draws.std(axis=0), np.sqrt(np.diag(covariance)), rtol=0.35)
+    draws, again = (drawn_from(gaussian, np.ones(3), spread * np.eye(3)) for _ in range(2))
+    deviations = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose((draws.mean(axis=0) - 1.0) / deviations, 0.0, atol=0.15)
+    np.testing.assert_allclose(draws.std(axis=0), deviations, rtol=0.1)
     assert draws.tobytes() == again.tobytes()
-    bent = ensemble(
-        lambda x: 0.5 * x[0] ** 2 + 0.5 * ((x[1] - x[0] ** 2) / 0.2) ** 2, np.zeros(2), 0.1 * np.eye(2)
+    box = drawn_from(lambda x: np.inf if np.abs(x).max() > 1.0 else 0.0, np.zeros(2), spread * np.eye(2))
+    np.testing.assert_allclose(np.quantile(box, (0.05, 0.95), axis=0).T, [(-0.9, 0.9)] * 2, atol=0.07)
+    bent = drawn_from(
+        lambda x: 0.5 * x[0] ** 2 + 0.5 * ((x[1] - x[0] ** 2) / 0.2) ** 2, np.zeros(2), spread * np.eye(2)
     )
-    assert bent[:, 0].std() == pytest.approx(1.0, rel=0.4)
-    assert np.abs(bent[:, 1] - bent[:, 0] ** 2).mean() < 0.2
+    np.testing.assert_allclose(np.quantile(bent[:, 0], (0.05, 0.95)), (-1.645, 1.645), atol=0.5)
+    assert np.abs(bent[:, 1] - bent[:, 0] ** 2).mean() == pytest.approx(0.16, rel=0.2)
 
 
 def test_without_a_record_nothing_absolute_is_said_but_of_colour():
@@ -270,6 +275,20 @@ def test_intervals_cover_under_the_right_model():
     np.testing.assert_allclose(leverage, np.diag(covariance), rtol=1e-6, atol=1e-9)
     rows = np.concatenate([item.sensitivity.reshape(-1, item.sensitivity.shape[2]) for item in items])
     np.testing.assert_allclose(rows @ rows.T, covariance, rtol=1e-5, atol=1e-8)
+
+
+def test_noise_without_a_record_is_what_the_fit_leaves():
+    """And nothing is found in it."""
+    told = 0
+    for seed in range(20):
+        problem = kit.closed_problem(seed=seed, samples=150, gain_deviation=0.02)
+        bare = {name: replace(item, noise=None) for name, item in problem.campaign.channels.items()}
+        unknown = kit.problem_of(replace(problem.campaign, channels=bare), problem.model)
+        found = residual_set(unknown, kit.fitted(unknown))
+        for data, item in zip(problem.trials, found.trials, strict=True):
+            np.testing.assert_allclose(item.noise_deviation, data.deviation, rtol=0.25)
+        told += any(cell.significant for cell in locate(found).cells)
+    assert told <= 2
 
 
 def test_held_out_trials_move_nothing_that_is_shared():

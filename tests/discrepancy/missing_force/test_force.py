@@ -116,6 +116,10 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypat
     second = next(item for item in ranked if item.candidate.terms[0].effect.family not in families)
     assert ranked[0].log_evidence > second.log_evidence + 10.0
     assert ranked[0].log_evidence > search.whole.log_evidence + 10.0
+    # its values are where a fit that begins there stays
+    again = search.followed(ranked[0], ranked[0].candidate, ranked[0].effect)
+    deviations = np.sqrt(np.diag(ranked[0].effect_covariance))
+    np.testing.assert_allclose((again.effect - ranked[0].effect) / deviations, 0.0, atol=0.4)
     share = ForceShares(search).of(ranked[0], held_out=False)
     assert share.value > 0.85
     assert share.interval[0] <= share.value <= share.interval[1]
@@ -234,6 +238,23 @@ def seen_force(problem, effect=None, place=""):
         start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2]
         found = search.followed(search.whole, Candidate((term,)), start)
     return missing_force(search, found or search.whole)
+
+
+@pytest.mark.parametrize("high", [3.0, 1.05])
+def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(high):
+    """Beside no law a damper takes up what the drag does: the drag is the same wherever its range ends."""
+    rig, (drag,) = LumpedModel.load("single_mass_rig"), chosen("quadratic_damping")
+    first, damper = rig.description.parameter
+    rows = [first, damper.model_copy(update={"high": high})]
+    rig = LumpedModel(rig.description.model_copy(update={"parameter": rows}))
+    problem = problem_of(released(ModelPatch((DAMPED,))), rig)
+    search = ForceSearch(problem)
+    term = Term(drag, "slide")
+    start = next(item for item in search.screened(search.whole, [drag]) if item[1] == term)[2]
+    found = search.followed(search.whole, Candidate((term,)), start)
+    (law,) = found.candidate.patch(problem.setting, found.effect)
+    at_one = law.coefficient / law.reference_velocity**2
+    assert at_one == pytest.approx(DAMPED.coefficient / DAMPED.reference_velocity**2, rel=0.06)
 
 
 @pytest.mark.parametrize("number", [CART, SERVO, SHAKEN, STORES])

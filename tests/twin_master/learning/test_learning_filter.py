@@ -247,7 +247,7 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
 
 
 def test_predicted_follows_the_scenario_through_the_policy(turns, expectation):
-    found = expectation.predicted([turns[2].carried], [turns[2].filtered], 2)
+    found = expectation.predicted([turns[2].carried], [turns[2].filtered], [POLICY], 2)
     table = enumerated(3).sum(axis=(0, 1, 4))  # (S, E)
     table = table / table.sum()
     matrix, value = model().transition.matrix, sensors().value_per_draw
