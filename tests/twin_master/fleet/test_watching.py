@@ -437,7 +437,7 @@ def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
     soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(belief, control, strict=True)]
     # Who leaves with the same percentage comes by its state.
     printed = np.rint(100.0 * np.maximum(soon, 0.0))
-    worst = np.lexsort((-group["mean"].values[:, -1].sum(axis=1), -printed))
+    worst = np.lexsort((-group["mean"].values[:, -1].astype(float).sum(axis=1), -printed))
     assert max(soon) > min(soon) + 0.1
     assert len(set(printed)) < len(set(soon))
     table = fleet_page(tmp_path / "flown", WORST).partition("Who needs attention next")[2]
