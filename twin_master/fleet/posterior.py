@@ -171,11 +171,6 @@ def lines(weight: Float, axes: Axes, *of: Callable[[Float], Float]) -> tuple[Lin
     return tuple(Line(axis, weight.sum(axis=other), own) for axis, other, own in sums)
 
 
-def points_of(axes: Sequence[Float]) -> Float:
-    """Return all points of a tensor grid as probabilities: (P, K)."""
-    return logistic(np.array(list(product(*axes))))
-
-
 def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
     """Return a grid that resolves the posterior of K probabilities.
 
@@ -189,7 +184,8 @@ def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
     shape = (POINTS[count],) * count
 
     def density(axes: Axes) -> Float:
-        return log_likelihood(points_of(axes)).reshape(shape) + _uniform(axes)
+        points = np.array(list(product(*axes)))
+        return log_likelihood(logistic(points)).reshape(shape) + _uniform(axes)
 
     axis = np.linspace(logit(np.array(LOWEST)), logit(np.array(HIGHEST)), POINTS[count])
     axes, found = narrowed(density, (axis,) * count)

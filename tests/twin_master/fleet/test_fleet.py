@@ -28,7 +28,7 @@ from twin_master.mission.preparation import kept_knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.store.writing import open_run
 from uav_twin import fly as new_run
-from uav_twin import fly_fleet, open_fleet
+from uav_twin import fly_fleet, open_fleet, prepare_twin
 
 
 def growing(library_file: Path, count: int = 10, shard: int = 4) -> Fleet:
@@ -214,10 +214,8 @@ def test_figures_are_those_of_the_flights(library_file, tmp_path):
         assert found.value == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure(library_file, tmp_path):
-    fleet = growing(library_file, count=1)
-    folder, (group,) = fly_fleet(fleet, tmp_path / "fleet").folder, fleet.groups
-    knowledge = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
+def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():
+    knowledge = prepare_twin("growing_damage")
     flights = Flights.empty(knowledge, 5)
     flights.state[:], flights.control_index[:, :7] = 0.0, 1  # seven turns, then the asset ends
     for twin, (called, left) in enumerate([(1, 9), (4, 9), (5, 9), (5, 6), (9, 9)]):
