@@ -121,8 +121,7 @@ def fly_fleet(
         result = fleet.head.model_dump(exclude={"shard"}) | {"twins": fleet.size}
         atomic_write_text(folder / RESULT_NAME, to_json(result | told))
     seconds = time.perf_counter() - begin
-    failures, ended = told["failures"], told["ended"]
-    return FleetOutcome(folder, fleet.size, failures, ended, seconds, flown, shards - flown)
+    return FleetOutcome(folder, fleet.size, told["failures"], told["ended"], seconds, flown, shards - flown)
 
 
 def told_of(folder: Path) -> dict[str, dict[str, str]]:

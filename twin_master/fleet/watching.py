@@ -346,9 +346,8 @@ class _Files:
     def ended(self) -> bool:
         """Whether nothing more is to be read."""
         found = (self._fleet.assets.get(f"{self._group.name}/{name}") for name in self._files)
-        here = [asset for asset in found if asset is not None]
         return not self._follow and all(
-            asset.watch.intake.ended or self._fleet.enough(asset) for asset in here
+            asset is None or asset.watch.intake.ended or self._fleet.enough(asset) for asset in found
         )
 
     def look(self, searching: bool) -> int:

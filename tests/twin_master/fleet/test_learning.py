@@ -128,11 +128,13 @@ def test_a_grid_has_the_moments_of_a_beta(counts):
         np.testing.assert_allclose(marginal.interval(), np.quantile(draws, [0.025, 0.975]), rtol=2e-2)
 
 
-def test_groups_share_what_a_dense_sum_says():
+@pytest.mark.parametrize("beside", [(), ((5, 95),)])
+def test_groups_share_what_a_dense_sum_says(beside):
+    """Also beside another probability, which says nothing of it."""
     from scipy.stats import beta, betabinom
 
     counts = [(3, 47), (6, 44), (2, 48), (9, 41), (4, 46)]
-    (found,), groups = shared([grid_of(own) for own in counts])
+    (found, *_), groups = shared([grid_of(own, *beside) for own in counts])
     low, high = logit(np.array([LOWEST, HIGHEST]))
     m, kappa = np.meshgrid(
         logistic(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
@@ -144,13 +146,13 @@ def test_groups_share_what_a_dense_sum_says():
     weight /= weight.sum()
     assert found["mean"] == pytest.approx(float((weight * m).sum()), rel=1e-3)
     assert found["log10_concentration"] == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
-    for (n, k), (marginal,) in zip(counts, groups, strict=True):
+    for (n, k), (marginal, *_) in zip(counts, groups, strict=True):
         exact = float((weight * (a + n) / (kappa + n + k)).sum())
         assert marginal.mean == pytest.approx(exact, rel=2e-3)
         for bound, reached in zip(marginal.interval(), (0.025, 0.975), strict=True):
             below = float((weight * beta.cdf(bound, a + n, b + k)).sum())
             assert below == pytest.approx(reached, abs=4e-3)
-    means = [marginal.mean for (marginal,) in groups]
+    means = [marginal.mean for marginal, *_ in groups]
     assert np.std(means) < 0.8 * np.std([n / (n + k) for n, k in counts])
 
 
@@ -163,14 +165,6 @@ def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few):
     assert large[0].mean == pytest.approx(p, abs=0.1 * deviation)
     low, high = large[0].interval()
     assert (low, high) == pytest.approx((p - 1.96 * deviation, p + 1.96 * deviation), abs=0.1 * deviation)
-
-
-def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet():
-    counts = [(3, 47), (6, 44), (12, 38)]
-    _, single = shared([grid_of(own) for own in counts])
-    _, both = shared([grid_of(own, (5, 95)) for own in counts])
-    for one, two in zip(single, both, strict=True):
-        assert two[0].mean == pytest.approx(one[0].mean, rel=2e-2)
 
 
 def test_a_population_is_that_of_normal_members():
