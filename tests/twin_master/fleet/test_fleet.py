@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +224,12 @@ def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():
         flights.control_index[twin, left:7] = 0
     delay, early = _fallbacks(knowledge, flights)
     np.testing.assert_array_equal(delay, [np.inf, np.inf, np.nan, 1.0, np.nan])
-    assert not early.any()
+    assert (early == 0).all()
+    both = replace(
+        knowledge, policy=np.eye(2)[(knowledge.model.states.coordinates.sum(axis=1) < 0.5).astype(int)]
+    )
+    delay, early = _fallbacks(both, flights)  # by which no state alone calls for a fallback
+    assert (np.isnan(delay) & (early == -1)).all()
 
 
 def test_the_command_line(library_file, tmp_path):
