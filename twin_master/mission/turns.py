@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from twin_master.network.estimator import Carried, Notice, Suspicion
+from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.twin import Twin, TwinTurn
 
 
@@ -171,11 +171,6 @@ class History:
     def smoothed(self) -> Float:
         """p(D_k | all observations) (T, S)."""
         return self.twin.smoothed()[-len(self.turns) :]
-
-    @property
-    def carried(self) -> tuple[Carried, ...]:
-        """What the estimator carried on from each turn."""
-        return self.twin.carried[-len(self.turns) :]
 
     @property
     def suspicion(self) -> tuple[Suspicion, ...]:

@@ -211,11 +211,8 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
 @pytest.mark.parametrize("other", [None, np.array([0.2, 0.7, 0.1])])
 def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation, other):
     """Where the model does not decide alone, the belief about the state is `other`."""
-    carried, seen, rewards = (
-        [turn.carried for turn in turns],
-        observations(),
-        RewardModel(sensors(), *SETTINGS),
-    )
+    carried, seen = [turn.carried for turn in turns], observations()
+    rewards = RewardModel(sensors(), *SETTINGS)
     believed = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
     if other is not None:
         believed = (np.tile(other, (STEPS, 1)),) * 2
