@@ -191,9 +191,8 @@ def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench, tmp_path):
     other = replace(found, priors=(replace(found.priors[0], high=9.0),), samples=found.samples + 0.25)
     (tmp_path / "other.nc").write_bytes(result_bytes(other))  # of a pump that takes thicker oil
     resolved = resolve_scenario(scenario, Overrides(calibration=tmp_path / "other.nc"))
-    with pytest.raises(
-        MissionInputError, match=r"range of 'viscosity_factor', 0\.8 to 1\.2.* calibration has"
-    ):
+    wrong = r"range of 'viscosity_factor', 0\.8 to 1\.2.* calibration has"
+    with pytest.raises(MissionInputError, match=wrong):
         asset_source(resolved).check()
 
 
@@ -203,9 +202,8 @@ def test_what_an_fmu_does_not_have_is_one_sentence(bench):
         model.write_text(edited((bench / "model.toml").read_text(), (old, new)))
         assert sentence in refused("calibrate", "campaign", bench / "lab", "--model", model, code=None)
     shutil.copytree(bench / "lab", bench / "far")
-    (bench / "far/points.csv").write_text(
-        (bench / "lab/points.csv").read_text().replace("1400.0,", "9400.0,", 1)
-    )
+    points = (bench / "lab/points.csv").read_text()
+    (bench / "far/points.csv").write_text(points.replace("1400.0,", "9400.0,", 1))
     for lab, model, sentence in (
         ("far", bench / "model.toml", "The trial 'points', row 4 of its table"),
         ("far", bench / "model.toml", "lies outside the range of 'speed', 500 to 2500"),

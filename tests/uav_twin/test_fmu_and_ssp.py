@@ -65,9 +65,8 @@ def test_an_fmu_alone(foreign_fmu, tmp_path):
     assert rows[0].tolist()[:3] == (0.0, 1.0, 0.0)
     assert rows["bounces"].tolist() == [0] * 8 + [1] * 12 + [2]
     assert plot.read_bytes()[:4] == b"\x89PNG"
-    assert "500 steps to t = 0.4 s, every 0.0008 s" in said(
-        "fmu", "simulate", fmu, "--in-process", "--stop-time", 0.4
-    )
+    told = said("fmu", "simulate", fmu, "--in-process", "--stop-time", 0.4)
+    assert "500 steps to t = 0.4 s, every 0.0008 s" in told
 
 
 @pytest.mark.parametrize("where", [(), ("--in-process",)], ids=["worker", "in process"])
@@ -92,9 +91,8 @@ def test_an_array_may_be_empty(foreign_fmu, tmp_path):
     bound, given = tmp_path / "empty.toml", tmp_path / "u.csv"
     bound.write_text(SIZED.replace("n = 3", "n = 0"), encoding="utf-8")
     given.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
-    assert "control.u must be 0 values" in refused(
-        "fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--in-process"
-    )
+    words = ("fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--in-process")
+    assert "control.u must be 0 values" in refused(*words)
 
 
 def test_histories_of_an_array_of_another_size(foreign_fmu, tmp_path):
@@ -130,10 +128,8 @@ def test_structural_parameters_of_a_binding(foreign_fmu):
         with pytest.raises(FmuFileError, match=r"'u' of .* has 3 elements but 2 start values"):
             asset.reset({})
     content["binding"]["structural_parameters"] = {"rows": 3}
-    with pytest.raises(
-        BindingError,
-        match=r"structural_parameters\.rows of the binding r names 'rows', which is not a variable",
-    ):
+    wrong = r"structural_parameters\.rows of the binding r names 'rows', which is not a variable"
+    with pytest.raises(BindingError, match=wrong):
         FmiAsset(foreign_fmu("resize3"), parse_binding(content))
     huge = foreign_fmu.changed("resize3", "many", ('max="8"', ""))
     content["binding"]["structural_parameters"] = {"n": 1e9}
@@ -280,9 +276,8 @@ def test_from_a_script_to_a_library(tmp_path):
 
 @pytest.mark.long
 def test_a_run_of_the_pump_speaks_of_pumps(tmp_path):
-    scenario = written(
-        tmp_path, text_of("pump_wear", ("steps = 60", "steps = 12"), ("draws = 40", "draws = 6"))
-    )
+    text = text_of("pump_wear", ("steps = 60", "steps = 12"), ("draws = 40", "draws = 6"))
+    scenario = written(tmp_path, text)
     folder = tmp_path / "run"
     shown = said("run", scenario, "--out", folder, "--in-process")
     assert "twin, per shift" in shown

@@ -213,13 +213,10 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
     """Where the model does not decide alone, the belief about the state is `other`."""
     carried, seen = [turn.carried for turn in turns], observations()
     rewards = RewardModel(sensors(), *SETTINGS)
-    believed = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
+    now, later = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
     if other is not None:
-        believed = (np.tile(other, (STEPS, 1)),) * 2
-    filtered, smoothed = (
-        of(carried, belief, seen)
-        for of, belief in zip((expectation.filtered, expectation.smoothed), believed, strict=True)
-    )
+        now = later = np.tile(other, (STEPS, 1))
+    filtered, smoothed = expectation.filtered(carried, now, seen), expectation.smoothed(carried, later, seen)
     value = sensors().value_per_draw
     whole = enumerated(STEPS)
     for t in range(STEPS):
