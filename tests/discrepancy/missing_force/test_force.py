@@ -126,7 +126,7 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypat
 
 
 def test_a_dead_zone_is_found_though_its_stiffness_is_not_told_at_first_sight(tmp_path):
-    """In proportion to its size its force is the same whatever the stiffness: from most values it vanishes."""
+    """In proportion to its size its force is the same whatever the stiffness; from most it vanishes."""
     problem = blind(tmp_path, PLAY, 37)
     best = ForceSearch(problem).name(chosen("free_play"))[0]
     (play,) = best.candidate.patch(problem.setting, best.effect)
