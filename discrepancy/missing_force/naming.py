@@ -16,10 +16,11 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Key, Point, Term
+from discrepancy.fits.fitting import LARGEST_EFFECT
 from discrepancy.fits.problem import Problem
 
 from .filtered import Process, Solution
-from .hypotheses import LARGEST, Columns, log_prior, scaled, variants
+from .hypotheses import Columns, log_prior, scaled, variants
 from .view import MOST_STEPS, Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
@@ -287,7 +288,8 @@ class ForceSearch:
         found: dict[Term, list[tuple[float, FloatArray]]] = {}
         for number, (value, size) in self._weighed(base, columns, [term for term, _ in tried]).items():
             term, values = tried[number]
-            found.setdefault(term, []).append((value, term.sized(values, size, -LARGEST, LARGEST)))
+            start = term.sized(values, size, -LARGEST_EFFECT, LARGEST_EFFECT)
+            found.setdefault(term, []).append((value, start))
         rows = []
         for term, starts in found.items():
             top = max(value for value, _ in starts)
@@ -359,7 +361,7 @@ class ForceSearch:
             turns_back = step @ before < -0.5 * (before @ before)
             share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
             move = share * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            effect = np.clip(candidate.stepped(effect, move), -LARGEST, LARGEST)
+            effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
             motions, before = found.motions, step
             settled = turn > 0 and np.abs(step).max(initial=0.0) < SETTLED
         return best

@@ -135,6 +135,18 @@ def test_a_dead_zone_is_found_though_its_stiffness_is_not_told_at_first_sight(tm
         assert getattr(play, key) == pytest.approx(truth[f"free_play.{key}"], rel=0.05)
 
 
+def test_a_law_far_larger_than_is_usual_is_followed(tmp_path):
+    """A drag seven prior deviations above the median: what ends before leaves most of it to the damper."""
+    problem = blind(tmp_path, SHAKEN, 37)
+    search = ForceSearch(problem)
+    _, term, (start, *_) = search.screened(search.whole, chosen("quadratic_damping"))[0]
+    found = search.followed(search.whole, Candidate((term,)), start)
+    share = ForceShares(search).of(found, held_out=True)
+    assert share.tested
+    assert share.interval[0] > 0.95
+    assert np.abs(found.shared).max() < 1.0
+
+
 def test_a_report_opens_with_the_missing_force(tmp_path):
     blind(tmp_path, CART)
     found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml")
