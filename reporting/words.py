@@ -85,7 +85,7 @@ def rounded(value: float, deviation: float) -> str:
     if abs(value) >= 1e6 or deviation < 1e-6:
         digits = max(2, floor(log10(max(abs(value), deviation))) + decimals + 1)
         return f"{value:.{min(digits, 12) - 1}e}"
-    return f"{value:.{max(decimals, 0)}f}".replace("-", "−")
+    return f"{value:z.{max(decimals, 0)}f}".replace("-", "−")  # nothing is less than none
 
 
 def plus_minus(value: float, deviation: float) -> str:

@@ -330,7 +330,7 @@ def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -
     watched = scenario.asset.kind == WATCHED_KIND
     source = believed_source(scenario) if watched else asset_source(scenario)
     source.check()
-    origin, mission, (drawn, draws) = source.origin, scenario.mission, source.uncertain
+    origin, mission, (drawn, draws) = source.origin, scenario.mission, source.uncertain()
     levels = {factor.name: len(factor.levels) for factor in scenario.state}
     return {
         "name": mission.name,

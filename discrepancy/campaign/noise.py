@@ -101,6 +101,11 @@ class NoiseModel:
             and abs(interval - self.interval) <= 1e-3 * self.interval
         )
 
+    def stays_coloured(self, trial: Trial) -> bool:
+        """Whether coloured noise cannot be whitened in a trial: its samples are no independent ones there."""
+        pace = trial.whitened_at
+        return trial.is_dynamic and self.autoregression.size > 0 and not (pace and self.applies(pace))
+
 
 def aliased(frequency: float, interval: float) -> float:
     """Return where a line shows [Hz] when sampled at `interval` [s]: 50 Hz shows at 10 Hz with 1/60 s."""

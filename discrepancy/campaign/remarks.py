@@ -44,15 +44,8 @@ def _not_whitened(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) ->
     found = []
     for name, channel in channels.items():
         noise = noise_model(channel, 1.0)
-        if not noise.autoregression.size:
-            continue
-        where = [
-            trial.name
-            for trial in trials
-            if trial.is_dynamic
-            and name in trial.channels
-            and (trial.whitened_at is None or not noise.applies(trial.whitened_at))
-        ]
+        there = (trial for trial in trials if name in trial.channels)
+        where = [trial.name for trial in there if noise.stays_coloured(trial)]
         if where:
             trials_there = f"{counted(len(where), 'trial')} {', '.join(map(repr, where))}"
             found.append(said("remarks.not_whitened", channel=name, trials=trials_there))

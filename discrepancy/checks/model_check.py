@@ -301,39 +301,32 @@ def _signs(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator
 def _swaps(
     campaign: Campaign, predictions: dict[str, FloatArray]
 ) -> Iterator[tuple[tuple[str, str], DataFault]]:
-    groups: dict[tuple[Quantity, tuple[str, ...]], list[str]] = defaultdict(list)
+    groups: dict[tuple[Quantity, tuple[str, ...]], list[Channel]] = defaultdict(list)
     for name, channel in campaign.channels.items():
-        trials = tuple(trial.name for trial in campaign.trials if name in trial.channels)
+        having = tuple(trial.name for trial in campaign.trials if name in trial.channels)
         if not np.isinf(channel.gain_deviation) and channel.quantity is not Quantity.SIGNAL:
-            groups[channel.quantity, trials].append(name)
-    for (_, trials), names in groups.items():
-        if len(names) > 1:
-            chosen = [trial for trial in campaign.trials if trial.name in trials]
-            yield from _swaps_of(campaign, chosen, names, predictions)
+            groups[channel.quantity, having].append(channel)
+    for (_, names), alike in groups.items():
+        trials = [trial for trial in campaign.trials if trial.name in names] if len(alike) > 1 else []
+        misfit = sum((_misfits(trial, predictions[trial.name], alike) for trial in trials), np.zeros((1, 1)))
+        _, assigned = linear_sum_assignment(misfit)
+        for row, place in enumerate(assigned):
+            if row < place and assigned[place] == row:
+                before, after = misfit[[row, place], [row, place]], misfit[[row, place], [place, row]]
+                if np.all(after < 0.5 * before) and np.sum(before - after) > 30.0:
+                    pair = alike[row].name, alike[place].name
+                    yield pair, fault(FaultKind.SWAPPED, pair[0], other=pair[1])
 
 
-def _swaps_of(
-    campaign: Campaign, trials: list[Trial], names: list[str], predictions: dict[str, FloatArray]
-) -> Iterator[tuple[tuple[str, str], DataFault]]:
-    misfit = np.zeros((len(names), len(names)))
-    for trial in trials:
-        columns = [trial.channels.index(name) for name in names]
-        for row, own in enumerate(columns):
-            used = trial.used[:, own]
-            for place, other in enumerate(columns):
-                predicted = predictions[trial.name][used, other]
-                misfit[row, place] += _misfit(
-                    trial.values[used, own], predicted, campaign.channels[names[row]], trial
-                )
-    _, assigned = linear_sum_assignment(misfit)
-    for row, place in enumerate(assigned):
-        if row < place and assigned[place] == row:
-            before = misfit[row, row], misfit[place, place]
-            after = misfit[row, place], misfit[place, row]
-            better = all(new < 0.5 * old for old, new in zip(before, after, strict=True))
-            if better and sum(before) - sum(after) > 30.0:
-                pair = names[row], names[place]
-                yield pair, fault(FaultKind.SWAPPED, pair[0], other=pair[1])
+def _misfits(trial: Trial, predictions: FloatArray, alike: list[Channel]) -> FloatArray:
+    """Return the misfits (C, C) of channels to what the model says of each of them."""
+    columns = [trial.channels.index(channel.name) for channel in alike]
+    rows = []
+    for own, channel in zip(columns, alike, strict=True):
+        used = trial.used[:, own]
+        data, said = trial.values[used, own], predictions[used]
+        rows.append([_misfit(data, said[:, other], channel, trial) for other in columns])
+    return np.array(rows)
 
 
 def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial) -> float:

@@ -19,7 +19,7 @@ from discrepancy.sentences import said
 from .dependence import dependences, excess, mode_shares, predicted_frequencies
 from .map import Cell, residual_map
 from .omnibus_tests import OmnibusTest, coloured_noise, mean_square, noise_groups, serial_tests, variance_test
-from .residuals import FittedTrial, ResidualSet
+from .residuals import FittedTrial, ResidualSet, without_colour
 
 ALIKE = 0.9
 """Squared cosine from which two patterns over the channels count as the same."""
@@ -209,6 +209,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     fitted = residuals.fitted
     if fitted is None:
         raise FitError("Nothing can be located: every trial is held out, and at least one fitted is needed.")
+    fitted = without_colour(fitted)
     white = fitted.white(np.random.default_rng(seed))
     coloured = coloured_noise(fitted)
     tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
@@ -223,7 +224,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
         found += [(gap * item.share, item) for item in told if item is not None]
     cells = residual_map(fitted, white, MAP_RATE)
     remarks = [*coloured.values(), *_noise_remarks(fitted)]
-    if all(cell.axis == "frequency" for cell in cells):
+    if any(item.used.any() for item in fitted.trials) and all(cell.axis == "frequency" for cell in cells):
         remarks.append(said("location.not_judged"))
     disagreements = tuple(item for _, item in sorted(found, key=lambda row: -row[0]))
     return Location(any(rejected), tests, cells, disagreements, tuple(remarks))

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from discrepancy.campaign.noise import noise_model
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, Trial
 from discrepancy.errors import FitError
@@ -183,6 +184,18 @@ class ResidualSet:
                 along += part.T @ item.standardised[item.used]
         root = np.linalg.cholesky(precision)
         return np.asarray(np.linalg.solve(precision, along) + np.linalg.solve(root.T, draw))
+
+
+def without_colour(residuals: ResidualSet) -> ResidualSet:
+    """Return a set without the records whose noise is coloured and could not be whitened: it tells no gap."""
+    noise = {name: noise_model(channel, 1.0) for name, channel in residuals.channels.items()}
+
+    def kept(trial: Trial) -> Trial:
+        white = [not noise[name].stays_coloured(trial) for name in trial.channels]
+        return replace(trial, used=trial.used & np.array(white))
+
+    trials = (replace(item, trial=kept(item.trial)) for item in residuals.trials)
+    return replace(residuals, trials=tuple(trials))
 
 
 def quadratic_moments(

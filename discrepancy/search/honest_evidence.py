@@ -44,13 +44,15 @@ def left_by(problem: Problem, found: CandidateFit) -> Remainder:
     factor, of_noise = np.ones(count), np.zeros(count, dtype=bool)
     noise_of = noise_levels(problem, found)
     for channel, name in enumerate(problem.channel_names):
-        series, used, interval = _records(problem, found, channel)
+        series, used, steps = _records(problem, found, channel)
         counted = sum(float(item.sum()) for item in used)
         if not series:
             continue
         freedom, known = max(counted - found.spent[channel], 1.0), problem.freedom[channel]
         left = sum(float(item @ item) for item in series) / freedom
-        larger = bool(known > 0.0 and noise_tests.variance_p_value(left, freedom, known) < LEVEL)
+        interval = max(float(np.median(item)) for item in steps)
+        colour, doubt, fewer = _recorded_colour(problem, name, steps, interval)
+        larger = known > 0.0 and noise_tests.variance_p_value(left, freedom / fewer, known / fewer) < LEVEL
         if (
             not larger
             and noise_tests.combine(
@@ -60,7 +62,7 @@ def left_by(problem: Problem, found: CandidateFit) -> Remainder:
         ):
             continue
         rho, chance = _autocorrelation(series)
-        of_noise[channel] = not larger and _is_of_record(problem, name, interval, float(rho[0]), counted)
+        of_noise[channel] = not larger and abs(rho[0] - colour) < LIKE_RECORD * np.sqrt(1.0 / counted + doubt)
         level = 1.0 if of_noise[channel] else max(left, 1.0) if known > 0.0 else left
         factor[channel] = np.sqrt(level * max(1.0 + 2.0 * float(np.sum(rho**2 - chance)), 1.0))
         beside = left / noise_of[channel] - 1.0
@@ -119,16 +121,20 @@ def refitted(problem: Problem, wide: Problem, found: CandidateFit, **options: An
 
 def _records(
     problem: Problem, found: CandidateFit, channel: int
-) -> tuple[list[FloatArray], list[BoolArray], float]:
-    """Return the residuals of a channel in motion, which samples of them count, and their interval [s]."""
-    series, used, intervals = [], [], [0.0]
+) -> tuple[list[FloatArray], list[BoolArray], list[FloatArray]]:
+    """Return the residuals of a channel in motion, which samples of them count, and steps in time [s].
+
+    Of records whose noise is white they are one.
+    """
+    series, used, steps = [], [], []
     for data, residual in zip(problem.trials, found.residuals, strict=True):
         for column in np.flatnonzero(data.groups == channel) if data.trial.is_dynamic else ():
             if len(residual) >= noise_tests.SHORTEST_SERIES:
                 series.append(np.ascontiguousarray(residual[:, column]))
                 used.append(data.weight[:, column] > 0.0)
-                intervals.append(float(np.median(data.steps[1:])))
-    return series, used, max(intervals)
+                white = not data.noise[column].stays_coloured(data.trial)
+                steps.append(np.median(data.steps[1:], keepdims=True) if white else data.steps[1:])
+    return series, used, steps
 
 
 def _autocorrelation(series: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -142,17 +148,30 @@ def _autocorrelation(series: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     return products[1:] / max(products[0], 1e-300), pairs[1:] / pairs[0] ** 2
 
 
-def _is_of_record(problem: Problem, name: str, interval: float, rho: float, count: float) -> bool:
-    """Whether the noise record of a channel may have the correlation rho of what is left at one sample."""
+def _recorded_colour(
+    problem: Problem, name: str, steps: list[FloatArray], interval: float
+) -> tuple[float, float, float]:
+    """Return what noise as in a channel's record leaves in records: their correlation at one sample.
+
+    And its variance, and how many times fewer independent samples they have. NaN where nothing is recorded,
+    or at another pace. What is whitened leaves what the filter leaves of the record.
+    """
     record, noise = problem.campaign.channels[name].noise, problem.noise[name]
-    if record is None or record.samples is None or record.interval is None:
-        return False
-    if not np.any(record.samples) or abs(record.interval - interval) > LAGS * interval:
-        return False
-    values = noise.whiten(record.samples - record.samples.mean(), record.interval)
-    own = float(values[1:] @ values[:-1] / (values @ values))
-    deviation = np.sqrt(1.0 / len(values) + 1.0 / count)
-    return bool(abs(rho - own) < LIKE_RECORD * deviation)
+    if record is None or record.samples is None or record.interval is None or not np.any(record.samples):
+        return np.nan, 0.0, 1.0
+    raw = record.samples - record.samples.mean()
+    if abs(record.interval - interval) > LAGS * interval:
+        return np.nan, 0.0, 1.0
+    found = []
+    for item in steps:
+        white = len(item) == 1
+        values = noise.whiten(raw, record.interval) if white else raw
+        rho = noise_tests.lag_products(values, len(raw) // 4)[0] / float(values @ values)
+        beside = 0.0 if white else 2.0 * float(np.sum(rho[1:] ** 2 - 1.0 / len(raw)))
+        along = rho[1] if white else np.mean(np.interp(item / record.interval, np.arange(len(rho)), rho))
+        found.append((along, 1.0 / len(raw), 1.0 + max(beside, 0.0)))
+    colour, doubt, fewer = np.mean(found, axis=0).tolist()
+    return colour, doubt, fewer
 
 
 TURNS = 3

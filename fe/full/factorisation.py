@@ -304,16 +304,19 @@ def most_moved(load: FloatArray, values: FloatArray, shapes: FloatArray) -> IntA
 
 
 def lowest_eigenpairs(
-    stiffness: sparse.sparray, mass: sparse.sparray, count: int
+    stiffness: sparse.sparray | Factorisation, mass: sparse.sparray, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Lowest eigenvalues (count,) [rad^2/s^2] and vectors (n, count) by shift-inverted Lanczos.
+
+    The stiffness may be given factorised.
 
     Raises
     ------
     SolutionError
         If the iteration did not converge to `MODE_RESIDUAL_LIMIT`.
     """
-    factors = Factorisation(stiffness)
+    factors = stiffness if isinstance(stiffness, Factorisation) else Factorisation(stiffness)
+    stiffness = factors.stiffness
     size = stiffness.shape[0]
     inverse = LinearOperator((size, size), matvec=factors.riesz, dtype=float)
     start = np.random.default_rng(16).standard_normal(size)  # fixed: the same model gives the same bytes

@@ -24,6 +24,8 @@ from reporting.words import counted
 from .settings import StructureSettings
 from .terms import ReductionTerms, State
 
+OUTPUTS_TOGETHER = 8
+"""Outputs whose dual solutions are judged at once."""
 TOGETHER = 4
 """Full solutions of the search, and states whose modes are refined, at once."""
 DUAL_TOLERANCE = 0.01
@@ -88,14 +90,22 @@ def dual_solutions(
         own *= (lengths > DEPENDENT * lengths[:, :1])[:, np.newaxis]
         functions.append(own.transpose(2, 0, 1))
         moved = factors.unwhitened(own.swapaxes(0, 1).reshape(size, -1)).reshape(size, count, -1)
-        for output, displacement in zip(outputs.T, moved.swapaxes(0, 1), strict=True):
-            images = [np.asarray(term @ displacement) for term in terms.stiffness_terms]
-            stiffness.append(np.stack([displacement.T @ image for image in images]))
-            # a function that is not there gets no part
-            stiffness[-1][-1] += np.diag(np.diagonal(stiffness[-1].sum(axis=0)) == 0.0)
-            forces = np.column_stack((output, factors.whitened(np.concatenate(images, axis=1))))
-            rounded = LEAST_DUAL * np.linalg.norm(output) * np.eye(1, forces.shape[1])
-            residual.append(np.concatenate((np.linalg.qr(forces, mode="r"), rounded)))
+        for few in np.array_split(np.arange(count), ceil(count / OUTPUTS_TOGETHER)):
+            flat = moved[:, few].reshape(size, -1)
+            images = np.stack([(term @ flat).reshape(size, len(few), -1) for term in terms.stiffness_terms])
+            forces = factors.whitened(np.moveaxis(images, 0, 2).reshape(size, -1))
+            for output, inner, force in zip(
+                outputs[:, few].T,
+                np.einsum("nom,tnok->otmk", moved[:, few], images, optimize=True),
+                forces.reshape(size, len(few), -1).swapaxes(0, 1),
+                strict=True,
+            ):
+                # a function that is not there gets no part
+                inner[-1] += np.diag(np.diagonal(inner.sum(axis=0)) == 0.0)
+                stiffness.append(inner)
+                forced = np.column_stack((output, force))
+                rounded = LEAST_DUAL * np.linalg.norm(output) * np.eye(1, forced.shape[1])
+                residual.append(np.concatenate((np.linalg.qr(forced, mode="r"), rounded)))
     duals = np.array(functions)
     inner, norms = (
         np.array(part).reshape(len(duals), count, *np.shape(part)[1:]) for part in (stiffness, residual)

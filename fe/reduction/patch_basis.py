@@ -70,10 +70,8 @@ def _responses(full: PatchOperators, loss: float) -> FloatArray:
     """Return solutions (n, k) of the full model, all damage regions with one loss, in their natural sizes."""
     operators, rows, stations = full.operators, full.rows, full.plain["stations"]
     health = dict.fromkeys(operators.regions, loss)
-    factors, (frequency, modes) = (
-        Factorisation(operators.stiffness(None, health)),
-        natural_frequencies(operators, MODES, health),
-    )
+    factors = Factorisation(operators.stiffness(None, health))
+    frequency, modes = natural_frequencies(operators, MODES, health, factors)
     step = max(1, len(stations) // 13)
     along_x, along_y, elastic, *others = rows["line_rows"]
     along, *turned = rows["strain_rows"]

@@ -301,9 +301,14 @@ def _response(structure: AffineStructure, displacement: FloatArray) -> StaticRes
 
 
 def natural_frequencies(
-    structure: AffineStructure, count: int, values: Mapping[str, float] | None = None
+    structure: AffineStructure,
+    count: int,
+    values: Mapping[str, float] | None = None,
+    factors: Factorisation | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Lowest frequencies (m,) [Hz], rising, and mass-normalised shapes (n, m), undamped; see `at` for values.
+
+    Who has the factorised stiffness at these values may give it.
 
     Raises
     ------
@@ -316,6 +321,6 @@ def natural_frequencies(
     stiffness, mass, _ = structure.at(values or {})
     if not mass.diagonal().any():
         raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")
-    squares, shapes = lowest_eigenpairs(stiffness, mass, count)
+    squares, shapes = lowest_eigenpairs(factors or stiffness, mass, count)
     shapes = shapes / np.sqrt(np.einsum("im,im->m", shapes, mass @ shapes))
     return np.sqrt(squares) / (2.0 * np.pi), shapes

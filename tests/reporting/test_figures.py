@@ -2,6 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
+from itertools import combinations
 
 import matplotlib as mpl
 import numpy as np
@@ -89,6 +90,4 @@ def test_the_palette_can_be_told_apart_in_grey_and_by_colour_blind_readers():
     colors = np.array([mpl.colors.to_rgb(c) for c in (figures.PAST, figures.PREDICTION, figures.TRUTH)])
     deuteranopia = np.array([[0.625, 0.375, 0.0], [0.70, 0.30, 0.0], [0.0, 0.30, 0.70]])
     seen = colors @ deuteranopia.T
-    for i in range(3):
-        for j in range(i):
-            assert np.linalg.norm(seen[i] - seen[j]) > 0.3
+    assert all(np.linalg.norm(one - other) > 0.3 for one, other in combinations(seen, 2))

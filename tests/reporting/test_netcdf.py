@@ -126,24 +126,16 @@ def spin(path: Path) -> object:
         pass
 
 
-def wait(path: Path) -> object:
-    time.sleep(1000.0)
-    return {}
+READINGS = {
+    "spin": spin,
+    "wait": lambda _: time.sleep(1000.0),
+    "crash": lambda _: os.abort(),
+    "fill": lambda _: {"a": xr.Dataset({"a": ("row", np.zeros(10**9, dtype=np.uint8))})},
+    "refuse": lambda _: {}["a\nb"],
+}
 
 
-def crash(path: Path) -> object:
-    os.abort()
-
-
-def fill(path: Path) -> object:
-    return {"a": xr.Dataset({"a": ("row", np.zeros(10**9, dtype=np.uint8))})}
-
-
-def refuse(path: Path) -> object:
-    raise KeyError("a\nb")
-
-
-@pytest.mark.parametrize("reading", [spin, wait, crash, fill, refuse])
+@pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
 def test_no_end_a_crash_and_a_full_memory_are_one_sentence(path, monkeypatch, capfd, reading):
     fork, readers = os.fork, []
 

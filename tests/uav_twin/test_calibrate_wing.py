@@ -35,6 +35,7 @@ from uav_twin import FmiAsset, assemble, load_calibration, load_design, reduced_
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 
+COARSE = ("refinement = 1.0", "refinement = 0.25")
 TRUTHS = {name: DigitalState(**own) for name, own in Inputs(__file__).table("wings.toml").items()}
 
 
@@ -65,7 +66,8 @@ def test_a_laboratory_is_simulated_with_its_truth(tmp_path):
     said(*simulate(tmp_path / "again", *given))  # bit for bit
     for file in sorted(path for path in out.rglob("*") if path.is_file()):
         assert file.read_bytes() == (tmp_path / "again" / file.relative_to(out)).read_bytes()
-    told = json.loads(said("calibrate", "--data", out, "--json"))
+    coarse = written(tmp_path, SHIPPED_DESIGN.read_text(encoding="utf-8"), COARSE)
+    told = json.loads(said("calibrate", "--data", out, "--design", coarse, "--json"))
     assert told["laboratory"].startswith("step1/geometry_data.csv read")
     assert [item["name"] for item in told["quantities"]][:2] == ["tip_stiffness", "frequency_1"]
     assert {"weighed_mass", "frequency_1"} <= {reading["name"] for reading in told["readings"]}
@@ -83,7 +85,7 @@ def test_an_fmu_and_another_design_are_measured_alike(tmp_path):
     for expected, seen in zip(read_records(model), read_records(flown), strict=True):
         assert seen.signal == pytest.approx(expected.signal, abs=1e-9)
     assert json.loads((flown / "truth.json").read_text(encoding="utf-8"))["bench"] == "wing.fmu"
-    changes = ("semi_span = 1.828", "semi_span = 1.9"), ("refinement = 1.0", "refinement = 0.25")
+    changes = ("semi_span = 1.828", "semi_span = 1.9"), COARSE
     design = written(tmp_path, SHIPPED_DESIGN.read_text(encoding="utf-8"), *changes)
     said(*simulate(tmp_path / "longer", "--design", design))
     truth = json.loads((tmp_path / "longer" / "truth.json").read_text(encoding="utf-8"))
@@ -327,7 +329,7 @@ def measured_planform(folder: Path, semi_span: float) -> Path:
 def test_the_model_follows_the_measured_planform(tmp_path):
     """The tailored wing is shorter and stiffer than the one on the drawing (a coarse mesh, for speed)."""
     text = SHIPPED_DESIGN.read_text(encoding="utf-8")
-    coarse = written(tmp_path, text, ("refinement = 1.0", "refinement = 0.25"))
+    coarse = written(tmp_path, text, COARSE)
     words = ("--data", measured_planform(tmp_path, 1818.0), "--design", coarse, "--out", tmp_path / "out")
     said("calibrate", *words, "--asset", "short wing", "--no-report")
     result = load_calibration(tmp_path / "out" / "calibration.nc")

@@ -222,9 +222,8 @@ class AssetSource:
         """The same twice."""
         return FlownAndBelieved(self.words, self.words, self.differ)
 
-    @property
     def uncertain(self) -> tuple[str, int]:
-        """Where draws of the parameter come from, in words, and how many there are."""
+        """Return where draws of the parameter come from, in words, and how many there are."""
         given = self._scenario.calibration
         return given.source.replace("_", " "), 1 if given.source == "fixed" else given.draws
 
@@ -310,14 +309,9 @@ class PairedSource(AssetSource):
 
     def __init__(self, asset: AssetSource, model: AssetSource, *, differ: bool = True) -> None:
         self._asset, self._model, self.differ = asset, model, differ
-        told = ("draws", "observation_table", "structural_table", "write_field")
+        told = ("uncertain", "draws", "observation_table", "structural_table", "write_field")
         for name, source in {"open": asset, **dict.fromkeys(told, model)}.items():
             setattr(self, name, getattr(source, name))
-
-    @property
-    def uncertain(self) -> tuple[str, int]:
-        """As of what is believed."""
-        return self._model.uncertain
 
     @property
     def origin(self) -> FlownAndBelieved:

@@ -29,7 +29,8 @@ from twin_master.assets.parameter import (
     ParameterDraws,
     check_calibration,
 )
-from twin_master.assets.structure_source import NamedStructure, StructureFmuSource, StructureSource
+from twin_master.assets.reduced_model import NamedStructure, ReducedModelSource
+from twin_master.assets.structure_source import StructureFmuSource
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
@@ -261,7 +262,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         )  # fmt: skip
 
 
-class DesignSource(_Wing, StructureSource):
+class DesignSource(_Wing, ReducedModelSource):
     """The reduced model of a wing design as what is believed, with effects where a patch gives some."""
 
     section: DesignBelief

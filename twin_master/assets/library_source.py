@@ -126,13 +126,10 @@ class ObservationLibrary:
         if set(names) != set(self.states.names):
             raise MissionInputError(said("assets.states", self=self, names=names))
         wanted = coordinates[:, [names.index(name) for name in self.states.names]]
-        for factor, asked in zip(self.states.factors, wanted.T, strict=True):
-            levels = np.array(factor.levels)
-            for level in np.unique(asked):
-                if _place(levels[:, None], level) is None:
-                    of = {"levels": _listed(levels), "name": factor.name}
-                    raise MissionInputError(said("assets.levels", level=level, **of))
-        return [_place(self.states.coordinates, state) or 0 for state in wanted]
+        try:
+            return [self.states.index(state) for state in wanted]
+        except InvalidModelError as error:
+            raise MissionInputError(said("assets.levels", error=error)) from None
 
     def control_of(self, name: str, values: Mapping[str, float]) -> int:
         """Return the index of the control whose inputs have the given values; its name does not matter.
@@ -144,11 +141,11 @@ class ObservationLibrary:
         """
         if set(values) != set(self.control_values):
             raise MissionInputError(said("assets.inputs", self=self, values=values))
-        known = np.column_stack([self.control_values[key] for key in values])
-        if (place := _place(known, np.array([*values.values()]))) is None:
+        known, wanted = np.column_stack([self.control_values[key] for key in values]), [*values.values()]
+        if not (same := np.isclose(known, wanted, rtol=_SAME, atol=0.0).all(axis=1)).any():
             shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
             raise MissionInputError(said("assets.control", shown=shown, name=name, self=self))
-        return place
+        return int(np.argmax(same))
 
     def at_draws(self, name: str, draws: Float) -> Float:
         """Return the observations (N, S, U, G) at N values of the parameter, linear between the sampled ones.
@@ -165,7 +162,7 @@ class ObservationLibrary:
             raise MissionInputError(said("assets.parameter", own=own, name=name))
         order = np.argsort(self.draws, kind="stable")
         nodes = self.draws[order]
-        slack = _SAME * max(1.0, float(np.abs(nodes).max()))
+        slack = _SAME * float(np.abs(nodes).max())
         if draws.min() < nodes[0] - slack or draws.max() > nodes[-1] + slack:
             ends = draws.min(), draws.max(), nodes[0], nodes[-1]
             raise MissionInputError(said("assets.draws", name=name, ends=ends))
@@ -175,12 +172,6 @@ class ObservationLibrary:
     def holds_draws(self, draws: Float) -> bool:
         """Return whether every value of the parameter was sampled, so that nothing is interpolated."""
         return bool(np.isin(draws, self.draws).all())
-
-
-def _place(known: Float, wanted: Float) -> int | None:
-    """Return which of the points (N, K) is the wanted one (K,); None if none is."""
-    distance = np.max(np.abs(known - wanted) / np.maximum(np.abs(wanted), 1.0), axis=1)
-    return int(distance.argmin()) if distance.min() <= _SAME else None
 
 
 def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
@@ -217,10 +208,6 @@ def load_observation_library(path: Path) -> ObservationLibrary:
     except (KeyError, ValueError, TypeError, InvalidModelError) as error:
         reason = error.args[0] if error.args else error
         raise MissionInputError(said("assets.layout", path=path, reason=reason)) from error
-
-
-def _listed(values: Float) -> str:
-    return ", ".join(f"{value:g}" for value in values)
 
 
 class LibraryBelief(BeliefSection):

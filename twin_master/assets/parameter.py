@@ -207,7 +207,8 @@ def check_calibration(
         It has a parameter that is not known, or one whose posterior mean lies outside its range; or it is of
         another design.
     """
-    if (found := _of_parameters(calibration)) is None:
+    found = read_calibration(calibration)
+    if found is None or found.design is not None:
         return
     names = {prior.name for prior in found.priors}
     rows = [("parameter", names, known)]
@@ -234,10 +235,7 @@ def is_of_parameters(file: Path | str) -> bool:
 
 def calibrated_means(calibration: Calibration) -> dict[str, float]:
     """Return the posterior means of the parameters of a model that were calibrated from a campaign, SI."""
-    found = _of_parameters(calibration)
-    return {} if found is None else {prior.name: found.mean(prior.name) for prior in found.priors}
-
-
-def _of_parameters(calibration: Calibration) -> "Calibrated | None":
     found = read_calibration(calibration)
-    return None if found is None or found.design is not None else found
+    if found is None or found.design is not None:
+        return {}
+    return {prior.name: found.mean(prior.name) for prior in found.priors}

@@ -88,7 +88,6 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         The scenario does not hold with them.
     """
     table = loaded.scenario.moved(loaded.path.resolve().parent).to_dict()
-    _check_overrides(overrides, table["asset"]["kind"])
     _change_asset(table, overrides)
     if overrides.library:
         design = table["belief"].get("design")
@@ -108,42 +107,30 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     return parse_scenario(table, f"{loaded.path}{beside}")
 
 
-def _check_overrides(overrides: Overrides, kind: str) -> None:
-    """Check that the overrides do not contradict each other, or what is flown."""
-    if overrides.strain_library and (overrides.fmu or overrides.binding):
-        raise MissionInputError("--strain-library flies no FMU: give either it or --fmu and --binding.")
-    if overrides.strain_library and overrides.library:
-        raise MissionInputError("--strain-library is asset and model itself: give either it or --library.")
-    if overrides.ssp and (overrides.strain_library or overrides.fmu):
-        raise MissionInputError("an SSP file is flown as it is: give neither --fmu nor --strain-library.")
-    if overrides.fmu and kind in ("coupled", "ssp"):
-        raise MissionInputError(said("assets.several"))
-
-
 def _change_asset(table: dict[str, Any], overrides: Overrides) -> None:
     """Let something else fly; what is said of the asset stays, as far as the other kind knows it."""
-    flown = table["asset"]["kind"]
-    if overrides.ssp:
-        _change_kind(table, "ssp", overrides.ssp)
-    if overrides.fmu:
-        _change_kind(table, "fmu", overrides.fmu)
-    if overrides.strain_library:
-        file = overrides.strain_library
-        _change_kind(table, "strain_library", file / FILE_NAME if file.is_dir() else file)
-        if flown != "strain_library":
-            table["belief"] = {"kind": "asset"}
+    flown, library = table["asset"], overrides.strain_library
+    others = {"ssp": overrides.ssp, "fmu": overrides.fmu, "strain_library": library}
+    given = [(kind, file) for kind, file in others.items() if file]
+    if len(given) > 1:
+        raise MissionInputError("one asset flies: give one of an SSP file, --fmu and --strain-library.")
+    if library and (overrides.binding or overrides.library):
+        raise MissionInputError(said("assets.itself"))
+    if overrides.fmu and flown["kind"] in ("coupled", "ssp"):
+        raise MissionInputError(said("assets.several"))
+    if given and flown.get("patch"):
+        raise MissionInputError(said("assets.patch"))
+    for kind, file in given:
+        known = AssetSection.kinds()[kind].model_fields
+        place = file / FILE_NAME if library and file.is_dir() else file
+        kept = {key: value for key, value in flown.items() if key in known and value != ""}
+        table["asset"] = kept | {"kind": kind, "file": str(place.resolve())}
+    if library and flown["kind"] != "strain_library":
+        table["belief"] = {"kind": "asset"}
     if overrides.binding:
         table["asset"]["binding"] = str(overrides.binding.resolve())
     if overrides.in_process and "isolated" in table["asset"]:
         table["asset"]["isolated"] = False
-
-
-def _change_kind(table: dict[str, Any], kind: str, file: Path) -> None:
-    if table["asset"].get("patch"):
-        raise MissionInputError(said("assets.patch"))
-    known = AssetSection.kinds()[kind].model_fields
-    kept = {key: value for key, value in table["asset"].items() if key in known and value != ""}
-    table["asset"] = kept | {"kind": kind, "file": str(file.resolve())}
 
 
 def _wings(table: dict[str, Any]) -> list[dict[str, Any]]:

@@ -214,9 +214,8 @@ class StrainLibrarySource(AssetSource):
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
             raise MissionInputError(said("assets.gauges", library=library, scenario=scenario))
 
-    @property
     def uncertain(self) -> tuple[str, int]:
-        """Samples of its own."""
+        """Return that it has samples of its own, and how many."""
         return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:

@@ -139,7 +139,7 @@ def in_credible_set(
     for axis, factor in enumerate(model.states.factors):
         distance = np.abs(np.asarray(factor.levels) - true_state[:, axis, None])  # (T, levels)
         level_distance = np.abs(model.states.coordinates[:, axis] - true_state[:, axis, None])
-        nearest &= level_distance <= distance.min(axis=1, keepdims=True) + _TOLERANCE
+        nearest &= level_distance <= distance.min(axis=1, keepdims=True) + factor.slack
     descending = -np.sort(-probability, axis=1)
     reached = np.cumsum(descending, axis=1) >= credibility - _TOLERANCE
     least = descending[np.arange(len(descending)), np.argmax(reached, axis=1)]

@@ -95,10 +95,13 @@ class LearntExpectation:
         last = (self.learning.hypotheses(carried[-1], weight) for weight in own)
         return stacked(self._known(found, *row) for found, row in zip(last, rows, strict=True))
 
-    def predicted(self, carried: Sequence[Carried], beliefs: Float, horizon: int) -> Expected:
-        """Return what is expected after each of T turns, of given filtered beliefs, of the H to come."""
-        rows = zip(carried, beliefs, strict=True)
-        return stacked(self._ahead(turn, belief, horizon) for turn, belief in rows)
+    def predicted(self, carried: Sequence[Carried], beliefs: Float, asked: Float, horizon: int) -> Expected:
+        """Return what is expected after each of T turns of given filtered beliefs, of the H to come.
+
+        Controls are asked for with the probabilities p(U | D) (T, S, U).
+        """
+        rows = zip(carried, beliefs, asked, strict=True)
+        return stacked(self._ahead(*row, horizon) for row in rows)
 
     def of_marginals(
         self, learnt: Mapping[str, Learnt], joint: Float, controls: slice, seen: Float | None
@@ -156,14 +159,14 @@ class LearntExpectation:
         found = self._of(hypotheses, _believing(hypotheses.weight, belief)[None, :, :, None], u, seen)
         return Expected(**{name: values[0] for name, values in vars(found).items()})
 
-    def _ahead(self, turn: Carried, belief: Float, horizon: int) -> Expected:
+    def _ahead(self, turn: Carried, belief: Float, asked: Float, horizon: int) -> Expected:
         hypotheses = self.learning.hypotheses(turn)
         rows, coming = _believing(hypotheses.weight, belief), np.empty((horizon, *hypotheses.weight.shape))
         step = self.learning.model.transition.matrix[turn.control_index]
         for h in range(horizon):
             rows, step = rows @ step, self._closed_loop
             coming[h] = rows
-        return self._of(hypotheses, coming[..., None] * self.policy, slice(None), None)
+        return self._of(hypotheses, coming[..., None] * asked, slice(None), None)
 
     def _of(self, hypotheses: Hypotheses, weight: Float, controls: slice, seen: Float | None) -> Expected:
         """Return what is expected under B beliefs (B, K, S, U') over hypotheses, states and controls."""

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
 from twin_master.errors import (
     ImpossibleObservation,
@@ -21,7 +22,7 @@ from twin_master.errors import (
     NotResumableError,
     TwinMasterError,
 )
-from twin_master.learning.expectation import expected_of
+from twin_master.learning.expectation import Expected, expected_of
 from twin_master.mission.journal import (
     JournalFile,
     array_of,
@@ -90,20 +91,44 @@ def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
     return told
 
 
+def expected_in(turns: History, knowledge: Knowledge, name: str, belief: Float) -> tuple[Expected, Float]:
+    """Return what is expected in turns, and the probability of each control there.
+
+    Parameters
+    ----------
+    turns : History
+    knowledge : Knowledge
+        Of the twin in these turns.
+    name : str
+        `filtered`, `smoothed` or `predicted`.
+    belief : (T, S), or (T, H, S) where it is predicted
+        Of that name.
+    """
+    learns, seen, more = knowledge.expectation, None, tuple[Any, ...]()
+    if name == "predicted":
+        asked = knowledge.asked(turns.unexplained)
+        joint = belief[..., None] * asked[:, None]  # (T, H, S, U), eqs. (37)-(39)
+        belief, more = turns.filtered, (asked, belief.shape[1])
+    else:
+        seen = turns.observed
+        joint, more = known_control(belief, turns.control_index, len(knowledge.model.controls)), (seen,)
+    if learns is None:
+        expected = expected_of(knowledge.sensor_model, knowledge.rewards, joint, seen)
+    else:
+        carried = [turn.concluded.carried for turn in turns.turns]
+        expected = getattr(learns, name)(carried, belief, *more)
+    return expected, joint.sum(axis=-2)
+
+
 def gap_of(history: History, skipped: int, knowledge: Knowledge) -> dict[str, Any]:
     """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
 
     The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
     """
-    left, learns, sensors = history.behind(skipped), knowledge.expectation, knowledge.sensor_model
+    left = history.behind(skipped)
     if not left.turns or np.isnan(left.observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    if learns is None:
-        joint = known_control(left.filtered, left.control_index, sensors.control_count)
-        expected = expected_of(sensors, knowledge.rewards, joint, None, quantiles=False)
-    else:
-        carried = [turn.concluded.carried for turn in left.turns]
-        expected = learns.filtered(carried, left.filtered, left.observed)
+    expected, _ = expected_in(left, knowledge, "filtered", left.filtered)
     residual = (left.observed - expected.mean) / expected.noise
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),

@@ -230,6 +230,12 @@ class Knowledge:
             return self.scenario.control_names.index(named)
         return int(np.argmax(self.rewards.planning_reward(1.0, 0.0).mean(axis=0)))
 
+    def asked(self, unexplained: ArrayLike) -> Float:
+        """Return p(U | D) of turns to come (..., S, U), the safest so far as no state is believed (...)."""
+        share = np.asarray(unexplained, dtype=np.float64)[..., None, None]
+        safest = np.eye(len(self.model.controls))[self.safest]
+        return np.asarray((1.0 - share) * self.plan.policy + share * safest)
+
     @cached_property
     def true_model(self) -> GraphicalModel:
         """States and transitions of what really happens, where it is random growth."""

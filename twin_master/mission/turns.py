@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from twin_master.network.estimator import Carried, Notice, Suspicion
+from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.twin import Twin, TwinTurn
 
 
@@ -105,7 +105,7 @@ class History:
         How the asset ended the mission before its last turn; empty where it did not.
     row : (T, G + I)
         All that came; `observed` and `readings` are its two parts, NaN where nothing was received.
-    control_index, log_evidence, filtered, predicted, decision_probability : (T, ...)
+    control_index, log_evidence, filtered, predicted, decision_probability, unexplained : (T, ...)
         As in `TwinTurn`.
     state, observation : (T, ...)
         As in `Happened`; of a simulated asset only.
@@ -126,6 +126,7 @@ class History:
     log_evidence = _Column("concluded.log_evidence")
     predicted = _Column("concluded.prediction.predicted")
     decision_probability = _Column("concluded.decision_probability")
+    unexplained = _Column("concluded.unexplained")
     state = _Column("reading.happened.state")
     observation = _Column("reading.happened.observation")
     seconds = _Column("seconds")
@@ -170,11 +171,6 @@ class History:
     def smoothed(self) -> Float:
         """p(D_k | all observations) (T, S)."""
         return self.twin.smoothed()[-len(self.turns) :]
-
-    @property
-    def carried(self) -> tuple[Carried, ...]:
-        """What the estimator carried on from each turn."""
-        return self.twin.carried[-len(self.turns) :]
 
     @property
     def suspicion(self) -> tuple[Suspicion, ...]:

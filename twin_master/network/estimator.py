@@ -183,6 +183,11 @@ class Estimate:
     suspicion: Suspicion | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
 
+    @property
+    def unexplained(self) -> float:
+        """Probability of what believes in no state."""
+        return sum(one.probability for one in self.hypotheses if one.belief is None)
+
 
 class Estimator(Protocol):
     """What holds the belief: the exact filter, or one that learns beside it."""

@@ -42,6 +42,11 @@ class Factor:
         if not levels or not np.all(np.isfinite(levels)) or np.any(np.diff(levels) <= 0.0):
             raise InvalidModelError(said("network.levels", name=self.name, levels=levels))
 
+    @property
+    def slack(self) -> float:
+        """By how much a value may miss a level by rounding: a billionth of the largest level."""
+        return 1e-9 * max(map(abs, self.levels))
+
 
 @dataclass(frozen=True)
 class StateSpace:
@@ -85,7 +90,7 @@ class StateSpace:
         return table
 
     def index(self, levels: Sequence[float]) -> int:
-        """Return the joint index of the given levels, one per factor (matched to 1e-9).
+        """Return the joint index of the given levels, one per factor (matched to `Factor.slack`).
 
         Raises
         ------
@@ -98,7 +103,7 @@ class StateSpace:
         for factor, value in zip(self.factors, levels, strict=True):
             distance = np.abs(np.asarray(factor.levels) - value)
             best = int(distance.argmin())
-            if not distance[best] <= 1e-9:
+            if not distance[best] <= factor.slack:
                 raise InvalidModelError(said("network.no_level", value=value, factor=factor))
             indices.append(best)
         return int(np.ravel_multi_index(indices, self.shape))

@@ -390,7 +390,7 @@ class Twin:
         prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
         decision_probability = self._decision(estimate.filtered, control_index)
         if self._safest is not None:
-            none = sum(one.probability for one in estimate.hypotheses if one.belief is None)
+            none = estimate.unexplained
             decision_probability = (1.0 - none) * decision_probability + none * self._safest
             prediction = prediction.mixed(none, self._safest)
         self._proposed = int(np.argmax(decision_probability))

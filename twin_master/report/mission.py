@@ -4,7 +4,7 @@ The belief over the joint states turn by turn, and the policy over the states.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,15 +29,6 @@ _DASHES = (0, (3, 1.2))
 _DOT: dict[str, Any] = {
     "color": style.OBSERVED, "linestyle": "none", "marker": "o", "markersize": 2.3, "markeredgewidth": 0.6,
 }  # fmt: skip
-
-
-class Band(NamedTuple):
-    """A line over steps with its band: (n,) each."""
-
-    step: Float
-    center: Float
-    lower: Float
-    upper: Float
 
 
 def default_now(run: Run) -> int:
@@ -134,18 +125,19 @@ def _zones(axes: Axes, run: Run, now: int, *, named: bool) -> None:
             axes.text(now + 0.5, height, "prediction", transform=where, ha="left", color=style.PREDICTION)
 
 
-def _draw(axes: Axes, past: Band, predicted: Band, truth: Float | None, now: int) -> None:
-    """Draw a course: past, present, prediction, and the truth from the first step on."""
-    for shown, color, label, look in (
-        (past, style.PAST, "past", {}),
-        (predicted, style.PREDICTION, "prediction", {"linestyle": _DASHES, "marker": ".", "markersize": 3.5}),
-    ):
-        known = np.isfinite(shown.center)
-        if known.any():
-            step, center, lower, upper = (values[known] for values in shown)
-            style.band(axes, step, lower, upper, color)
-            axes.plot(step, center, color=color, label=label, **look)  # type: ignore[arg-type]
-    _, mean, least, most = (float(values[-1]) for values in past)
+def _draw(axes: Axes, now: int, course: Float, truth: Float | None) -> None:
+    """Draw a course, its mean and ends (3, n), up to the present and predicted; and the truth beside it."""
+    steps = np.arange(course.shape[1])
+    ahead = {"linestyle": _DASHES, "marker": ".", "markersize": 3.5}
+    for part, color, label, look in (
+        (steps[: now + 1], style.PAST, "past", {}), (steps[now + 1 :], style.PREDICTION, "prediction", ahead),
+    ):  # fmt: skip
+        known = part[np.isfinite(course[0, part])]
+        if len(known):
+            center, lower, upper = course[:, known]
+            style.band(axes, known, lower, upper, color)
+            axes.plot(known, center, color=color, label=label, **look)  # type: ignore[arg-type]
+    mean, least, most = course[:, now].tolist()
     if np.isfinite(mean):
         axes.errorbar(
             [now], [mean], yerr=[[max(mean - least, 0.0)], [max(most - mean, 0.0)]],
@@ -153,28 +145,26 @@ def _draw(axes: Axes, past: Band, predicted: Band, truth: Float | None, now: int
             zorder=4, label="present",
         )  # fmt: skip
     if truth is not None:
-        seen = truth[: now + 1 + len(predicted.step)]
-        axes.plot(np.arange(len(seen)), seen, **style.TRUTH_LINE, label="truth")
+        seen = truth[: len(steps)]
+        axes.plot(steps[: len(seen)], seen, **style.TRUTH_LINE, label="truth")
 
 
-def _bands(run: Run, name: str, index: int, now: int, scale: float) -> tuple[Band, Band]:
-    """Return past and prediction of `quantity` or `reward` in printed units, with 95 % intervals.
+def _course(run: Run, name: str, index: int, now: int) -> Float:
+    """Return `quantity` or `reward` up to a turn and as predicted there, with 95 % intervals, SI: (3, n).
 
     The past is seen in hindsight at the last turn, and as seen at the time before that.
     """
-    found = []
     past = "smoothed" if now == run.steps - 1 else "filtered"
-    for group, part, first in ((past, slice(0, now + 1), 0), ("predicted", now, now + 1)):
-        mean = scale * run[f"{group}/{name}_mean"][part][..., index]
-        if name == "reward":
-            half = NORMAL_95 * run[f"{group}/reward_standard_deviation"][part][..., index]
-            lower, upper = mean - half, mean + half
-        else:
-            lower, upper = (
-                scale * run[f"{group}/{name}_{end}"][part][..., index] for end in ("lower", "upper")
-            )
-        found.append(Band(np.arange(float(first), first + len(mean)), mean, lower, upper))
-    return found[0], found[1]
+
+    def seen(figure: str) -> Float:
+        own, coming = (run[f"{group}/{name}_{figure}"][..., index] for group in (past, "predicted"))
+        return np.concatenate((own[: now + 1], coming[now]))
+
+    mean = seen("mean")
+    if name == "reward":
+        half = NORMAL_95 * seen("standard_deviation")
+        return np.array([mean, mean - half, mean + half])
+    return np.array([mean, seen("lower"), seen("upper")])
 
 
 def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
@@ -185,17 +175,15 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
         np.arange(now + 1), at_the_time, color=style.PRESENT, linewidth=0.9, label="as seen at the time"
     )
     if now == run.steps - 1:
-        mean, deviation = run["smoothed/mean"], run["smoothed/standard_deviation"]
+        past = run["smoothed/mean"], run["smoothed/standard_deviation"]
     else:
-        past, states = run.smoothed_until(now), run.model.states
-        mean, deviation = states.mean(past), states.standard_deviation(past)
+        belief, states = run.smoothed_until(now), run.model.states
+        past = states.mean(belief), states.standard_deviation(belief)
     coming = run["predicted/mean"][now], run["predicted/standard_deviation"][now]
-    found = []
-    for first, (center, spread) in ((0, (mean, deviation)), (now + 1, coming)):
-        middle, half = factor.scale * center[:, index], 2.0 * factor.scale * spread[:, index]
-        ends = (np.clip(middle + sign * half, factor.levels[0], factor.levels[-1]) for sign in (-1.0, 1.0))
-        found.append(Band(np.arange(float(first), first + len(middle)), middle, *ends))
-    _draw(axes, found[0], found[1], None if run.truth is None else factor.scale * run.truth[:, index], now)
+    mean, deviation = (factor.scale * np.vstack(parts)[:, index] for parts in zip(past, coming, strict=True))
+    ends = np.clip(mean + np.array([[-2.0], [2.0]]) * deviation, factor.levels[0], factor.levels[-1])
+    truth = None if run.truth is None else factor.scale * run.truth[:, index]
+    _draw(axes, now, np.vstack((mean, ends)), truth)
     margin = 0.075 * (factor.levels[-1] - factor.levels[0]) or 6.0
     axes.set_yticks(factor.levels, [short_number(level) for level in factor.levels])
     axes.set(ylim=(factor.levels[0] - margin, factor.levels[-1] + margin), ylabel=factor.label)
@@ -215,10 +203,8 @@ def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
         look = {**_DOT, "marker": "x", "transform": axes.get_xaxis_transform()}
         axes.plot(lost, np.full(len(lost), 0.04), **look, label="lost")
     truth = run.get(f"truth/{sensors.quantity}")
-    _draw(
-        axes, *_bands(run, "quantity", sensor, now, sensors.scale),
-        None if truth is None else sensors.scale * truth[:, sensor], now,
-    )  # fmt: skip
+    truth = None if truth is None else sensors.scale * truth[:, sensor]
+    _draw(axes, now, sensors.scale * _course(run, "quantity", sensor, now), truth)
     axes.margins(y=0.12)
     unit = sensors.units[sensor]
     axes.set_ylabel(unit if sensors.named else f"{sensors.quantity} ({unit})")
@@ -256,7 +242,7 @@ def _control_panel(axes: Axes, run: Run, _index: int, now: int) -> str:
 
 
 def _reward_panel(axes: Axes, run: Run, reward: int, now: int) -> str:
-    _draw(axes, *_bands(run, "reward", reward, now, 1.0), None, now)
+    _draw(axes, now, _course(run, "reward", reward, now), None)
     axes.margins(y=0.15)
     axes.set_ylabel("reward")
     return f"{capital(REWARD_NAMES[reward])} reward"

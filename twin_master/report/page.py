@@ -17,7 +17,7 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Page, ReportFigure, Words
 from reporting.words import counted, listing, parameter_title, small
 from twin_master.assets.asset_source import calibrated_with
-from twin_master.assets.structure_source import FIELD_NAME
+from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.errors import RunFolderError
 from twin_master.report import mission as course
 from twin_master.report import model as tailored
@@ -229,16 +229,11 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
         name=parameter_title(run.scenario.calibration.parameter), draws=run["calibration/draw_value"],
         unit="dimensionless" if unit == "1" else unit,
     )  # fmt: skip
-    yield from _structure(run, folder, check)
-
-
-def _structure(run: Run, folder: Path, check: tailored.PredictiveCheck) -> Iterator[ReportFigure]:
-    """Draw the structure itself, where the run holds the planform of its wing or the field of its mesh."""
     planform = planform_of(design_of(folder), run.scenario)
     if (folder / FIELD_NAME).is_file():
         picture = mesh_figure(run, folder, check.residual[-1])
         yield WORDS.figure("structure", picture.figure, run=run, picture=picture)
-    elif planform is not None:
+    elif planform is not None:  # of a wing
         figure = planform_figure(run, planform, check.residual[-1])
         yield WORDS.figure("structure", figure, run=run, picture=None)
 

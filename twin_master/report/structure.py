@@ -22,7 +22,8 @@ from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
 from reporting.arrays import Float
 from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY
-from twin_master.assets.structure_source import FIELD_NAME, FLOWN_COPY, MODEL_COPY
+from twin_master.assets.reduced_model import FIELD_NAME
+from twin_master.assets.structure_source import FLOWN_COPY, MODEL_COPY
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy
 from twin_master.report.reading import Run

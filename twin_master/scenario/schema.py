@@ -5,6 +5,7 @@ what is kept here, and in `config.json` of a run, is in SI. Nothing here knows a
 another scenario file.
 """
 
+import math
 import tomllib
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -46,7 +47,8 @@ from twin_master.sentences import said
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge beyond which a unit was forgotten [1]."""
 _DECIMALS = 12
-"""Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
+"""Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %; to more
+where a state is small in its unit."""
 REWARD_NAMES = ("health", "control", "error")
 """The rewards (9)-(11)."""
 FIGURES: dict[str, dict[str, tuple[str, str]]] = tomllib.loads(
@@ -245,7 +247,12 @@ class Scenario(Section):
         for entry in self.truth.gains:
             last = entry.first_step if entry.last_step is None else entry.last_step
             gain[entry.first_step : last + 1, self.state_names.index(entry.state)] += entry.gain
-        return np.asarray(np.round(np.cumsum(gain, axis=0), _DECIMALS))
+        history = np.cumsum(gain, axis=0)
+        for state in history.T:
+            largest = np.abs(state).max()
+            above = math.ceil(math.log10(largest)) if 0.0 < largest < 1.0 else 0
+            state[:] = np.round(state, _DECIMALS - above)
+        return history
 
     @property
     def another_model(self) -> bool:

@@ -83,21 +83,19 @@ class Section(toml_file.Section):
         known = {
             name: f"{name}[_{cls.units[name]}]" if name in cls.units else name for name in cls.model_fields
         }
-        given = {str(key): cls.split_unit(str(key)) for key in table}
-        bases = {base for base, _ in given.values()}
-        for key, (base, _) in given.items():
+        converted: dict[str, object] = {}
+        for key, value in table.items():
+            base, unit = cls.split_unit(str(key))
             if base not in known:
                 raise ValueError(f"unknown key `{key}`; the keys known there are {', '.join(known.values())}")
-        for name in cls.units:
-            if cls.model_fields[name].is_required() and name not in bases:
-                raise ValueError(f"`{known[name]}` is missing")
-        converted: dict[object, object] = {}
-        for (key, (base, unit)), value in zip(given.items(), table.values(), strict=True):
-            if base in table and unit:
-                raise ValueError(f"`{base}` and `{key}` were both given: keep one of them")
+            if base in converted:
+                raise ValueError(f"`{base}` was given with and without its unit: keep one of them")
             if unit == "percent":
                 _check_percent(key, value)
             converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
+        for name in cls.units:
+            if cls.model_fields[name].is_required() and name not in converted:
+                raise ValueError(f"`{known[name]}` is missing")
         return converted
 
     @classmethod

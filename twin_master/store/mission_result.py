@@ -204,10 +204,10 @@ class MissionResult:
     @property
     def spans(self) -> list[tuple[Knowledge, slice]]:
         """What the twin knew, and in which of the turns."""
-        models = in_turn(self.models)[1:]
-        ends = [max(0, model.from_turn - self.flight.first_turn) for model in models]
-        known = [model.knowledge for model in in_turn(self.models)[:-1]] + [self.knowledge]
-        return [*zip(known, map(slice, [0, *ends], [*ends, len(self.flight.turns)]), strict=True)]
+        models = in_turn(self.models) or [BelievedModel(0, self.knowledge)]
+        starts = [max(0, model.from_turn - self.flight.first_turn) for model in models]
+        parts = map(slice, starts, [*starts[1:], len(self.flight.turns)])
+        return [(model.knowledge, part) for model, part in zip(models, parts, strict=True)]
 
     @property
     def state_unit(self) -> str:

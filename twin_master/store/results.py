@@ -1,6 +1,7 @@
 """A flown mission as labelled arrays, and as tables for people."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from itertools import cycle
 from types import MappingProxyType
 from typing import Any
@@ -8,14 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.arrays import Float
 from reporting.groups import Group, Variable
 from reporting.table_file import table_text
-from twin_master.learning.expectation import Expected, expected_of, joined
-from twin_master.mission.preparation import Knowledge
+from twin_master.learning.expectation import joined
+from twin_master.mission.loop import expected_in
 from twin_master.mission.truth import SensorStatus, Truth
-from twin_master.mission.turns import History
-from twin_master.network.inference import known_control
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
@@ -133,7 +131,10 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]
         ("predicted", flight.predicted, f"{so_far}, through the policy"),
     ):
         flown = name != "predicted"
-        parts = [_expected(own, flight, name, belief, part) for own, part in result.spans]
+        parts = [
+            expected_in(replace(flight, turns=flight.turns[part]), own, name, belief[part])
+            for own, part in result.spans
+        ]
         expected = joined([part for part, _ in parts])
         values = {
             "probability": belief,
@@ -161,25 +162,6 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]
         elif name == "predicted":
             values["control_probability"] = np.concatenate([asked for _, asked in parts])
         yield name, made.group(name, _plain(values), words)
-
-
-def _expected(
-    known: Knowledge, flight: History, name: str, belief: Float, part: slice
-) -> tuple[Expected, Float]:
-    """Return what is expected in some turns, and the probability of each control there."""
-    seen, learns, given = flight.observed[part], known.expectation, belief[part]
-    if name == "predicted":
-        joint = given[..., None] * known.plan.policy  # (T, H, S, U), eqs. (37)-(39)
-        given = flight.filtered[part]
-    else:
-        joint = known_control(given, flight.control_index[part], len(known.model.controls))
-    ahead = name == "predicted"
-    if learns is None:
-        expected = expected_of(known.sensor_model, known.rewards, joint, None if ahead else seen)
-    else:
-        more = belief.shape[1] if ahead else seen
-        expected = getattr(learns, name)(flight.carried[part], given, more)
-    return expected, joint.sum(axis=-2)
 
 
 def _learnt(result: MissionResult) -> Iterator[Entry]:

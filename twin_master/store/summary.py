@@ -14,7 +14,6 @@ from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MissionResult, printed_learnt, titles_of
 
-_TOLERANCE = 1e-9
 _CHANGES_SAID = 3
 
 Words = Mapping[str, object]
@@ -106,7 +105,7 @@ def find_fallback(
     if switch is None:
         return Fallback()
     axis, level = switch
-    called = _first(true_state[:, axis] >= level - _TOLERANCE)
+    called = _first(true_state[:, axis] >= level - states.factors[axis].slack)
     left = control_index != first_control
     before = np.arange(len(left)) < (len(left) if called is None else called)
     return Fallback(states.factors[axis].name, level, called, _first(left & ~before), _first(left & before))

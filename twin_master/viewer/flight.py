@@ -200,34 +200,38 @@ class Flight:
 
     def believed(self, turns: Sequence[Record]) -> Belief:
         """Return what the twin believed of each of n turns when it was flown."""
-        joint = known_control(
+        filtered, controls = (
             np.array([turn["filtered"] for turn in turns]),
             [turn["control_index"] for turn in turns],
-            len(self.knowledge.model.controls),
         )
-        decided, observed = np.array([turn["decision_probability"] for turn in turns]), self.observed(turns)
-        if self.knowledge.expectation is None:
-            return self._belief(joint, observed, decided)
-        parts = []
-        for turn, own, seen in zip(turns, joint, observed, strict=True):
-            u = slice(turn["control_index"], turn["control_index"] + 1)
-            parts.append(self.knowledge.expectation.of_marginals(_learnt(turn), own[None, :, u], u, seen))
-        return Belief(joint.sum(axis=-1), joined(parts), decided)
+        joint = known_control(filtered, controls, len(self.knowledge.model.controls))
+        observed, learns = self.observed(turns), self.knowledge.expectation
+        if learns is None:
+            expected = self._expected(joint, observed)
+        else:
+            parts = []
+            for turn, own, seen in zip(turns, joint, observed, strict=True):
+                u = slice(turn["control_index"], turn["control_index"] + 1)
+                parts.append(learns.of_marginals(_learnt(turn), own[None, :, u], u, seen))
+            expected = joined(parts)
+        return Belief(filtered, expected, np.array([turn["decision_probability"] for turn in turns]))
 
     def predicted(self, turn: Record) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""
-        model, plan = self.knowledge.model, self.knowledge.plan
-        horizon, filtered = self.scenario.mission.prediction_steps, array_of(turn["filtered"])
-        coming = predict(model, filtered, turn["control_index"], plan.policy, horizon)
-        if self.knowledge.expectation is None:
-            return self._belief(coming.joint, None, coming.control_probability)
-        expected = self.knowledge.expectation.of_marginals(_learnt(turn), coming.joint, slice(None), None)
-        return Belief(coming.joint.sum(axis=-1), expected, coming.control_probability)
+        known, horizon = self.knowledge, self.scenario.mission.prediction_steps
+        flown, learns = (array_of(turn["filtered"]), turn["control_index"]), known.expectation
+        coming = predict(known.model, *flown, known.plan.policy, horizon).predicted
+        none = turn.get("suspicion", {}).get("hypotheses", {}).get("none of these", 0.0)
+        joint = coming[..., None] * known.asked(none)
+        if learns is None:
+            expected = self._expected(joint, None)
+        else:
+            expected = learns.of_marginals(_learnt(turn), joint, slice(None), None)
+        return Belief(coming, expected, joint.sum(axis=-2))
 
-    def _belief(self, joint: Float, observed: Float | None, control_probability: Float) -> Belief:
+    def _expected(self, joint: Float, observed: Float | None) -> Expected:
         known = self.knowledge
-        expected = expected_of(known.sensor_model, known.rewards, joint, observed, quantiles=False)
-        return Belief(joint.sum(axis=-1), expected, control_probability)
+        return expected_of(known.sensor_model, known.rewards, joint, observed, quantiles=False)
 
 
 def _learnt(record: Record) -> dict[str, Learnt]:

@@ -319,14 +319,16 @@ class Watch:
     def told(self, first: int) -> list[tuple[int, Notice]]:
         """Return what the operator was told in the turns from `first` on, each sentence once.
 
-        What was told before the first turn counts to it.
+        What was told before the first turn counts to it. The first alarm is told whenever it was raised.
         """
-        told: dict[str, tuple[int, Notice]] = {}
+        early, told = self.teaching.first_alarm, dict[str, tuple[int, Notice]]()
         lines = takewhile(lambda line: max(line[0].get("turn", 0), 0) >= first, records_backwards(self._path))
+        found = [early] if early is not None and early[0] < first else []
         for record in reversed([record for record, *_ in lines if "notices" in record]):
-            for notice in record["notices"]:
-                found = {**notice, "sensors": tuple(notice["sensors"])}
-                told.setdefault(notice["sentence"], (max(record["turn"], 0), Notice(**found)))
+            found += [(max(record["turn"], 0), notice) for notice in record["notices"]]
+        for turn, notice in found:
+            known = Notice(**{**notice, "sensors": tuple(notice["sensors"])})
+            told.setdefault(known.sentence, (turn, known))
         return [*told.values()]
 
     def _figures(self, counts: Counts, turns: int) -> list[Told]:

@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -282,17 +282,10 @@ def watch(
                 counts = watched.run(feed, decide, between, turns=turns, patched=patch, untold=untold)
             watched.store(counts, last=last, report=report)
         except Exception as error:
-            kept = _observed(watched.folder)
+            kept = watched.teaching.turn >= 0
             error.add_note(said("watch.kept", folder=watched.folder) if kept else said("watch.begun"))
             raise
     return watched.folder
-
-
-def _observed(folder: Path) -> bool:
-    """Return whether a watch has any turn, or may have."""
-    with suppress(NotResumableError):
-        return last_turn(folder / JOURNAL_NAME)[0] >= 0
-    return True
 
 
 def _read(

@@ -201,6 +201,8 @@ class Teaching:
         Notices that go with the next turn.
     adopted : list of dict
         The models that were adopted, as the journal has them.
+    first_alarm : tuple or None
+        The turn of the first alarm, and its notice.
     """
 
     threshold: float
@@ -209,6 +211,7 @@ class Teaching:
     trial: dict[str, Any] | None = None
     untold: list[dict[str, Any]] = field(default_factory=list)
     adopted: list[dict[str, Any]] = field(default_factory=list)
+    first_alarm: tuple[int, Mapping[str, Any]] | None = None
     _alarm: tuple[int, int] | None = None
     _ask_at: int = 0
     _since: int = 0
@@ -258,6 +261,7 @@ class Teaching:
             if notice["kind"] == "alarm":
                 self._alarm = self.turn, int(notice.get("since") or 0)
                 self._ask_at = self.turn + SETTLE_TURNS
+                self.first_alarm = self.first_alarm or (self.turn, notice)
 
     def _ask(self, suspicion: Mapping[str, Any]) -> None:
         if self._alarm is None or self.question or self.trial or self.turn < self._ask_at:

@@ -14,8 +14,11 @@ from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import attempt, fit
+from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import _distance
+from discrepancy.location.locate import locate
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.search.honest_evidence import left_by, refitted, widened
 from discrepancy.sources.examples import example_campaign, plan_for
@@ -199,3 +202,22 @@ def test_colour_of_the_noise_is_told_from_a_remainder():
         # what the record's own autoregression took out is no remainder, nor is what it left
         assert size == (0.0 if of_noise else pytest.approx(1.5, rel=0.5))
         assert left.is_noise is of_noise
+
+
+def test_colour_of_the_noise_is_no_gap_where_stamps_are_uneven_and_it_stays():
+    generator, wrong = np.random.default_rng(5), [0, 0]
+    time = 0.01 * np.arange(500)
+    root = np.linalg.cholesky((covariance(time, 1.5, 0.03, 0.0) + np.eye(500)) / (1.0 + 1.5**2))
+    for seed in range(12):
+        samples = 0.02 * np.sqrt(1.0 + 1.5**2) * root @ generator.standard_normal(len(time))
+        record = NoiseRecord(float(samples.std()), 499.0, samples - samples.mean(), 0.01, "pre-trigger")
+        problem, _, _ = ringing(seed, 400, coloured(1.5, 0.03, 0.0, seed))
+        trials = (item.rows(np.sort(generator.permutation(400)[:320])) for item in problem.campaign.trials)
+        problem = kit.problem_of(replace(problem.campaign, trials=tuple(trials)), problem.model)
+        problem = kit.with_noise(problem, y1=record)
+        found = kit.fitted(problem)
+        wrong[0] += absolute_gate(problem, replace(found, remainder=left_by(problem, found))).passed is False
+        located = locate(residual_set(problem, found))
+        assert all(cell.channel != "y1" for cell in located.cells)
+        wrong[1] += located.disagrees
+    assert max(wrong) <= 1

@@ -147,7 +147,7 @@ def test_files_that_cannot_be_flown_are_refused_before_a_folder_is_made(folder, 
     bad.write_bytes(b"nothing")
     for overrides, words in (
         (Overrides(fmu=fmu), "the scenario couples several"),
-        (Overrides(ssp=bad, fmu=fmu), "give neither --fmu"),
+        (Overrides(ssp=bad, fmu=fmu), "give one of an SSP file"),
         (Overrides(ssp=tmp_path / "none.ssp"), "none.ssp cannot be read"),
         (Overrides(ssp=bad), "not a sound SSP archive"),
     ):

@@ -272,15 +272,3 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
     passed = draw / (1.0 + fouling * draw) / ((slope * draw + offset) * flow)
     shown = 20.0 + 60.0 * (1.0 - np.exp(-np.stack([0.5 * passed, passed], axis=-1)))
     np.testing.assert_allclose(known.predicted, shown, rtol=1e-4 if way == "swept" else 1e-12)
-
-
-@pytest.mark.long
-def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path):
-    library = Overrides(library=sampled(tmp_path))
-    fly(small_pump(), tmp_path / "asked")
-    fly(small_pump(), tmp_path / "sampled", library)
-    names = [f"csv/{file.name}" for file in (tmp_path / "asked" / "csv").iterdir()]
-    check_same(tmp_path / "sampled", tmp_path / "asked", *names)
-    # With another seed the draws are others, inside the sampled range only for some.
-    with pytest.raises(MissionInputError, match="scenario and seed"):
-        fly(small_pump(), tmp_path / "other", Overrides(library=library.library, seed=3))

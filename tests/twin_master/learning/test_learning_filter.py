@@ -211,11 +211,8 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
 @pytest.mark.parametrize("other", [None, np.array([0.2, 0.7, 0.1])])
 def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation, other):
     """Where the model does not decide alone, the belief about the state is `other`."""
-    carried, seen, rewards = (
-        [turn.carried for turn in turns],
-        observations(),
-        RewardModel(sensors(), *SETTINGS),
-    )
+    carried, seen = [turn.carried for turn in turns], observations()
+    rewards = RewardModel(sensors(), *SETTINGS)
     believed = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
     if other is not None:
         believed = (np.tile(other, (STEPS, 1)),) * 2
@@ -247,7 +244,7 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
 
 
 def test_predicted_follows_the_scenario_through_the_policy(turns, expectation):
-    found = expectation.predicted([turns[2].carried], [turns[2].filtered], 2)
+    found = expectation.predicted([turns[2].carried], [turns[2].filtered], [POLICY], 2)
     table = enumerated(3).sum(axis=(0, 1, 4))  # (S, E)
     table = table / table.sum()
     matrix, value = model().transition.matrix, sensors().value_per_draw

@@ -205,9 +205,12 @@ def test_the_view_shows_what_was_learnt(folder, run):
 def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario, run):
     knowledge = prepare_twin(str(scenario))
     history = History(twin := knowledge.twin(), 24)
-    observed = run["observed"].to_dataset()
-    for row, control in zip(observed["strain"].values, observed["control_index"].values, strict=True):
-        history.add(Turn(Reading(row), twin.turn(row, int(control))))
+    observed, coming = run["observed"].to_dataset(), run["predicted"]["control_probability"].values
+    rows = zip(observed["strain"].values, observed["control_index"].values, coming, strict=True)
+    for row, control, stored in rows:
+        concluded = twin.turn(row, int(control))
+        np.testing.assert_allclose(stored, concluded.prediction.control_probability, atol=1e-12)
+        history.add(Turn(Reading(row), concluded))
     gap = gap_of(history, 4, knowledge)
     residual = run["filtered"]["residual"].values[4:]
     assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))

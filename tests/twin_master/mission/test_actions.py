@@ -15,7 +15,7 @@ import uav_twin
 from tests.command_line import said
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
-from tests.twin_master.runs import edited, flight_of, of_wing, text_of, written
+from tests.twin_master.runs import edited, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
@@ -157,17 +157,6 @@ def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp
     assert "learnt" in run
     assert "notice" in run
     assert "belief predicted" in run["filtered"]["decision_probability"].attrs["long_name"]
-
-
-def test_missions_side_by_side_are_those_alone_with_readings_and_repairs():
-    known = knowledge("qmdp")
-    together = side_by_side(known, 3)
-    alone = flight_of(*of_wing(known.scenario), seed=1)
-    assert np.array_equal(together.control_index[1], alone.control_index)
-    assert np.array_equal(together.filtered[1], alone.filtered)
-    for states, controls in zip(together.state, together.control_index, strict=True):
-        assert not states[1:][controls[:-1] == REPAIR_1, 0].any()
-    assert (together.control_index == REPAIR_1).any()
 
 
 def test_an_action_that_ends_ends_the_mission():

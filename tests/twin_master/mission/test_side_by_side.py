@@ -62,6 +62,10 @@ def test_each_twin_flies_what_it_flies_alone(name, decide_on, library_file):
     alone = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truths[4], asset))
     assert np.array_equal(alone.control_index, together.control_index[4])
     assert len(np.unique(together.state[:, -1], axis=0)) > 1 or name != "growing_damage"
+    if name == "inspected_wing":  # a region is sound behind its repair
+        places = knowledge.scenario.control_names.index("repair_1"), together.control_index[:, :-1]
+        assert (together.state[:, 1:, 0] == 0.0)[places[1] == places[0]].all()
+        assert (places[1] == places[0]).any()
 
 
 class Remembering:

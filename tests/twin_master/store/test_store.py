@@ -3,13 +3,15 @@
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from reporting.errors import FileNotWrittenError
-from tests.twin_master.runs import flight_of, of_library
-from twin_master.errors import RunFolderError
+from tests.twin_master.runs import changed_scenario, flight_of, of_library, table_of
+from twin_master.errors import InvalidModelError, RunFolderError
+from twin_master.fleet.store import in_credible_set
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Reference
@@ -132,6 +134,26 @@ def test_fallback(gentle, truth, delay, early):
     assert (found.delay, found.early_step) == (delay, early)
     told = list(of_fallback(found, SCENARIO)[2])  # one that came before the damage has no delay
     assert told[3:] == [None if early == 29 else delay, early]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-13, 1e9])
+def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
+    """History, fallback and credible sets of leaks of square millimetres, told in square metres, too."""
+    changes: dict[str, Any] = {"state": table_of("level_turns")["state"], "truth": {"gains": []}}
+    for factor in changes["state"]:
+        factor["levels"] = [unit * level / 100 for level in factor.pop("levels_percent")]
+    for gain in table_of("level_turns")["truth"]["gains"]:
+        changes["truth"]["gains"].append(gain | {"gain": unit * gain.pop("gain_percent") / 100})
+    scenario = changed_scenario("level_turns", changes).scenario
+    model, truth = build_graphical_model(scenario), scenario.scripted_history()
+    np.testing.assert_allclose(truth, unit * SCENARIO.scripted_history(), rtol=1e-12)
+    assert find_fallback(model.states, POLICY, 1, controls(40), truth).called_for_step == 30
+    belief = np.tile(model.states.certain((0.2 * unit, 0.4 * unit)), (50, 1))
+    expected = in_credible_set(MODEL, belief, SCENARIO.scripted_history())
+    np.testing.assert_array_equal(in_credible_set(model, belief, truth), expected)
+    assert expected.sum() == 6
+    with pytest.raises(InvalidModelError, match="no level of factor"):
+        model.states.index((0.3 * unit, 0.0))
 
 
 def test_rms_error_of_a_certain_belief():

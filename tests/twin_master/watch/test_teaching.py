@@ -79,6 +79,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     assert asked["decided_by"] == "gauge 5 off"
     assert asked["hypotheses"]["gauge 5 off"] > 0.9
     assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
+    assert watch.told(asked["turn"])[0] == watch.told(0)[0]  # the first alarm also in that of the last turns
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2

@@ -302,9 +302,6 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_pat
     line = [sys.executable, "-m", "uav_twin", "watch", str(scenario.path), "--no-report"]
     out, pipe = ["--out", str(tmp_path / "watch")], subprocess.PIPE
     with subprocess.Popen([*line, *out], stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
-        assert process.stdin
-        assert process.stdout
-        assert process.stderr
         process.stdin.write("".join(lines[:2]))
         process.stdin.flush()
         assert json.loads(process.stdout.readline())["turn"] == 0
@@ -416,12 +413,8 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
 def test_a_turn_without_observation_has_its_number_in_a_report_of_the_last_ones(scenario, mission, tmp_path):
     rows = mission.observed[:10].copy()
     rows[8] = np.nan
-    controls = ["3g"] * 8 + ["2g"] * 2
-    messages = [
-        {"turn": turn, "strain": row.tolist(), "control": control}
-        for turn, (row, control) in enumerate(zip(rows, controls, strict=True))
-    ]
-    uav_twin.watch(scenario, messages, tmp_path / "watch", last=4, report=False)
+    path = write_csv(tmp_path / "m.csv", rows, np.array([1] * 8 + [0] * 2))
+    uav_twin.watch(scenario, path, tmp_path / "watch", last=4, report=False)
     assert figures_of(tmp_path / "watch")["blind_steps"] == "8"
     summary = json.loads((tmp_path / "watch" / "summary.json").read_text())
     assert summary["control"] == "left 3g for 2g at turn 8"
