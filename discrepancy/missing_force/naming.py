@@ -204,7 +204,7 @@ class ForceSearch:
         return self.columns.bare()
 
     def rough(self, port: str) -> Explained:
-        """Return the missing force at a port as one that may jump, along the motion that the smooth one gives."""
+        """Return the missing force at a port as one that may jump, along the motion of the smooth one."""
         found = self.at[port]
         begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
         return seen(self.columns.along(found.view, found.motions), self.about(begin), begin)
