@@ -204,10 +204,16 @@ class ForceSearch:
         return self.columns.bare()
 
     def rough(self, port: str) -> Explained:
-        """Return the missing force at a port as one that may jump, along the motion of the smooth one."""
+        """Return the missing force at a port as one that may jump, linear about the motion that it gives."""
         found = self.at[port]
-        begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
-        return seen(self.columns.along(found.view, found.motions), self.about(begin), begin)
+        for _ in range(2):
+            self.point = self._point(found)
+            view = self._view()
+            for _ in range(2):
+                view = self.columns.along(view, view.smoothed(found.processes)[2])
+            begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
+            found = seen(view, self.about(begin), begin)
+        return found
 
     def whole_point(self, found: Explained) -> Point:
         """Return the point of a hypothesis, from which a fit may begin."""
