@@ -74,7 +74,7 @@ def test_numbers_that_no_file_or_float_holds_or_come_twice_are_refused():
         ("observation", "standard_deviation_microstrain", 10**400,
          r"observation\.standard_deviation.*finite"),
         ("rewards", "health_weight", 10**5000, r"rewards\.health_weight.*thousands of digits"),
-        ("observation", "standard_deviation", 1e-4, "given with and without its unit"),  # with and without unit
+        ("observation", "standard_deviation", 1e-4, "given with and without its unit"),
     ):  # fmt: skip
         table = table_of("level_turns")
         table[section][key] = value
