@@ -25,6 +25,8 @@ _SHAPES = ((3, 5), (4, 5), (6, 5), (9, 5), (13, 5), (18, 5), (6, 9), (9, 9), (9,
 _EDGE = 3  # samples at either end that are not judged, and the narrowest half width
 _NEAR = 25  # half width of the neighbourhood whose roughness a sample is compared with
 _PASSES = 8
+Weights = Callable[[int, int], FloatArray]
+"""Half width and degree to what `_weights` and `_uneven_weights` return."""
 _NORMAL = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 
 
@@ -58,6 +60,8 @@ def mark_outliers(campaign: Campaign) -> Campaign:
 
 def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     """Yield trial, channel and the outliers (N,) of every record that has any."""
+    # all channels of a trial have its stamps
+    weights = {trial.name: _weights_at(trial.time) for trial in campaign.trials if trial.is_dynamic}
     for name, channel in campaign.channels.items():
         by_repeats = _repeat_outliers(campaign, channel)
         for trial in campaign.trials:
@@ -66,7 +70,7 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
             column = trial.channels.index(name)
             values, used = trial.values[:, column], trial.used[:, column]
             if trial.is_dynamic:
-                found = sample_outliers(values, used, None if is_even(trial.time) else trial.time)
+                found = sample_outliers(values, used, weights[trial.name])
             elif trial.name in by_repeats:
                 found = by_repeats[trial.name] & used
             else:
@@ -76,7 +80,7 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
 
 
 def sample_outliers(
-    values: FloatArray, used: BoolArray | None = None, time: FloatArray | None = None
+    values: FloatArray, used: BoolArray | None = None, weights: Weights | None = None
 ) -> BoolArray:
     """Return which samples of a record are isolated outliers, (N,); see `mark_outliers`.
 
@@ -86,8 +90,8 @@ def sample_outliers(
         The record.
     used : (N,) ndarray of bool, optional
         Samples that count; the others are bridged and never reported.
-    time : (N,) ndarray, optional
-        Of the samples, where they are not even [s].
+    weights : callable, optional
+        What `_weights_at` says of the stamps; those of even ones if left out.
     """
     count, size = len(values), float(np.max(np.abs(values), initial=0.0))
     used = np.ones(count, dtype=bool) if used is None else used
@@ -98,8 +102,8 @@ def sample_outliers(
     # squares of readings of any size stay in range
     clean = np.where(used, values / size, np.interp(rows, rows[used], values[used] / size))
     judged = clean.copy()
-    weights = _weights if time is None else cache(partial(_uneven_weights, time))
-    known = _SHAPES if time is None else [shape for shape in _SHAPES if shape[1] == _SHAPES[0][1]]
+    weights = weights or _weights
+    known = [shape for shape in _SHAPES if weights is _weights or shape[1] == _SHAPES[0][1]]
     shapes = [_Surroundings(weights, shape) for shape in known if 4 * shape[0] + 4 <= count]
     around = min(shapes, key=lambda shape: _scatter(shape.rest(clean)))
     width, degree = around.shape
@@ -190,12 +194,12 @@ class _Surroundings:
     Parameters
     ----------
     weights : callable
-        What `_weights` does.
+        See `Weights`.
     shape : (int, int)
         Half width of the neighbourhood, and degree.
     """
 
-    def __init__(self, weights: Callable[[int, int], FloatArray], shape: tuple[int, int]) -> None:
+    def __init__(self, weights: Weights, shape: tuple[int, int]) -> None:
         self.shape = shape
         shapes = [*((item, 5) for item in (3, 4, 6, 9, 13) if item < shape[0]), shape]
         self._weights = {item[0]: weights(*item) for item in shapes}
@@ -228,6 +232,10 @@ def _weights(width: int, degree: int) -> FloatArray:
     weights = np.ones(2 * width + 1)
     weights[neighbours] = -np.linalg.pinv(basis)[0]  # value of the polynomial at the middle
     return weights
+
+
+def _weights_at(time: FloatArray) -> Weights:
+    return _weights if is_even(time) else cache(partial(_uneven_weights, time))
 
 
 def _uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:

@@ -302,6 +302,8 @@ def test_what_is_no_single_number_or_no_start_is_not_set(foreign_fmu) -> None:
         wrong = Component("a", foreign_fmu(model), {name: Setting(1.0)})
         with pytest.raises(CouplingError, match=re.escape(f"a.{name} cannot be set: {words}")):
             Wiring(SystemStructure("one", (wrong,)))
+    switched = Component("a", foreign_fmu("array3"), {"active": Setting(False)})
+    assert Wiring(SystemStructure("one", (switched,))).settings == {"a": {"active": 0.0}}
 
 
 def test_start_values_of_outputs_are_set(foreign_fmu) -> None:
