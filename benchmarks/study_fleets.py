@@ -100,7 +100,7 @@ def groups(fleets: int, twins: int) -> None:
             known = knowledge(dict(zip(ASSUMED, true.tolist(), strict=True)), ASSUMED, fixed=True)
             grids.append(learnt(known, flights(known, 10_000 * fleet + 100 * group, twins)))
             rates.append(true)
-        for what, found in (("alone", [grid.marginals for grid in grids]), ("shared", shared(grids).groups)):
+        for what, found in (("alone", [grid.marginals for grid in grids]), ("shared", shared(grids)[1])):
             for true, marginals in zip(rates, found, strict=True):
                 for rate, marginal in zip(true.tolist(), marginals, strict=True):
                     low, high = marginal.interval()

@@ -124,11 +124,8 @@ def _watched_table(standing: Mapping[str, Any]) -> "Table":
     from reporting.console_table import console_table
     from twin_master.mission.loop import health_in_words
 
-    def badness(row: tuple[str, dict[str, Any]]) -> tuple[int, float]:
-        return row[1]["alarms"], sum(known["mean"] for known in row[1]["last"]["health"].values())
-
     told = [(name, asset) for name, asset in standing["assets"].items() if asset["last"] is not None]
-    worst = sorted(told, key=badness, reverse=True)[:ROWS]
+    worst = sorted(told, key=lambda row: (row[1]["alarms"], row[1]["severity"]), reverse=True)[:ROWS]
     states, rows = list(dict.fromkeys(name for _, asset in worst for name in asset["last"]["health"])), []
     for name, asset in worst:
         last, health = asset["last"], health_in_words(asset["last"])

@@ -117,7 +117,7 @@ class Worsening:
 
     def probability(self, points: Float) -> Float:
         """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""
-        share = points[:, self.place]
+        share = points.take(self.place, axis=1)
         return np.asarray((1.0 - share) * self.ends[0] + share * self.ends[1])
 
 

@@ -10,8 +10,6 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
@@ -20,7 +18,7 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
-from twin_master.fleet.shard import Engine, Kit, Piece, ShardResult, flown, unflown, with_parameters
+from twin_master.fleet.shard import Engine, Piece, ShardResult, flown, unflown, with_parameters
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store, sizes_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
@@ -123,8 +121,7 @@ def fly_fleet(
         result = fleet.head.model_dump(exclude={"shard"}) | {"twins": fleet.size}
         atomic_write_text(folder / RESULT_NAME, to_json(result | told))
     seconds = time.perf_counter() - begin
-    failures, ended = told["failures"], told["ended"]
-    return FleetOutcome(folder, fleet.size, failures, ended, seconds, flown, shards - flown)
+    return FleetOutcome(folder, fleet.size, told["failures"], told["ended"], seconds, flown, shards - flown)
 
 
 def told_of(folder: Path) -> dict[str, dict[str, str]]:
@@ -219,16 +216,17 @@ def _check(fleet: Fleet) -> None:
     wrong = []
     for group in fleet.groups:
         means = {name: spread.mean for name, spread in group.spreads.items()}
-        names = group.files or ("",)
-        for name, scenario in zip(names, group.scenarios, strict=True):
+        several = len(group.scenarios) > 1
+        for place, scenario in enumerate(group.scenarios):
             try:
                 _check_group(group, scenario)
                 source_of(with_parameters(scenario, means), real=bool(group.observations)).check()
             except IN_FLIGHT as error:
-                wrong.append(f"{group.name} {name}".rstrip() + f": {error}")
-        for path in group.recordings:
+                asset = f" {group.members[place].name}" if several else ""
+                wrong.append(f"{group.name}{asset}: {error}")
+        for path in [member.file for member in group.members if group.observations]:
             try:
-                file_feed(path, group.scenarios[0])
+                file_feed(path or Path(), group.scenarios[0])
             except IN_FLIGHT as error:
                 wrong.append(f"{group.name}: {error}")
     if wrong:
@@ -261,26 +259,17 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
     """Check that the model holds where the true assets are."""
     from fe.wing.design import wing_structure
 
-    name, regions = "young_modulus_factor", scenario.state_names
-    ranges = wing_structure(regions, 0).ranges
-    own = scenario.asset.true_parameters.get(name, 1.0)
-    found = {name: (np.array([member.parameters.get(name, own) for member in group.members]), "assets")}
+    name, asset = "young_modulus_factor", scenario.asset.true_parameters
+    ranges = wing_structure(scenario.state_names, 0).ranges
+    true = {name: ([member.parameters.get(name, asset.get(name, 1.0)) for member in group.members], "assets")}
     if scenario.truth.kind == "scripted":
-        steps = f"{scenario.mission.step_name}s"
-        states = scenario.scripted_history().T
-        found |= {region: (values, steps) for region, values in zip(regions, states, strict=True)}
-    for what, (values, of) in found.items():
+        history = zip(scenario.state_names, scenario.scripted_history().T.tolist(), strict=True)
+        true |= {region: (values, f"{scenario.mission.step_name}s") for region, values in history}
+    for what, (values, of) in true.items():
         low, high = ranges[what]
-        outside = values[(values < low - 1e-12) | (values > high + 1e-12)]
-        if len(outside):
-            told = {
-                "what": what,
-                "count": len(outside),
-                "number": len(values),
-                "of": of,
-                "example": outside[0],
-            }
-            raise FleetError(said("fleet.outside", low=low, high=high, **told))
+        if outside := [value for value in values if not low - 1e-12 <= value <= high + 1e-12]:
+            told = {"what": what, "count": len(outside), "number": len(values), "of": of}
+            raise FleetError(said("fleet.outside", low=low, high=high, example=outside[0], **told))
 
 
 def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
@@ -299,13 +288,12 @@ def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-    return pickle.dumps(Kit(scenario.portable().to_dict(), files, wing), pickle.HIGHEST_PROTOCOL)
+    return pickle.dumps((scenario.portable().to_dict(), files, wing), pickle.HIGHEST_PROTOCOL)
 
 
 def group_folder(folder: Path, group: Group, place: int) -> Path:
-    """Return where what the twins of a group know is kept, or one of them where each has files of its own."""
-    own = folder / GROUPS / group.name
-    return own / str(place) if group.files else own
+    """Return where what the twins of a group know is kept, those of one of its scenarios."""
+    return folder / GROUPS / group.name / str(place)
 
 
 def _fly(
@@ -329,10 +317,10 @@ def _fly(
         for number, members in left:
             group = fleet.groups[number]
             try:
-                packed = kit(number, members[0].row if group.files else 0)
-                ready = _recorded(group, members)
+                packed = kit(number, members[0].place)
+                ready = tuple(_recorded(group, member) for member in members)
             except IN_FLIGHT as error:
-                if not group.files:
+                if len(group.scenarios) == 1:
                     raise
                 keep(number, members, unflown(members[0], str(error)))  # of one asset with a file of its own
             else:
@@ -364,19 +352,16 @@ def _fly(
     return len(whole), len(left)
 
 
-def _recorded(group: Group, members: Sequence[Member]) -> tuple[Member, ...]:
-    """Return members with what their real assets have shown: workers need no files."""
-    if not group.recordings:
-        return tuple(members)
-    scenario = group.scenarios[0]
-    feeds = (file_feed(group.recordings[member.row], scenario) for member in members)
-    pairs = zip(members, feeds, strict=True)
-    return tuple(replace(member, recording=tuple(feed.messages(None))) for member, feed in pairs)
+def _recorded(group: Group, member: Member) -> Member:
+    """Return a member with what its real asset has shown: workers need no files."""
+    if not group.observations or member.file is None:
+        return member
+    return replace(member, recording=tuple(file_feed(member.file, group.scenarios[0]).messages(None)))
 
 
 def _shards(fleet: Fleet) -> Iterator[tuple[int, Sequence[Member]]]:
-    """Yield all shards in their order: twins that share all files, no more of them than a shard holds."""
+    """Yield all shards in their order: twins that share a scenario, no more of them than a shard holds."""
     for number, group in enumerate(fleet.groups):
-        size = 1 if group.files else fleet.head.shard
+        size = fleet.head.shard if len(group.scenarios) == 1 else 1
         for first in range(0, len(group.members), size):
             yield number, group.members[first : first + size]

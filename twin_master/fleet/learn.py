@@ -93,11 +93,12 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
             stage.advance()
     if not found:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
-    together, names = None, next(iter(found.values())).worsening.names
+    names, told = next(iter(found.values())).worsening.names, dict[str, Any]()
+    lines, everywhere = [lessons.grid.marginals for lessons in found.values()], set[str]()
     if len(found) > 1 and len(names) <= 2 and {each.worsening.names for each in found.values()} == {names}:
-        together = shared([lessons.grid for lessons in found.values()])
-    lines = [lessons.grid.marginals for lessons in found.values()] if together is None else together.groups
-    everywhere = set().union(*(lessons.flown for lessons in found.values() if together is not None))
+        figures, lines = shared([lessons.grid for lessons in found.values()])
+        everywhere = set().union(*(lessons.flown for lessons in found.values()))
+        told = {"shared": dict(zip(names, figures, strict=True))}
     groups = {
         name: lessons.told(own, lessons.flown | everywhere)
         for (name, lessons), own in zip(found.items(), lines, strict=True)
@@ -109,18 +110,7 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
         "config": hash_record({key: config[key] for key in ("kind", "format", "fleet")}),
         "program": config["provenance"]["versions"].get("uav-twin", ""),
     }
-    result: dict[str, Any] = {"source": source, "groups": groups}
-    if together is not None:
-        result["shared"] = {
-            name: {
-                "mean": mean.mean,
-                "standard_deviation": mean.standard_deviation,
-                "log10_concentration": size.mean,
-                "log10_concentration_standard_deviation": size.standard_deviation,
-            }
-            for name, mean, size in zip(names, together.mean, together.concentration, strict=True)
-        }
-    return result
+    return {"source": source, "groups": groups} | told
 
 
 Seen = tuple[Knowledge, Float, Index]

@@ -109,14 +109,20 @@ class Member:
         What happens to it; the same mission flies with ``uav-twin run --seed``.
     parameters : dict of str to float
         Its true parameters, where the group spreads them, SI.
+    place : int
+        Of its scenario in the group.
+    file : Path or None
+        That sets it apart: its FMU, its calibration, or the recording of a real asset.
     recording : tuple or None
-        Of a real asset: what was observed, as it goes to a worker.
+        What was observed of a real asset, as it goes to a worker.
     """
 
     row: int
     name: str
     seed: int
     parameters: Mapping[str, float]
+    place: int = 0
+    file: Path | None = None
     recording: tuple[Fed, ...] | None = None
 
 
@@ -132,12 +138,8 @@ class Group:
     spreads : dict of str to Spread
         Parameters that differ from asset to asset.
     members : tuple of Member
-    files : tuple of str
-        Name of the file that sets each asset apart; empty where they share all of them.
     observations : str
         Where those of real assets come from, a pattern of files or an address; empty where assets are flown.
-    recordings : tuple of Path
-        The files among them, one for each member.
     file : dict of str to str
         Name and hash of the file of the scenario of real assets.
     """
@@ -146,9 +148,7 @@ class Group:
     scenarios: tuple[Scenario, ...]
     spreads: Mapping[str, Spread]
     members: tuple[Member, ...]
-    files: tuple[str, ...] = ()
     observations: str = ""
-    recordings: tuple[Path, ...] = ()
     file: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
@@ -157,11 +157,11 @@ class Group:
             "name": self.name,
             "scenarios": [scenario.portable().to_dict() for scenario in self.scenarios],
             "parameters": {name: spread.model_dump() for name, spread in self.spreads.items()},
-            "members": [[member.name, member.seed] for member in self.members],
-            "files": list(self.files),
+            "members": [[member.name, member.seed, member.place] for member in self.members],
         }
         if self.observations:
-            whole = (path / JOURNAL_NAME if path.is_dir() else path for path in self.recordings)
+            files = (member.file for member in self.members if member.file is not None)
+            whole = (path / JOURNAL_NAME if path.is_dir() else path for path in files)
             found["recordings"] = [hash_file(path) for path in whole]
         return found
 
@@ -257,7 +257,6 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     common = replace(Overrides(seed=seed, in_process=section.in_process, learnt_group=section.name), **files)
     observed = section.observations or ""
     where = str(folder / observed) if observed and not is_broker(observed) else observed
-    paths = tuple(recordings(where)) if where and not is_broker(where) else ()
     key, pattern = ("fmu", section.fmus) if section.fmus else ("calibration", section.calibrations)
     found = sorted(folder.glob(pattern)) if pattern else []
     if pattern and not found:
@@ -275,13 +274,13 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
             scenarios.append(_of_group(section, resolved))
     if wrong:
         raise FleetError("\n".join(["assets that cannot fly:", *wrong]))
-    names = [file.stem for file in found] or [f"{section.name}-{row}" for row in range(section.count or 0)]
-    members = [_member(section, seed, row, name) for row, name in enumerate(names)]
-    members += [Member(row, asset_name(path), seed, {}) for row, path in enumerate(paths)]
-    return Group(
-        section.name, tuple(scenarios), {} if where else section.parameters, tuple(members),
-        tuple(file.name for file in found), where, paths, loaded.file,
-    )  # fmt: skip
+    members = [_member(section, seed, row, file) for row, file in enumerate(found)]
+    members += [_member(section, seed, row) for row in range(section.count or 0)]
+    if where and not is_broker(where):
+        paths = enumerate(recordings(where))
+        members = [Member(row, asset_name(path), seed, {}, file=path) for row, path in paths]
+    spreads = {} if where else section.parameters
+    return Group(section.name, tuple(scenarios), spreads, tuple(members), where, loaded.file)
 
 
 def recordings(pattern: str) -> list[Path]:
@@ -307,7 +306,7 @@ def _of_group(section: GroupSection, scenario: Scenario) -> Scenario:
     return parse_scenario(table, f"group {section.name}")
 
 
-def _member(section: GroupSection, seed: int, row: int, name: str) -> Member:
+def _member(section: GroupSection, seed: int, row: int, file: Path | None = None) -> Member:
     # Keyed by group and number: a twin meets the same fate whatever else flies.
     sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(section.name.encode()), row))
     own = int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
@@ -316,4 +315,5 @@ def _member(section: GroupSection, seed: int, row: int, name: str) -> Member:
         key: spread.mean + spread.standard_deviation * float(value)
         for (key, spread), value in zip(sorted(section.parameters.items()), normal, strict=True)
     }
-    return Member(row, name, own, drawn)
+    name, place = (f"{section.name}-{row}", 0) if file is None else (file.stem, row)
+    return Member(row, name, own, drawn, place, file)

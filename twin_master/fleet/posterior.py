@@ -171,11 +171,6 @@ def lines(weight: Float, axes: Axes, *of: Callable[[Float], Float]) -> tuple[Lin
     return tuple(Line(axis, weight.sum(axis=other), own) for axis, other, own in sums)
 
 
-def points_of(axes: Sequence[Float]) -> Float:
-    """Return all points of a tensor grid as probabilities: (P, K)."""
-    return logistic(np.array(list(product(*axes))))
-
-
 def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
     """Return a grid that resolves the posterior of K probabilities.
 
@@ -189,31 +184,15 @@ def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
     shape = (POINTS[count],) * count
 
     def density(axes: Axes) -> Float:
-        return log_likelihood(points_of(axes)).reshape(shape) + _uniform(axes)
+        points = np.array(list(product(*axes)))
+        return log_likelihood(logistic(points)).reshape(shape) + _uniform(axes)
 
     axis = np.linspace(logit(np.array(LOWEST)), logit(np.array(HIGHEST)), POINTS[count])
     axes, found = narrowed(density, (axis,) * count)
     return Grid(axes, found - _uniform(axes))
 
 
-@dataclass(frozen=True)
-class Shared:
-    """Probabilities of groups that come from one Beta distribution each, whose m and kappa are inferred.
-
-    Attributes
-    ----------
-    mean, concentration : tuple of Line
-        m, and log10 kappa, for each of the K probabilities.
-    groups : tuple of tuple of Line
-        The K probabilities of each group.
-    """
-
-    mean: tuple[Line, ...]
-    concentration: tuple[Line, ...]
-    groups: tuple[tuple[Line, ...], ...]
-
-
-def shared(grids: Sequence[Grid]) -> Shared:
+def shared(grids: Sequence[Grid]) -> tuple[list[dict[str, float]], list[tuple[Line, ...]]]:
     """Infer Beta(m kappa, (1 - m) kappa) of one or two probabilities over groups, and each group under it.
 
     m is uniform in its log odds between the bounds of a probability, and kappa in its logarithm, from 3 to
@@ -224,6 +203,11 @@ def shared(grids: Sequence[Grid]) -> Shared:
     ----------
     grids : sequence of Grid
         Log likelihood of each group, of the same K = 1 or 2 probabilities.
+
+    Returns
+    -------
+    tuple of two lists
+        Figures of m and of log10 kappa for each of the K probabilities; the probabilities of each group.
     """
     from scipy.special import betaln
 
@@ -252,7 +236,16 @@ def shared(grids: Sequence[Grid]) -> Shared:
         joint /= joint.sum()
         groups.append(lines(joint.reshape((FINE,) * count), own, logistic))
     found = lines(hyper, (odds, digits) * count, logistic, np.asarray)
-    return Shared(found[::2], found[1::2], tuple(groups))
+    figures = [
+        {
+            "mean": mean.mean,
+            "standard_deviation": mean.standard_deviation,
+            "log10_concentration": size.mean,
+            "log10_concentration_standard_deviation": size.standard_deviation,
+        }
+        for mean, size in zip(found[::2], found[1::2], strict=True)
+    ]
+    return figures, groups
 
 
 def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:

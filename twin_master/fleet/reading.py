@@ -38,7 +38,7 @@ class Outcomes:
         Share of the called-for fallbacks that came within `WITHIN` steps, as far as these were flown; NaN
         without any.
     early : Estimated
-        Share of missions with a fallback before the damage could be seen.
+        Share of missions with a fallback before the damage that calls for it; NaN where none does.
     rms, bias : tuple of Estimated
         Of each factor, SI: root of the mean squared error of its filtered mean over all steps of all
         missions, and the mean error.
@@ -68,7 +68,7 @@ class Outcomes:
         squared, bias = ((error**power).mean(axis=1).filled(np.nan).T for power in (2, 1))
         return cls(
             within=_share(kept["delay"][~np.isnan(kept["delay"])] <= WITHIN),
-            early=_share(kept["early"] > 0.0),
+            early=_share(kept["early"][kept["early"] >= 0.0] > 0.0),
             rms=tuple(_root(_mean(own)) for own in squared),
             bias=tuple(_mean(own) for own in bias),
             evidence=_mean(np.nanmean(kept["log_evidence"], axis=1)),
@@ -120,6 +120,12 @@ def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
     return last
 
 
+def severity(scenario: Scenario, mean: Float) -> Float:
+    """Return how badly off assets are by the means of their states (..., F): the sum of shares of ranges."""
+    low, high = np.array([(factor.levels[0], factor.levels[-1]) for factor in scenario.state]).T
+    return np.asarray(((mean - low) / np.where(high > low, high - low, 1.0)).sum(axis=-1))
+
+
 def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     """Return the probability that twins leave a control within the steps that are predicted: (B,).
 
@@ -169,12 +175,12 @@ def known_twins(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") ->
     RunFolderError
         What the twins know is missing or damaged.
     """
-    flown, own = has_flown(group["status"].values), folder / GROUPS / record["name"]
-    for place, table in enumerate(record["scenarios"]):
-        rows = flown[flown == place] if record["files"] else flown
-        home = own / str(place) if record["files"] else own
-        if len(rows):
-            yield rows, home, kept_knowledge(home, Scenario.model_validate(table).moved(home))
+    flown = has_flown(group["status"].values)
+    places = np.array([place for *_, place in record["members"]])[flown]
+    for place in np.unique(places).tolist():
+        rows, table = flown[places == place], record["scenarios"][place]
+        home = folder / GROUPS / record["name"] / str(place)
+        yield rows, home, kept_knowledge(home, Scenario.model_validate(table).moved(home))
 
 
 def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
@@ -210,7 +216,8 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
         if not np.isnan(study.within.value):
             step = f"{group.attrs['step_name']}s"
             found[f"fallback within {WITHIN} {step}, of those called for"] = study.within
-        found["early fallback"] = study.early
+        if not np.isnan(study.early.value):
+            found["early fallback"] = study.early
         for name, rms, bias in zip(group.attrs["factors"], study.rms, study.bias, strict=True):
             found[f"filtered rms error of {name}"], found[f"bias of {name}"] = rms, bias
         found["log evidence of a step"] = study.evidence

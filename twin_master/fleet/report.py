@@ -26,7 +26,7 @@ from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND, WATCHED_KIND, fleet_config, told_of
 from twin_master.fleet.learn import LESSONS_NAME, lesson_rows
-from twin_master.fleet.reading import figure_rows, group_figures, last_turns, leaving, noticed
+from twin_master.fleet.reading import figure_rows, group_figures, last_turns, leaving, noticed, severity
 from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, has_flown, open_group
 from twin_master.fleet.watching import STATE_NAME, counts_of, read_standing
 from twin_master.mission.journal import JOURNAL_NAME
@@ -61,6 +61,11 @@ class Standing:
     control: list[str]
     alarms: NDArray[np.int64]
     leaving: Float
+
+    @property
+    def severity(self) -> Float:
+        """How badly off each is (B,)."""
+        return severity(self.scenario, self.mean)
 
 
 def write_fleet_report(folder: Path | str) -> Path:
@@ -144,8 +149,8 @@ def _opening(found: list[Standing], groups: "list[xr.Dataset]") -> str:
     first = np.concatenate([group["first_notice"].values[:, NOTICE_KINDS.index("alarm")] for group in groups])
     alarmed = first[first >= 0]
     called = delay[~np.isnan(delay)]
-    worst = max((one for one in found if one.names), key=lambda one: one.mean.sum(axis=1).max(), default=None)
-    row = 0 if worst is None else int(np.argmax(worst.mean.sum(axis=1)))
+    worst = max((one for one in found if one.names), key=lambda one: one.severity.max(), default=None)
+    row = 0 if worst is None else int(np.argmax(worst.severity))
     return WORDS.say(
         "opening", flown=sum(len(one.names) for one in found), assets=len(delay),
         alarmed=len(alarmed), first=min(alarmed, default=0),
@@ -215,7 +220,7 @@ def _add_group(
     if courses is not None:
         page.add_report_figure(WORDS.figure("course", course_figure(scenario, *courses)))
     factors, soon = printed_factors(scenario), np.rint(100.0 * np.nan_to_num(standing.leaving))
-    order = np.lexsort((-standing.mean.sum(axis=1), -soon, -standing.alarms))[:most].tolist()
+    order = np.lexsort((-standing.severity, -soon, -standing.alarms))[:most].tolist()
     rows, told = [], bool(standing.alarms.any())
     for row in order:
         states = [
@@ -242,7 +247,7 @@ def map_figure(scenario: Scenario, last: Float, failed: int) -> Figure:
     factors, count = printed_factors(scenario), len(last) + failed
     wide = max(1, int(np.ceil(np.sqrt(2.0 * count))))
     high = -(-count // wide)
-    order = np.argsort(-last.sum(axis=1), kind="stable")
+    order = np.argsort(-severity(scenario, last), kind="stable")
     figure, rows = style.panels(
         len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.07, right=0.99, hspace=0.25
     )

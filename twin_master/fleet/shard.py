@@ -47,8 +47,6 @@ from twin_master.watch.message import Fed
 if TYPE_CHECKING:
     from distributed import Client
 
-    from fe.runtime.reduced import ReducedModel
-
 
 def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
     """Return what B twins conclude of B recordings: beliefs and controls are those of a watch of each."""
@@ -88,25 +86,6 @@ def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
     return history
 
 
-@dataclass(frozen=True)
-class Kit:
-    """All that the twins of a scenario need, on any machine.
-
-    Attributes
-    ----------
-    scenario : dict
-        Portable.
-    files : dict of str to bytes
-        The prepared folder by its paths: what the twin knows, and the FMU.
-    wing : ReducedModel or None
-        The model that is flown in the place of an FMU.
-    """
-
-    scenario: Mapping[str, Any]
-    files: Mapping[str, bytes]
-    wing: "ReducedModel | None"
-
-
 ShardResult = tuple[Mapping[str, NDArray[Any]], dict[str, dict[str, str]]]
 """Variables of the store with B rows; and by the names of twins what ended their flights, `failures`, and how
 assets ended their simulations early, `ended`."""
@@ -125,18 +104,24 @@ def program_version() -> str:
     return hash_record([found["versions"], found["source_hashes"], list(sys.version_info[:2])])
 
 
-class _Unpacked:
-    """A kit, ready to fly."""
+class Kit:
+    """All that the twins of a scenario need, on any machine, ready to fly.
+
+    Parameters
+    ----------
+    packed : bytes
+        Pickled: the scenario, portable; the prepared folder, files by their paths: what the twin knows, and
+        the FMU; and the model that is flown in the place of an FMU, or None.
+    """
 
     def __init__(self, packed: bytes) -> None:
-        kit: Kit = pickle.loads(packed)
+        scenario, files, self.wing = pickle.loads(packed)
         self._folder = folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        for name, content in kit.files.items():
+        for name, content in files.items():
             atomic_write_bytes(folder / name, content)
-        self.scenario = Scenario.model_validate(kit.scenario).moved(folder)
+        self.scenario = Scenario.model_validate(scenario).moved(folder)
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
-        self.wing = kit.wing
 
     def told(self, sentence: str) -> str:
         """Return a sentence without the folder of this process, which nobody else knows."""
@@ -157,7 +142,7 @@ class _Unpacked:
         return source.open()
 
 
-_unpacked = lru_cache(maxsize=1)(_Unpacked)
+_unpacked = lru_cache(maxsize=1)(Kit)
 """Gives the last kit of this process again: shards of a group follow each other."""
 
 
@@ -189,7 +174,7 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
     return outcomes_of(kit.knowledge, flights, members), told
 
 
-def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
+def _flown(kit: Kit, members: Sequence[Member]) -> Flights:
     """Fly twins with their assets."""
     truths = [kit.knowledge.truth(member.seed) for member in members]
     with _Hangar(kit, members) as hangar:
@@ -203,7 +188,7 @@ def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
 class _Hangar(ExitStack):
     """Assets that may have a memory, one open at a time; what failed is opened anew for the next twin."""
 
-    def __init__(self, kit: _Unpacked, members: Sequence[Member]) -> None:
+    def __init__(self, kit: Kit, members: Sequence[Member]) -> None:
         super().__init__()
         seeds = bool(getattr(kit.scenario.asset, "seeds", ()))  # where assets have seeds of their own
         self._kit = kit

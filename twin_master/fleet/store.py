@@ -83,7 +83,7 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
         "log_evidence": flights.log_evidence,
         "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, turns) - 1],
         "delay": np.where(failed, np.nan, delay),
-        "early": early & ~failed,
+        "early": np.where(failed, -1, early),
         "notices": [[len(turns) for turns in own] for own in told],
         "first_notice": [[min(turns, default=-1) for turns in own] for own in told],
         "credible": np.where(
@@ -96,19 +96,20 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
     return found
 
 
-def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the delay of the fallback and whether it came early, of each twin."""
+def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the delay of the fallback, and whether it came early (-1: none is defined), of each twin."""
     scenario, plan = knowledge.scenario, knowledge.plan
     first = scenario.control_names.index(scenario.mission.first_control)
     delay = np.full(len(flights.state), np.nan)
-    early = np.zeros(len(delay), dtype=bool)
+    early = np.full(len(delay), -1)
     for twin, (control, state) in enumerate(zip(flights.control_index, flights.state, strict=True)):
         if np.isnan(state[0]).any():
             continue
         turns = int(np.sum(control >= 0))
         course = control[:turns], state[:turns]
         fallback = find_fallback(knowledge.model.states, plan.control_index, first, *course)
-        early[twin] = fallback.early_step is not None
+        if fallback.switch_state is not None:
+            early[twin] = fallback.early_step is not None
         if fallback.called_for_step is not None:
             late = turns - fallback.called_for_step <= WITHIN  # so that nobody knows whether it would come
             never = np.nan if late else np.inf

@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text, written
 from reporting.json_file import read_json
@@ -17,7 +19,7 @@ from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
 from twin_master.fleet.flight import WATCHED_KIND, held_fleet
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
-from twin_master.fleet.reading import attention
+from twin_master.fleet.reading import attention, severity
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.sentences import said
@@ -48,7 +50,8 @@ def read_standing(folder: Path) -> dict[str, Any]:
     """Return `assets` and `failures` of a watched fleet, both empty where nothing was watched.
 
     Of each asset `last` is what its last decision said, None before the first; `alarms` and `refused` are
-    numbers; `leaving` is the probability that its control is left within the steps that are predicted.
+    numbers; `leaving` is the probability that its control is left within the steps that are predicted, and
+    `severity` how badly off it is.
     """
     path = folder / STATE_NAME
     return dict(read_json(path, FleetError)) if path.is_file() else {"assets": {}, "failures": {}}
@@ -103,13 +106,15 @@ class WatchedAsset:
 
     def record(self) -> dict[str, Any]:
         """Return how it stands, for the view."""
-        last = leaving = None
+        last = leaving = worst = None
         if self.decision is not None and self.watch.filtered is not None:
             last = {key: self.decision[key] for key in _OF_A_DECISION}
             control = self.watch.scenario.control_names.index(last["control"])
             leaving = float(attention(self._knowledge, self.watch.filtered, control))
+            mean = np.array([state["mean"] for state in last["health"].values()])
+            worst = float(severity(self.watch.scenario, mean))
         alarms, refused = self._alarms_before + len(self.alarms), self.watch.intake.counts.rejected
-        return {"last": last, "alarms": alarms, "refused": refused, "leaving": leaving}
+        return {"last": last, "alarms": alarms, "refused": refused, "leaving": leaving, "severity": worst}
 
 
 @dataclass
@@ -341,9 +346,8 @@ class _Files:
     def ended(self) -> bool:
         """Whether nothing more is to be read."""
         found = (self._fleet.assets.get(f"{self._group.name}/{name}") for name in self._files)
-        here = [asset for asset in found if asset is not None]
         return not self._follow and all(
-            asset.watch.intake.ended or self._fleet.enough(asset) for asset in here
+            asset is None or asset.watch.intake.ended or self._fleet.enough(asset) for asset in found
         )
 
     def look(self, searching: bool) -> int:

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from twin_master.mission.preparation import kept_knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.store.writing import open_run
 from uav_twin import fly as new_run
-from uav_twin import fly_fleet, open_fleet
+from uav_twin import fly_fleet, open_fleet, prepare_twin
 
 
 def growing(library_file: Path, count: int = 10, shard: int = 4) -> Fleet:
@@ -158,7 +159,7 @@ def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
         fly_fleet(fleet, fleet_file.parent / "out")
     lines = str(caught.value).splitlines()
     assert lines[0].startswith("3 of the assets cannot fly")
-    assert [line.split(":")[0] for line in lines[1:]] == ["north a.fmu", "north b.fmu", "south"]
+    assert [line.split(":")[0] for line in lines[1:]] == ["north a", "north b", "south"]
     assert not (fleet_file.parent / "out").exists()
 
 
@@ -214,10 +215,8 @@ def test_figures_are_those_of_the_flights(library_file, tmp_path):
         assert found.value == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure(library_file, tmp_path):
-    fleet = growing(library_file, count=1)
-    folder, (group,) = fly_fleet(fleet, tmp_path / "fleet").folder, fleet.groups
-    knowledge = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
+def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():
+    knowledge = prepare_twin("growing_damage")
     flights = Flights.empty(knowledge, 5)
     flights.state[:], flights.control_index[:, :7] = 0.0, 1  # seven turns, then the asset ends
     for twin, (called, left) in enumerate([(1, 9), (4, 9), (5, 9), (5, 6), (9, 9)]):
@@ -225,7 +224,12 @@ def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure(library_
         flights.control_index[twin, left:7] = 0
     delay, early = _fallbacks(knowledge, flights)
     np.testing.assert_array_equal(delay, [np.inf, np.inf, np.nan, 1.0, np.nan])
-    assert not early.any()
+    assert (early == 0).all()
+    both = replace(
+        knowledge, policy=np.eye(2)[(knowledge.model.states.coordinates.sum(axis=1) < 0.5).astype(int)]
+    )
+    delay, early = _fallbacks(both, flights)  # by which no state alone calls for a fallback
+    assert (np.isnan(delay) & (early == -1)).all()
 
 
 def test_the_command_line(library_file, tmp_path):

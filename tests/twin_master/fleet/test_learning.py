@@ -1,6 +1,7 @@
 """What a fleet teaches, against enumeration, closed forms and the truth."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import _noisier, learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
-from twin_master.fleet.reading import Outcomes, attention, leaving
+from twin_master.fleet.reading import Outcomes, attention, leaving, severity
 from twin_master.fleet.report import write_fleet_report
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.network.planner import BeliefPolicy
@@ -81,29 +82,28 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability, name, success):
             assert found[twin, row] == pytest.approx(expected.sum(), abs=1e-12)
 
 
-def test_evidence_is_that_of_the_filter():
+def test_evidence_of_a_node_is_that_of_the_filter():
     scenario = tiny(EACH, levels=5)
     model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
     generator = np.random.default_rng(5)
     values = 1e-3 * (1.0 + generator.random((3, 25, 2, 24)))
     interval = 1e-4 * generator.standard_normal((25, 2, 24, 2))
-    sensors = GaussianSensorModel(values, 1e-4, interval=interval)
     observed = values[1, 3, 0] + 1e-4 * generator.standard_normal((2, 6, 24))
-    observed[0, 2] = np.nan
-    observed[1, :, 5] = np.nan
+    observed[0, 2] = observed[1, :, 5] = np.nan
     control = generator.integers(0, 2, (2, 6))
-    scaled, common = scaled_likelihood(sensors, observed, control)
-    found = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
-    for twin in range(2):
-        rows = sensors.log_likelihood_sequence(observed[twin], control[twin])
-        expected = filter_sequence(model, control[twin], rows).log_evidence.sum()
-        assert found[twin] == pytest.approx(expected, rel=1e-12)
+    sensors = GaussianSensorModel(values, 1e-4, interval=interval)
     nodes = node_evidence(worsening, worsening.assumed, sensors, observed, control)
-    for node in range(3):
+    for node, twin in product(range(3), range(2)):
         alone = GaussianSensorModel(values[node : node + 1], 1e-4, interval=interval)
-        scaled, common = scaled_likelihood(alone, observed, control)
-        expected = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
-        np.testing.assert_allclose(nodes[:, node], expected, rtol=1e-12)
+        rows = alone.log_likelihood_sequence(observed[twin], control[twin])
+        expected = filter_sequence(model, control[twin], rows).log_evidence.sum()
+        assert nodes[twin, node] == pytest.approx(expected, rel=1e-12)
+
+
+def grid_of(*counts: tuple[int, int]) -> Grid:
+    """Return the likelihood of probabilities of which so many were hits, and so many not."""
+    hits, misses = np.array(counts, dtype=float).T
+    return refined(lambda points: np.log(points) @ hits + np.log1p(-points) @ misses, len(counts))
 
 
 @pytest.mark.parametrize(
@@ -119,12 +119,7 @@ def test_a_grid_has_the_moments_of_a_beta(counts):
     """Between the bounds, which cut some off; of four probabilities with few points for each."""
     from scipy.stats import beta
 
-    def log_likelihood(points: np.ndarray) -> np.ndarray:
-        sums = [a * np.log(points[:, k]) + b * np.log1p(-points[:, k]) for k, (a, b) in enumerate(counts)]
-        return np.asarray(np.sum(sums, axis=0))
-
-    grid = refined(log_likelihood, len(counts))
-    for (a, b), marginal in zip(counts, grid.marginals, strict=True):
+    for (a, b), marginal in zip(counts, grid_of(*counts).marginals, strict=True):
         exact = beta(a + 1, b + 1)
         low, high = exact.cdf([LOWEST, HIGHEST])
         draws = exact.ppf(low + (high - low) * (np.arange(20_000) + 0.5) / 20_000)
@@ -133,16 +128,13 @@ def test_a_grid_has_the_moments_of_a_beta(counts):
         np.testing.assert_allclose(marginal.interval(), np.quantile(draws, [0.025, 0.975]), rtol=2e-2)
 
 
-def groups_of(counts: list[tuple[int, int]]) -> list[Grid]:
-    return [refined(lambda p, a=a, b=b: a * np.log(p[:, 0]) + b * np.log1p(-p[:, 0]), 1) for a, b in counts]
-
-
-def test_groups_share_what_a_dense_sum_says():
+@pytest.mark.parametrize("beside", [(), ((5, 95),)])
+def test_groups_share_what_a_dense_sum_says(beside):
+    """Also beside another probability, which says nothing of it."""
     from scipy.stats import beta, betabinom
 
     counts = [(3, 47), (6, 44), (2, 48), (9, 41), (4, 46)]
-    grids = groups_of(counts)
-    found = shared(grids)
+    (found, *_), groups = shared([grid_of(own, *beside) for own in counts])
     low, high = logit(np.array([LOWEST, HIGHEST]))
     m, kappa = np.meshgrid(
         logistic(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
@@ -152,44 +144,27 @@ def test_groups_share_what_a_dense_sum_says():
     a, b = m * kappa, (1.0 - m) * kappa
     weight = np.prod([betabinom.pmf(n, n + k, a, b) for n, k in counts], axis=0)
     weight /= weight.sum()
-    assert found.mean[0].mean == pytest.approx(float((weight * m).sum()), rel=1e-3)
-    assert found.concentration[0].mean == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
-    for (n, k), (marginal,) in zip(counts, found.groups, strict=True):
+    assert found["mean"] == pytest.approx(float((weight * m).sum()), rel=1e-3)
+    assert found["log10_concentration"] == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
+    for (n, k), (marginal, *_) in zip(counts, groups, strict=True):
         exact = float((weight * (a + n) / (kappa + n + k)).sum())
         assert marginal.mean == pytest.approx(exact, rel=2e-3)
         for bound, reached in zip(marginal.interval(), (0.025, 0.975), strict=True):
             below = float((weight * beta.cdf(bound, a + n, b + k)).sum())
             assert below == pytest.approx(reached, abs=4e-3)
-    means = [marginal.mean for (marginal,) in found.groups]
+    means = [marginal.mean for marginal, *_ in groups]
     assert np.std(means) < 0.8 * np.std([n / (n + k) for n, k in counts])
 
 
 @pytest.mark.parametrize("few", [(1, 249), (13, 237)])
 def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few):
     many = (22_500, 427_500)
-    large, _ = shared(groups_of([many, few])).groups
+    large, _ = shared([grid_of(many), grid_of(few)])[1]
     p, n = many[0] / sum(many), sum(many)
     deviation = np.sqrt(p * (1.0 - p) / n)
     assert large[0].mean == pytest.approx(p, abs=0.1 * deviation)
     low, high = large[0].interval()
     assert (low, high) == pytest.approx((p - 1.96 * deviation, p + 1.96 * deviation), abs=0.1 * deviation)
-
-
-def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet():
-    counts = [(3, 47), (6, 44), (12, 38)]
-    single = shared(groups_of(counts))
-    pairs = [
-        refined(
-            lambda p, seen=((a, 5), (b, 95)): (
-                np.log(p) @ np.array(seen[0], float) + np.log1p(-p) @ np.array(seen[1], float)
-            ),
-            2,
-        )
-        for a, b in counts
-    ]
-    both = shared(pairs)
-    for one, two in zip(single.groups, both.groups, strict=True):
-        assert two[0].mean == pytest.approx(one[0].mean, rel=2e-2)
 
 
 def test_a_population_is_that_of_normal_members():
@@ -323,10 +298,17 @@ def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(gr
         always = BeliefPolicy(np.ones((1, 25)), np.array([control]))
         keep_knowledge(home / str(place), replace(knowledge, policy=always))
     table = scenario.portable().to_dict()
-    record = {"name": name, "files": ["a.fmu", "b.fmu"], "scenarios": [table, table]}
+    record = {"name": name, "members": [["a", 3, 0], ["b", 4, 1]], "scenarios": [table, table]}
     two = group.isel(twin=slice(2))
     control = two["control_index"].values[:, -1]
     np.testing.assert_array_equal(leaving(tmp_path, record, two), [control[0] != 1, control[1] != 0])
+
+
+def test_states_of_other_units_count_alike_for_who_is_badly_off():
+    table = tiny(EACH).to_dict()
+    table["state"][1]["levels"] = [1.0, 1.5, 4.0]
+    found = severity(parse_scenario(table, "units"), np.array([[0.4, 1.0], [0.1, 4.0]]))
+    np.testing.assert_allclose(found, [1.0, 1.25])
 
 
 def test_turns_that_were_not_flown_take_no_part_in_the_figures():
@@ -368,14 +350,8 @@ def test_the_report_names_who_needs_attention(grown):
     assert [attention(always, belief, control).tolist() for control in (1, 0)] == [[0.0] * 25, [1.0] * 25]
     found = attention(knowledge, belief, 1)
     assert (found[policy != 1] == 1.0).all()
-    # By enumeration of whole lives: the damage moves under the control in force as long as it is kept.
-    generator = np.random.default_rng(2)
-    start, left, lives = 0, 0, 4000
-    cumulative = np.cumsum(model.transition.matrix[1], axis=1)
-    for _ in range(lives):
-        state, leaves = start, policy[start] != 1
-        for uniform in generator.random(scenario.mission.prediction_steps - 1):
-            state = int(np.searchsorted(cumulative[state], uniform))
-            leaves |= policy[state] != 1
-        left += int(leaves)
-    assert found[start] == pytest.approx(left / lives, abs=4.0 * np.sqrt(0.25 / lives))
+    kept = policy == 1  # the damage moves under the control in force as long as it is kept
+    stays = model.transition.matrix[1][np.ix_(kept, kept)]
+    chance = 1.0 - np.linalg.matrix_power(stays, scenario.mission.prediction_steps - 1).sum(axis=1)
+    np.testing.assert_allclose(found[kept], chance, atol=1e-12)
+    assert np.ptp(chance) > 0.1

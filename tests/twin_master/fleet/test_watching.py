@@ -431,13 +431,13 @@ def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
     flown = ensemble(str(tmp_path / "wing.toml"), range(60))
     fly_fleet(flown, tmp_path / "flown", Engine(0))
     group = open_fleet(tmp_path / "flown")["growing_damage"]
-    kept = tmp_path / "flown" / "groups" / "growing_damage"
+    kept = tmp_path / "flown" / "groups" / "growing_damage" / "0"
     knowledge = kept_knowledge(kept, flown.groups[0].scenarios[0])
     belief, control = group["belief"].values.astype(float), group["control_index"].values[:, -1]
     soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(belief, control, strict=True)]
     # Who leaves with the same percentage comes by its state.
     printed = np.rint(100.0 * np.maximum(soon, 0.0))
-    worst = np.lexsort((-group["mean"].values[:, -1].sum(axis=1), -printed))
+    worst = np.lexsort((-group["mean"].values[:, -1].astype(float).sum(axis=1), -printed))
     assert max(soon) > min(soon) + 0.1
     assert len(set(printed)) < len(set(soon))
     table = fleet_page(tmp_path / "flown", WORST).partition("Who needs attention next")[2]

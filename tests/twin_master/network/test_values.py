@@ -1,7 +1,5 @@
 """Quantities, rewards and plans: sums over states, controls and draws; optimal values."""
 
-import warnings
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -129,23 +127,6 @@ def test_the_value_is_optimal_and_that_of_its_policy(seed, discount, product):
     np.testing.assert_allclose(plan.action_value, action_value, rtol=0, atol=1e-12 * scale)
     np.testing.assert_allclose(plan.value, action_value.max(axis=1), rtol=0, atol=1e-11 * scale)
     np.testing.assert_array_equal(plan.policy.argmax(axis=1), plan.control_index)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_equal_to_pymdptoolbox(seed):
-    transition, reward = random_problem(seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from mdptoolbox.mdp import PolicyIteration, ValueIteration
-
-        iteration = ValueIteration(transition, reward, 0.6, epsilon=1e-12, max_iter=10_000)
-        iteration.run()
-        exact = PolicyIteration(transition, reward, 0.6)
-        exact.run()
-    plan = value_iteration(TransitionModel((transition,)), reward, 0.6)
-    np.testing.assert_array_equal(plan.control_index, iteration.policy)
-    np.testing.assert_array_equal(plan.control_index, exact.policy)
-    np.testing.assert_allclose(plan.value, exact.V, rtol=0, atol=1e-10)
 
 
 def test_closed_form_of_one_state_and_ties_go_to_the_first_control():
