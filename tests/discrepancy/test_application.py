@@ -296,7 +296,7 @@ def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
     assert len(first.model.patch)
     plan = plan_of(first.model)
-    drag = ModelPatch((PowerDamping("slide", 0.3, 2.0, 0.0, 0.05, 0.01),))
+    drag = ModelPatch((PowerDamping("slide", 0.8, 2.0, 0.0, 0.05, 0.01),))
     campaign = write_example(first.model, tmp_path / "campaign", "ringdown", 5, plan, drag)
     found = verdict_of(first, campaign, chosen("quadratic_damping"), tmp_path / "verdict")
     assert [item.identifier for item in found.verdict.effects] == ["quadratic_damping"]
