@@ -65,6 +65,7 @@ _STYLE: Final[dict[Any, Any]] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,  # a number beside an axis is what is there
     "axes.grid": False,
     "axes.unicode_minus": True,
     "grid.color": "#e3e3e3",

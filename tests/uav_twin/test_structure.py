@@ -56,16 +56,13 @@ def test_verify_compares_with_calculix(file, tmp_path, monkeypatch):
     assert "BROKEN" not in text
     assert (out / "static.inp").is_file()
     assert "is not an empty folder" in refused("structure", "verify", file, "--out", out)
-    assert (
-        json.loads(said("structure", "verify", file, "--modes", "2", "--json", "--quiet"))["passed"] is True
-    )
+    told = json.loads(said("structure", "verify", file, "--modes", "2", "--json", "--quiet"))
+    assert told["passed"] is True
     monkeypatch.setattr("uav_twin.structure.FREQUENCY_LIMIT", 0.0)
     found = command("structure", "verify", file, "--modes", "2")
     assert "BROKEN" in found.stdout
-    assert (found.returncode, found.stderr.strip().splitlines()[-1]) == (
-        1,
-        "1 of 4 checks broke their limit: 2 modes, frequencies.",
-    )
+    assert found.returncode == 1
+    assert found.stderr.strip().endswith("1 of 4 checks broke their limit: 2 modes, frequencies.")
 
 
 def test_a_fault_ends_in_one_sentence(file):

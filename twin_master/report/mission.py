@@ -105,42 +105,41 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
 
 
 def _zones(axes: Axes, run: Run, now: int, *, named: bool) -> None:
-    end = now + run.horizon
-    axes.set_xlim(-0.8, end + 0.8)
-    axes.axvspan(now + 0.5, end + 0.8, color=style.PREDICTION, alpha=0.06, linewidth=0)
-    axes.axvline(now, color=style.PRESENT, linewidth=0.8, zorder=0.5)
+    first, present = run.first_step, run.first_step + now
+    end = present + run.horizon
+    axes.set_xlim(first - 0.8, end + 0.8)
+    axes.axvspan(present + 0.5, end + 0.8, color=style.PREDICTION, alpha=0.06, linewidth=0)
+    axes.axvline(present, color=style.PRESENT, linewidth=0.8, zorder=0.5)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=True))
-    run.number_steps(axes.xaxis)
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.grid(axis="y")
     axes.yaxis.set_label_coords(-0.16, 0.5)
     if named:
         where, height = axes.get_xaxis_transform(), 1.24
-        axes.text(
-            now, height, f"now: {run.first_step + now}", transform=where, ha="right", color=style.PRESENT
-        )
-        if now > 0.35 * end:
-            axes.text(-0.8, height, "past", transform=where, ha="left", color=style.PAST)
-        if run.horizon > _NARROW * end:
-            axes.text(now + 0.5, height, "prediction", transform=where, ha="left", color=style.PREDICTION)
+        axes.text(present, height, f"now: {present}", transform=where, ha="right", color=style.PRESENT)
+        if now > 0.35 * (end - first):
+            axes.text(first - 0.8, height, "past", transform=where, ha="left", color=style.PAST)
+        if run.horizon > _NARROW * (end - first):
+            axes.text(present + 0.5, height, "prediction", transform=where, ha="left", color=style.PREDICTION)
 
 
-def _draw(axes: Axes, now: int, course: Float, truth: Float | None) -> None:
+def _draw(axes: Axes, run: Run, now: int, course: Float, truth: Float | None) -> None:
     """Draw a course, its mean and ends (3, n), up to the present and predicted; and the truth beside it."""
-    steps = np.arange(course.shape[1])
+    steps = run.first_step + np.arange(course.shape[1])
     ahead = {"linestyle": _DASHES, "marker": ".", "markersize": 3.5}
     for part, color, label, look in (
-        (steps[: now + 1], style.PAST, "past", {}), (steps[now + 1 :], style.PREDICTION, "prediction", ahead),
-    ):  # fmt: skip
-        known = part[np.isfinite(course[0, part])]
-        if len(known):
-            center, lower, upper = course[:, known]
-            style.band(axes, known, lower, upper, color)
-            axes.plot(known, center, color=color, label=label, **look)  # type: ignore[arg-type]
+        (slice(now + 1), style.PAST, "past", {}),
+        (slice(now + 1, None), style.PREDICTION, "prediction", ahead),
+    ):
+        known = np.isfinite(course[0, part])
+        if known.any():
+            at, (center, lower, upper) = steps[part][known], course[:, part][:, known]
+            style.band(axes, at, lower, upper, color)
+            axes.plot(at, center, color=color, label=label, **look)  # type: ignore[arg-type]
     mean, least, most = course[:, now].tolist()
     if np.isfinite(mean):
         axes.errorbar(
-            [now], [mean], yerr=[[max(mean - least, 0.0)], [max(most - mean, 0.0)]],
+            [steps[now]], [mean], yerr=[[max(mean - least, 0.0)], [max(most - mean, 0.0)]],
             color=style.PRESENT, marker="D", markersize=4.2, capsize=2.0, elinewidth=1.2, linestyle="none",
             zorder=4, label="present",
         )  # fmt: skip
@@ -171,9 +170,8 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
     """Draw mean and two standard deviations within the levels: p(D_t | o_0..o_now), p(D_{now+h} | ...)."""
     factor = run.factors[index]
     at_the_time = factor.scale * run["filtered/mean"][: now + 1, index]
-    axes.plot(
-        np.arange(now + 1), at_the_time, color=style.PRESENT, linewidth=0.9, label="as seen at the time"
-    )
+    turns = run.numbers[: now + 1]
+    axes.plot(turns, at_the_time, color=style.PRESENT, linewidth=0.9, label="as seen at the time")
     if now == run.steps - 1:
         past = run["smoothed/mean"], run["smoothed/standard_deviation"]
     else:
@@ -183,7 +181,7 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
     mean, deviation = (factor.scale * np.vstack(parts)[:, index] for parts in zip(past, coming, strict=True))
     ends = np.clip(mean + np.array([[-2.0], [2.0]]) * deviation, factor.levels[0], factor.levels[-1])
     truth = None if run.truth is None else factor.scale * run.truth[:, index]
-    _draw(axes, now, np.vstack((mean, ends)), truth)
+    _draw(axes, run, now, np.vstack((mean, ends)), truth)
     margin = 0.075 * (factor.levels[-1] - factor.levels[0]) or 6.0
     axes.set_yticks(factor.levels, [short_number(level) for level in factor.levels])
     axes.set(ylim=(factor.levels[0] - margin, factor.levels[-1] + margin), ylabel=factor.label)
@@ -193,8 +191,8 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
 def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
     sensors = run.sensors
     observation = sensors.scale * run.observed[: now + 1 + run.horizon, sensor]
-    turn = np.arange(len(observation))
-    seen, later = turn <= now, turn > now
+    turn = run.numbers[: len(observation)]
+    seen, later = turn <= turn[now], turn > turn[now]
     many = len(turn) > _MANY_DOTS  # as outlines they would make the page too large
     axes.plot(turn[seen], observation[seen], **_DOT, label="observed", rasterized=many)
     axes.plot(turn[later], observation[later], **_DOT, markerfacecolor="none", label="observed later")
@@ -204,7 +202,7 @@ def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
         axes.plot(lost, np.full(len(lost), 0.04), **look, label="lost")
     truth = run.get(f"truth/{sensors.quantity}")
     truth = None if truth is None else sensors.scale * truth[:, sensor]
-    _draw(axes, now, sensors.scale * _course(run, "quantity", sensor, now), truth)
+    _draw(axes, run, now, sensors.scale * _course(run, "quantity", sensor, now), truth)
     axes.margins(y=0.12)
     unit = sensors.units[sensor]
     axes.set_ylabel(unit if sensors.named else f"{sensors.quantity} ({unit})")
@@ -212,18 +210,18 @@ def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
 
 
 def _control_panel(axes: Axes, run: Run, _index: int, now: int) -> str:
-    tallest, width = 0.82, 0.8 if now + run.horizon < _MANY_TURNS else 1.0
+    present, tallest, width = run.numbers[now], 0.82, 0.8 if now + run.horizon < _MANY_TURNS else 1.0
     for control in range(len(run.controls)):
-        past = np.flatnonzero(run.control_index[:now] == control)
+        past = run.numbers[:now][run.control_index[:now] == control]
         parts = np.split(past, np.flatnonzero(np.diff(past) > 1) + 1) if width == 1.0 else past[:, None]
         bars = [(part[0] - width / 2, part[-1] - part[0] + width) for part in parts if len(part)]
         axes.broken_barh(bars, (control, tallest), facecolors=style.PAST, linewidth=0)
         if run.control_index[now] == control:
             axes.broken_barh(
-                [(now - width / 2, width)], (control, tallest), facecolors=style.PRESENT, linewidth=0
+                [(present - width / 2, width)], (control, tallest), facecolors=style.PRESENT, linewidth=0
             )
         axes.bar(
-            now + 1.0 + np.arange(run.horizon),
+            present + 1.0 + np.arange(run.horizon),
             tallest * run["predicted/control_probability"][now, :, control],
             width=width, bottom=control, color=style.PREDICTION, linewidth=0, label=f"_predicted {control}",
         )  # fmt: skip
@@ -231,8 +229,8 @@ def _control_panel(axes: Axes, run: Run, _index: int, now: int) -> str:
     later = np.arange(now + 1, min(now + 1 + run.horizon, run.steps))
     if len(later):
         axes.plot(
-            later, run.control_index[later] + tallest + 0.06, linestyle="none", marker="v", markersize=3.0,
-            color=style.TRUTH, markeredgewidth=0, label="flown later",
+            run.numbers[later], run.control_index[later] + tallest + 0.06, linestyle="none", marker="v",
+            markersize=3.0, color=style.TRUTH, markeredgewidth=0, label="flown later",
         )  # fmt: skip
     axes.grid(visible=False)
     axes.set_ylim(-0.02, len(run.controls) + 0.06)
@@ -242,8 +240,11 @@ def _control_panel(axes: Axes, run: Run, _index: int, now: int) -> str:
 
 
 def _reward_panel(axes: Axes, run: Run, reward: int, now: int) -> str:
-    _draw(axes, now, _course(run, "reward", reward, now), None)
+    _draw(axes, run, now, _course(run, "reward", reward, now), None)
     axes.margins(y=0.15)
+    low, high = axes.get_ylim()
+    if high - low < 1e-6:  # the same at all times, but for rounding
+        axes.set_ylim(low - 0.1, high + 0.1)
     axes.set_ylabel("reward")
     return f"{capital(REWARD_NAMES[reward])} reward"
 
@@ -308,17 +309,16 @@ def _marginal_figure(run: Run) -> Figure:
         marginal = run.model.states.marginal(run["filtered/probability"], run.model.states.names[index]).T
         places = np.arange(len(factor.levels))
         image = axes.pcolormesh(
-            np.arange(run.steps + 1) - 0.5, np.arange(len(places) + 1) - 0.5, marginal,
+            np.arange(run.steps + 1) + run.first_step - 0.5, np.arange(len(places) + 1) - 0.5, marginal,
             cmap=_PROBABILITY_COLORS, vmin=0.0, vmax=1.0,
         )  # fmt: skip
         if run.truth is not None:
             truth = np.interp(factor.scale * run.truth[:, index], factor.levels, places)
-            axes.plot(np.arange(run.steps), truth, color=style.TRUTH, linewidth=1.0, label="truth")
+            axes.plot(run.numbers, truth, color=style.TRUTH, linewidth=1.0, label="truth")
         axes.set_yticks(places, [short_number(level) for level in factor.levels])
         axes.set_ylabel(factor.label)
         style.panel_label(axes, "abcdefghijklmnopqrstuvwxyz"[index % 26], capital(factor.title))
         style.color_bar(figure, image, "probability", ax=axes, pad=0.02)
-        run.number_steps(axes.xaxis)
     axes.set_xlabel(run.step)
     return figure
 

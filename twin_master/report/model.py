@@ -142,7 +142,7 @@ def learnt_figure(run: Run) -> Figure:
         chosen = int(np.nanargmax(np.abs(last[:, 0] - learnt.prior[:, 0]) / last[:, 1]))
         others = np.delete(learnt.course[:, :, 0], chosen, axis=1)
         axes.plot(
-            _steps(run), others, color=style.REFERENCE, linewidth=0.5, alpha=0.8,
+            run.numbers, others, color=style.REFERENCE, linewidth=0.5, alpha=0.8,
             label=f"other {run.sensors.word}s",
         )  # fmt: skip
         truth = None if learnt.truth is None else learnt.truth[chosen]
@@ -159,13 +159,9 @@ def learnt_figure(run: Run) -> Figure:
     return figure
 
 
-def _steps(run: Run) -> Float:
-    return np.arange(run.first_step, run.first_step + run.steps, dtype=np.float64)
-
-
 def _course(axes: Axes, run: Run, course: Float, prior: Float, truth: Float | None) -> None:
     """Draw a course (T, 4) with its band and truth, from its prior (4,) before the first turn on."""
-    steps = _steps(run)
+    steps = run.numbers
     style.band(axes, steps, course[:, 2], course[:, 3], style.PRESENT)
     axes.plot(steps, course[:, 0], color=style.PRESENT, label="learnt, 90 % band")
     if run.first_step == 0:
@@ -281,13 +277,13 @@ def _residual_panel(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck
     axes.set_facecolor("#c8c8c8")
     count = len(run.sensors.titles)
     image = axes.pcolormesh(
-        np.arange(run.steps + 1) - 0.5, np.arange(count + 1) + 0.5, np.ma.masked_invalid(check.residual.T),
+        np.arange(run.steps + 1) + run.first_step - 0.5, np.arange(count + 1) + 0.5,
+        np.ma.masked_invalid(check.residual.T),
         cmap="PuOr_r", vmin=-4.0, vmax=4.0, rasterized=check.residual.size > _MOST_CELLS,
     )  # fmt: skip
     ticks = np.arange(1, count + 1, 4 if count > 8 else 1)
     axes.set(xlabel=run.step, ylabel=run.sensors.word, yticks=ticks)
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
-    run.number_steps(axes.xaxis)
     style.panel_label(axes, "a", "Standardised residuals")
     style.color_bar(figure, image, "standard deviations", ax=axes, pad=0.015, fraction=0.03, extend="both")
 

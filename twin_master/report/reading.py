@@ -25,7 +25,6 @@ from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.axis import Axis
 
 
 NORMAL_95 = 1.959963984540054
@@ -208,15 +207,15 @@ class Run:
         """Number T of steps."""
         return len(self.control_index)
 
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """Numbers of the steps: (T,)."""
+        return self["observed/step"].astype(np.int64)
+
     @property
     def first_step(self) -> int:
         """Number of the first step."""
-        return int(self["observed/step"][0])
-
-    def number_steps(self, axis: "Axis") -> None:
-        """Let an axis over the steps, which begins at 0, bear their numbers."""
-        if self.first_step:
-            axis.set_major_formatter(lambda place, _: f"{place + self.first_step:.0f}")
+        return int(self.numbers[0])
 
     @property
     def horizon(self) -> int:

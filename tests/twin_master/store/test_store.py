@@ -79,9 +79,8 @@ def test_tables_are_in_the_units_of_their_headers(result):
     health = list(csv.DictReader(tables["health"].splitlines()))
     assert [float(row["z1_true_percent"]) for row in health[8:13]] == [0, 0, 2, 4, 6]
     observed = list(csv.DictReader(tables["observed"].splitlines()))
-    assert float(observed[3]["strain_5_microstrain"]) == pytest.approx(
-        1e6 * result.flight.observed[3, 4], rel=1e-5
-    )
+    shown = float(observed[3]["strain_5_microstrain"])
+    assert shown == pytest.approx(1e6 * result.flight.observed[3, 4], rel=1e-5)
     assert observed[36]["strain_5_microstrain"] == ""
     policy = list(csv.DictReader(tables["policy"].splitlines()))
     assert (policy[0]["z1_percent"], policy[0]["control"]) == ("0", "3g")

@@ -105,11 +105,9 @@ def test_every_number_is_that_of_the_run(run):
     assert np.all(noise2 > 125e-6**2)
     spread = np.hypot(filtered["quantity_standard_deviation"].values, np.sqrt(noise2))
     np.testing.assert_allclose(wide(believed), spread, rtol=1e-9)
-    decided = filtered["decision_probability"].values
-    np.testing.assert_array_equal(believed.control_probability, decided)
-    np.testing.assert_array_equal(
-        expected.control_probability, stored["predicted"]["control_probability"].values[28]
-    )
+    coming = stored["predicted"]["control_probability"].values[28]
+    np.testing.assert_array_equal(believed.control_probability, filtered["decision_probability"].values)
+    np.testing.assert_array_equal(expected.control_probability, coming)
     np.testing.assert_array_equal(flight.truth(flight.seen(0, TURNS)), stored["truth"]["state"].values)
 
 
@@ -209,9 +207,8 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     # In printed units, with their bands.
     answer = told(teller, turn=28)
     past, believed = answer["past"], of_turns(flight, 0, 29)
-    np.testing.assert_allclose(
-        past["state"], 100.0 * flight.knowledge.model.states.mean(believed.probability)
-    )
+    mean = flight.knowledge.model.states.mean(believed.probability)
+    np.testing.assert_allclose(past["state"], 100.0 * mean)
     np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(flight.seen(0, 29)))
     width = np.subtract(past["sensor_upper"], past["sensor_lower"])
     np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * wide(believed))
