@@ -39,6 +39,7 @@ DAYS = 14
 # part them again. Before numba is imported, and for the processes that tests start. Those know nothing of
 # this: where there is one clone only, all keep the path and find each other's loops.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(FOLDER / "compiled"))
+os.environ.setdefault("NUMBA_OPT", "1")  # compiles in three quarters of the time, and our loops are as fast
 if not os.environ.get("CI"):
     from numba.core.caching import UserProvidedCacheLocator
 

@@ -4,13 +4,6 @@ An effect that is not in the catalogue can be imitated by one that is, closely e
 of many thousand samples. The difference then lies along few directions: the response of one kind of test has
 another size, slope over the span or zero than the name allows. A score test (Rao 1948, Proc. Camb. Phil. Soc.
 44) looks along these directions only, with nuisances and effect free to follow.
-
-An effect that has not one size in all trials, but follows the trial, stands for something else. From a fit
-with its remainder the size in each trial is a step of Newton's method away, its own nuisances following:
-u_t = u + g_t / h_t, with the deviation h_t^(-1/2) that the remainder widens. Cochran's
-Q = sum (u_t - mean)^2 h_t is chi^2 with one degree of freedom less than trials where the sizes agree (Cochran
-1954, Biometrics 10, 101-129); what they scatter beyond their deviations is that of DerSimonian and Laird 1986
-(Controlled Clinical Trials 7, 177-188).
 """
 
 from collections.abc import Iterable, Mapping
@@ -23,7 +16,6 @@ from scipy.stats import chi2, f
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.fits.candidate import Term
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.normal_equations import trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.fits.trial_data import TrialData
@@ -255,60 +247,3 @@ def _own_channel(problem: Problem, term: Term) -> str:
         return ""
     (channel,) = channels
     return channel if channel in problem.campaign.channels else ""
-
-
-LEVEL = 1e-3
-"""p-value of Cochran's Q below which sizes do not agree."""
-LARGE_SCATTER = 0.2
-"""Scatter between trials beyond their deviations, over the common size, from which an effect follows them."""
-TELLING = 0.5
-"""Relative deviation of the size in a trial beyond which the trial says nothing of it."""
-DIFFERENCE = 1e-4
-
-
-def scatter_of(shares: FloatArray, deviations: FloatArray) -> tuple[float, float]:
-    """Return the p-value of Cochran's Q of sizes (T,), and their scatter beyond their deviations."""
-    weights, freedom = deviations**-2, len(shares) - 1
-    statistic = float(weights @ (shares - weights @ shares / weights.sum()) ** 2)
-    spread = weights.sum() - float(weights @ weights) / weights.sum()
-    return float(chi2.sf(statistic, freedom)), float(np.sqrt(max(statistic - freedom, 0.0) / spread))
-
-
-def sizes_by_trial(problem: Problem, found: CandidateFit) -> dict[str, dict[str, tuple[float, float]]]:
-    """Return for each effect of a fit by name, for each trial that says something of its size, two numbers.
-
-    Size in the trial over the common one, less one, and the standard deviation of that.
-    """
-    precision = problem.precisions(found.sums)
-    parameters = [(term, item) for term in found.candidate.terms for item in term.parameters]
-    sizes = {term.effect.name: k for k, (term, item) in reversed([*enumerate(parameters)]) if item.magnitude}
-    rows: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in sizes}
-    for number, data in enumerate(problem.trials):
-        item = trial_rows(problem, number, found, found.candidate, precision)
-        matrix, gradient = item.of_shared()
-        for name, k in sizes.items():
-            own = np.flatnonzero(item.index == problem.shared.size + k)
-            prior, u = parameters[k][1].prior, float(found.effect[k])
-            if not own.size or prior.value(u) == 0.0 or matrix[own[0], own[0]] <= 0.0:
-                continue
-            slope = (prior.value(u + DIFFERENCE) - prior.value(u - DIFFERENCE)) / DIFFERENCE / 2.0
-            relative, information = slope / prior.value(u), float(matrix[own[0], own[0]])
-            deviation = abs(relative) / np.sqrt(information)
-            if deviation < TELLING:
-                rows[name][data.trial.name] = relative * float(gradient[own[0]]) / information, deviation
-    return rows
-
-
-def follows_trial(problem: Problem, found: CandidateFit) -> str:
-    """Return what is said of effects of a fit that follow the trial; empty where none does."""
-    told = []
-    for name, row in sizes_by_trial(problem, found).items():
-        shares, deviations = np.array([*row.values()]).reshape(-1, 2).T
-        if len(shares) < 2:
-            continue
-        p, scatter = scatter_of(shares, deviations)
-        if p < LEVEL and scatter > LARGE_SCATTER:
-            ends = (int(np.argmin(shares)), int(np.argmax(shares)))
-            low, high = (f"{100.0 * (1.0 + shares[at]):.0f} % of it in {list(row)[at]!r}" for at in ends)
-            told.append(said("remarks.follows_trial", name=name, low=low, high=high, p=p))
-    return " ".join(told)

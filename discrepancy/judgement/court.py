@@ -31,7 +31,7 @@ from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
 from .conclusion import Hypothetic
-from .consistency_gate import consistency_gate, follows_trial
+from .consistency_gate import consistency_gate
 from .proof import held_out_gate
 
 COUNTER = -0.1
@@ -151,10 +151,9 @@ class Court:
         return absolute_gate(self.problem, item)
 
     def beside(self, item: Any) -> str:
-        """Return what else speaks against a name: sizes that follow the trial, a gate that noise fails."""
-        following = follows_trial(self.problem, item)
-        if following or item.remainder is not None:
-            return following
+        """Return what else speaks against a name: a gate that it fails where it leaves noise."""
+        if item.remainder is not None:
+            return ""
         gates: list[Gate] = [consistency_gate(self.problem, item), held_out_gate(self.residuals(item))]
         return next((gate.reason for gate in gates if gate.passed is False), "")
 

@@ -39,8 +39,6 @@ LEVELS = (-1.3, -0.4, 0.4, 1.3)
 MOST_VARIANTS = 16
 AWAY = 0.5
 """Standard normal value of a magnitude with which an effect is tried, its size being free."""
-LARGEST = 4.0
-"""Standard normal value from which on an unknown is not followed."""
 
 
 def sees_forces(problem: Problem) -> bool:

@@ -16,10 +16,11 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Key, Point, Term
+from discrepancy.fits.fitting import LARGEST_EFFECT
 from discrepancy.fits.problem import Problem
 
 from .filtered import Process, Solution
-from .hypotheses import LARGEST, Columns, log_prior, scaled, variants
+from .hypotheses import Columns, log_prior, scaled, variants
 from .view import MOST_STEPS, Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
@@ -36,6 +37,8 @@ BESIDE = 0.1
 """Size of a force beside the largest one, over its size alone, to begin with."""
 WIDTHS = (10, 4, 4)
 """Effects that are followed after the screen: alone, beside one other, beside two."""
+TIED = 1.0
+"""Evidence [nat] by which values of an effect may differ to be begun with, too."""
 BEAM = 3
 """Sets to which one more effect is added."""
 ROUNDS = 8
@@ -239,13 +242,14 @@ class ForceSearch:
             best = self._ranked(found, len(effects))[0]
             longer: dict[Key, Explained] = {}
             for base in beam:
-                for _, term, start in self.screened(base, effects)[:width]:
+                for _, term, starts in self.screened(base, effects)[:width]:
                     candidate = base.candidate.plus(term)
                     if candidate.key in longer:
                         continue
-                    one = self.followed(base, candidate, np.concatenate((base.effect, start)))
-                    if one is not None:
-                        longer[candidate.key] = one
+                    begun = (np.concatenate((base.effect, start)) for start in starts)
+                    ends = [one for at in begun if (one := self.followed(base, candidate, at)) is not None]
+                    if ends:
+                        longer[candidate.key] = max(ends, key=lambda one: one.log_evidence)
             found |= longer
             ranked = self._ranked(longer, len(effects))
             if not ranked or self.score(ranked[0], len(effects)) <= self.score(best, len(effects)):
@@ -260,10 +264,13 @@ class ForceSearch:
     def _ranked(self, found: Mapping[Key, Explained], count: int) -> list[Explained]:
         return sorted(found.values(), key=lambda item: -self.score(item, count))
 
-    def screened(self, base: Explained, effects: Iterable[Effect]) -> list[tuple[float, Term, FloatArray]]:
+    def screened(
+        self, base: Explained, effects: Iterable[Effect]
+    ) -> list[tuple[float, Term, list[FloatArray]]]:
         """Return effects with the evidence that they may have beside a hypothesis, and values to begin with.
 
-        Best first, each at each of its places.
+        Best first, each at each of its places, from all values that do as well within `TIED`: in proportion
+        to its size a dead zone does the same whatever its stiffness, and ends elsewhere from each.
         """
         tried: list[tuple[Term, FloatArray]] = []
         columns: list[Column] = []
@@ -278,13 +285,16 @@ class ForceSearch:
                         if column is not None and any(np.any(part.readings) for part in column):
                             tried.append((term, values))
                             columns.append(column)
-        best: dict[tuple[str, str], tuple[float, Term, FloatArray]] = {}
+        found: dict[Term, list[tuple[float, FloatArray]]] = {}
         for number, (value, size) in self._weighed(base, columns, [term for term, _ in tried]).items():
             term, values = tried[number]
-            key = (term.label, term.place)
-            if key not in best or best[key][0] < value:
-                best[key] = (value, term, term.sized(values, size, -LARGEST, LARGEST))
-        return sorted(best.values(), key=lambda item: -item[0])
+            start = term.sized(values, size, -LARGEST_EFFECT, LARGEST_EFFECT)
+            found.setdefault(term, []).append((value, start))
+        rows = []
+        for term, starts in found.items():
+            top = max(value for value, _ in starts)
+            rows.append((top, term, [start for value, start in starts if value > top - TIED]))
+        return sorted(rows, key=lambda row: -row[0])
 
     def _weighed(
         self, base: Explained, columns: Sequence[Column], terms: Sequence[Term]
@@ -351,7 +361,7 @@ class ForceSearch:
             turns_back = step @ before < -0.5 * (before @ before)
             share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
             move = share * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            effect = np.clip(candidate.stepped(effect, move), -LARGEST, LARGEST)
+            effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
             motions, before = found.motions, step
             settled = turn > 0 and np.abs(step).max(initial=0.0) < SETTLED
         return best

@@ -326,8 +326,8 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     else:
         chosen = generator.choice(len(parts), count, p=softmax([part.log_evidence for part in parts]))
         draws = np.empty((count, len(every)))
-        for at, part in enumerate(parts):
-            draws[chosen == at] = part.draws(int(np.sum(chosen == at)), generator)
+        for at in np.unique(chosen):  # an optimum of a small share may have none
+            draws[chosen == at] = parts[at].draws(int(np.sum(chosen == at)), generator)
     return ParameterPosterior(procedure, draws, optima, marginal)
 
 

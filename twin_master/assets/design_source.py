@@ -171,30 +171,41 @@ class _Wing(NamedStructure):
         copy = self.section.copies()["patch"]
         return self.path(copy) if copy in self.places else None
 
-    @property
+    @cached_property
     def patch(self) -> "PatchFile | None":
-        """The patch, if there is one."""
+        """The patch, if there is one, with outputs in the place of channels.
+
+        Raises
+        ------
+        PatchFileError, MissionInputError
+            It is none, the wing cannot carry it, or an effect depends on time or on what happened before and
+            is believed, for which a model has no time.
+        """
+        from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, PointMass, PortForce, SensorDrift
+        from fe.runtime.wing_rows import OVERHANG
         from fmu_asset.packing.patch_file import load_patch
 
-        return None if self.patch_path is None else load_patch(self.patch_path)
-
-    def check_places(self, patch: "PatchFile") -> None:
-        """Refuse effects at places beside the wing; raises `MissionInputError`."""
-        from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, PointMass
-        from fe.runtime.wing_rows import OVERHANG
-
-        span = self.wing_design.planform.semi_span
-        load = span - self.wing_design.tip_load.distance_from_tip
+        if self.patch_path is None:
+            return None
+        wing, believed = self.wing_design, isinstance(self.section, DesignBelief)
+        span, patch = wing.planform.semi_span, load_patch(self.patch_path)
         for effect in patch.effects:
             for item in effect.patch:
                 first, length, beyond = 0.0, 0.0, (1.0 + OVERHANG) * span
                 if isinstance(item, LocalStiffnessLoss):
                     first, length, beyond = item.start, item.length, span
-                elif isinstance(item, LoadPlace | PointMass):
-                    first = item.station if isinstance(item, PointMass) else load + item.along_span
+                elif isinstance(item, PointMass):
+                    first = item.station
+                elif isinstance(item, LoadPlace):
+                    first = span - wing.tip_load.distance_from_tip + item.along_span
                 if first > beyond or first + length < 0.0:
                     of = {"effect": effect, "kind": item.kind, "place": first, "span": span}
                     raise MissionInputError(said("assets.place", where=self.patch_path, **of))
+                drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
+                if believed and (drifts or (isinstance(item, PortForce) and item.hysteretic)):
+                    what = "time" if drifts else "the loads before"
+                    raise MissionInputError(said("assets.remembers", effect=effect, what=what))
+        return patch.for_gauges(len(wing.gauges.positions), str(self.patch_path))
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain under a state and a control as VTU; return whether there is a field.
@@ -238,12 +249,9 @@ class WingFmuSource(_Wing, StructureFmuSource):
         from fmu_asset.packing.structure_fmu import check_form
         from fmu_asset.slaves.effects import effect_rows
 
-        patch, effects = self.patch, tuple[str, ...]()
-        check_form(self.section.packed, patched=patch is not None)
-        if patch is not None:
-            self.check_places(patch)
-            known = patch.for_gauges(len(self.wing_design.gauges.positions), str(self.patch_path))
-            effects = tuple(row.name for row in effect_rows(known.plain, 0, {}))
+        check_form(self.section.packed, patched=self.patch_path is not None)
+        given = [] if self.patch is None else self.patch.plain
+        effects = tuple(row.name for row in effect_rows(given, 0, {}))
         known_names, where = (*binding.parameter, *effects), f"the binding {binding.name}"
         check_calibration(self._scenario.calibration, known_names, where, advice=OWN_OF_WING)
         return effects
@@ -269,12 +277,9 @@ class DesignSource(_Wing, ReducedModelSource):
 
     def check_model(self) -> None:
         """Refuse effects that the twin cannot believe."""
-        if self.patch is not None:
-            role = self._scenario.observation.role
-            if role != "strain":
-                raise MissionInputError(said("assets.patched_role", role=role))
-            self.check_places(self.patch)
-            check_model_patch(self.patch, len(self.design.gauge), str(self.patch_path))
+        role = self._scenario.observation.role
+        if self.patch is not None and role != "strain":
+            raise MissionInputError(said("assets.patched_role", role=role))
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the strains (E, S, U, G)."""
@@ -323,7 +328,7 @@ def strains_with_effects(
     from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
     from fmu_asset.slaves.table import structure_table
 
-    effects = patch.for_gauges(wing.gauge_count).plain
+    effects = patch.plain
     rows, roles = structure_table(wing, {})
     behaviour = StructureBehaviour(wing, rows, roles, Effects(effects, wing.gauge_count, arrays))
     on = {switch_of(effect): 1.0 for effect in effects}
@@ -338,23 +343,3 @@ def strains_with_effects(
         return np.array(behaviour.start(start, 0.0, [given[name] for name in inputs])[: wing.gauge_count])
 
     return ask
-
-
-def check_model_patch(patch: "PatchFile", gauge_count: int, where: str = "The patch") -> None:
-    """Check that a model without time can carry the effects of a patch.
-
-    Raises
-    ------
-    MissionInputError
-        An effect depends on time or on what happened before.
-    PatchFileError
-        The wing cannot carry an effect.
-    """
-    from fe.runtime.patch import PortForce, SensorDrift
-
-    for effect in patch.for_gauges(gauge_count, where).effects:
-        for item in effect.patch:
-            drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
-            if drifts or (isinstance(item, PortForce) and item.hysteretic):
-                what = "time" if drifts else "the loads before"
-                raise MissionInputError(said("assets.remembers", effect=effect, what=what))

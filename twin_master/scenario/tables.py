@@ -1,6 +1,7 @@
 """Tables of a scenario: how the state moves, the truth, actions, learning, notices, the watch."""
 
 from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -223,24 +224,18 @@ def with_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
 
     What is malformed stays as it is: the schema says what is wrong with it.
     """
+    made = deepcopy(dict(table))
     try:
-        made = {**table, "control": list(table["control"])}
-        names = [dict(entry)["name"] for entry in made["control"]]
-        rewards = {**table["rewards"], "control": dict(table["rewards"]["control"])}
-        entries: list[dict[str, Any]] = [rewards["control"]]
-        for key, kinds in (("transition", ("probability", "tables")), ("truth", ("probability",))):
-            if key not in table:
-                continue
-            made[key] = dict(table[key]) | {k: dict(table[key][k]) for k in kinds if k in table[key]}
-            entries += [made[key][kind] for kind in kinds if made[key].get(kind)]
-        made["rewards"], weight = rewards, rewards.get("control_weight", 1.0) or 1.0
-        for action in table["action"]:
+        controls, rewards, truth = made["control"], made["rewards"], made.get("truth", {})
+        entries = [made["transition"].get(key) for key in ("probability", "tables")]
+        weight = rewards.get("control_weight", 1.0) or 1.0
+        for action in made["action"]:
             name, base = action["name"], action["control"]
-            if name not in names:
-                values = dict(made["control"][names.index(base)])["values"]
-                made["control"].append({"name": name, "title": action.get("title", ""), "values": values})
+            known = {control["name"]: control for control in controls}
+            if name not in known:
+                controls.append(known[base] | {"name": name, "title": action.get("title", "")})
             rewards["control"].setdefault(name, rewards["control"][base] - action["cost"] / weight)
-            for entry in entries:
+            for entry in filter(None, [*entries, truth.get("probability")]):
                 entry.setdefault(name, entry[base])
     except (KeyError, TypeError, ValueError, AttributeError):
         return table

@@ -6,13 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.signal import lfilter
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import SHAPE_GAIN
-from discrepancy.judgement.consistency_gate import LARGE_SCATTER, follows_trial, scatter_of, sizes_by_trial
 from discrepancy.judgement.court import Court
 from discrepancy.judgement.in_part import explained_share
 from discrepancy.judgement.naming import Case, name
@@ -392,39 +390,3 @@ def test_a_group_says_last_what_these_trials_cannot_test():
     assert not {effect.name for effect in kit.CATALOGUE if effect.unavailable(setting) is None} & told
     single = verdict_on("load_cell")
     assert with_untested(single, setting, kit.CATALOGUE) is single
-
-
-# ---------------------------------------------------------------- sizes of an effect by trial
-
-
-def test_cochrans_q_and_the_scatter_beyond_it_against_their_definitions():
-    generator = np.random.default_rng(1)
-    deviations = np.full(6, 0.05)
-    noise = deviations * generator.standard_normal((400, 6))
-    alike = np.array([scatter_of(item, deviations) for item in noise])
-    real = 0.4 * generator.standard_normal((400, 6))
-    apart = np.array([scatter_of(item, deviations) for item in noise + real])
-    assert stats.kstest(alike[:, 0], "uniform").pvalue > 1e-3
-    assert np.all(alike[:, 1] < LARGE_SCATTER)
-    assert np.sqrt(np.mean(apart[:, 1] ** 2)) == pytest.approx(0.4, abs=0.04)
-    assert np.mean((apart[:, 0] < 1e-3) & (apart[:, 1] > LARGE_SCATTER)) > 0.9
-
-
-@pytest.mark.parametrize("sizes", [(0.02, 0.02, 0.02), (0.02, 0.05, 0.012)])
-def test_friction_of_another_size_in_each_release_follows_the_trial(sizes):
-    bench = kit.chain_bench(static=False, dynamic_channels=("x3",))
-    parts = [bench.measured(3, bench.patch(FRICTION[0], {"friction_ratio": s}, "joint")) for s in sizes]
-    trials = tuple(part.trials[number] for number, part in enumerate(parts))
-    problem = kit.problem_of(replace(parts[0], trials=trials), bench.model)
-    found = kit.fitted(problem, Term(kit.chosen(FRICTION[0])[0], "joint"))
-    (rows,) = sizes_by_trial(problem, found).values()
-    assert list(rows) == ["release 0", "release 1", "release 2"]
-    shares, _ = np.array([*rows.values()]).T
-    told = follows_trial(problem, found)
-    if len(set(sizes)) > 1:
-        assert np.argmax(shares) == 1
-        assert "follows the trial" in told
-        assert "'release 1'" in told
-    else:
-        assert told == ""
-        assert np.all(np.abs(shares) < 0.1)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.blind_naming import at_unit
 from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
@@ -29,8 +30,8 @@ from tests.discrepancy.core.kit import problem_of
 from tests.discrepancy.rigs import chosen, fmu_rig, hiding
 from tests.refusals import Inputs
 
-CART, CART_IN_AIR, SHAKEN, SERVO, STORES = 0, 5, 8, 12, 14
-"""Campaigns of seed 1: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow."""
+CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
+"""Campaigns: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow, free play."""
 INPUTS = Inputs(__file__)
 DRIVE = INPUTS.text("drive.toml")
 DRIVEN = INPUTS.text("driven.toml")
@@ -87,11 +88,11 @@ def show(problem, gain=1.0):
         data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
 
 
-def blind(folder, number):
+def blind(folder, number, seed=1):
     """Write a campaign of the blind rigs and return it with its model."""
     folder = folder / "campaign"
-    bench, truth, _ = drawn(number, 1)
-    write(folder, bench, truth, "plain", (1, number))
+    bench, truth, _ = drawn(number, seed)
+    write(folder, bench, truth, "plain", (seed, number))
     return read(folder)
 
 
@@ -123,6 +124,16 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypat
     share = ForceShares(search).of(ranked[0], held_out=False)
     assert share.value > 0.85
     assert share.interval[0] <= share.value <= share.interval[1]
+
+
+@pytest.mark.parametrize(("number", "effect"), [(PLAY, "free_play"), (SHAKEN, "quadratic_damping")])
+def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
+    """A dead zone, whose stiffness first sight does not tell; a drag seven deviations above the median."""
+    problem = blind(tmp_path, number, 37)
+    best = ForceSearch(problem).name(chosen(effect))[0]
+    (law,) = at_unit(best.candidate.patch(problem.setting, best.effect))
+    for key, value in drawn(number, 37)[2]["values"].items():
+        assert getattr(law, key.removeprefix(f"{effect}.")) == pytest.approx(value, rel=0.05)
 
 
 def test_a_report_opens_with_the_missing_force(tmp_path):
@@ -235,7 +246,7 @@ def seen_force(problem, effect=None, place=""):
     found = None
     if effect is not None:
         term = Term(effect, place)
-        start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2]
+        start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2][0]
         found = search.followed(search.whole, Candidate((term,)), start)
     return missing_force(search, found or search.whole)
 
@@ -250,7 +261,7 @@ def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(hi
     problem = problem_of(released(ModelPatch((DAMPED,))), rig)
     search = ForceSearch(problem)
     term = Term(drag, "slide")
-    start = next(item for item in search.screened(search.whole, [drag]) if item[1] == term)[2]
+    start = next(item for item in search.screened(search.whole, [drag]) if item[1] == term)[2][0]
     found = search.followed(search.whole, Candidate((term,)), start)
     (law,) = found.candidate.patch(problem.setting, found.effect)
     at_one = law.coefficient / law.reference_velocity**2
@@ -289,7 +300,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
     problem = read(tmp_path)
     search = ForceSearch(problem)
     found = [search.followed(search.whole, Candidate((term,)), start)
-             for _, term, start in search.screened(search.whole, available(problem))[:6]]  # fmt: skip
+             for _, term, (start, *_) in search.screened(search.whole, available(problem))[:6]]  # fmt: skip
     best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.log_evidence)
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"

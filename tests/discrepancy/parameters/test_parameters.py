@@ -293,6 +293,9 @@ def test_several_maxima_are_told():
     ratio = np.exp(-0.5 * (0.75**2 - 0.85**2))  # equal likelihoods: the prior weighs them
     assert np.mean(found.samples[:, 0] > 0.0) == pytest.approx(ratio / (1.0 + ratio), abs=0.03)
     np.testing.assert_allclose(np.abs(found.samples[:, 0]).mean(), 0.8, atol=0.01)
+    few = calibrate_parameters(campaign, choice_of(even, (0.3, 0.7, -5.0, 5.0), priors[1]), samples=4)
+    assert few.procedure == "several optima"  # of which the lesser has no draw
+    np.testing.assert_allclose(few.samples[:, 0], 0.8, atol=0.02)
 
 
 def test_what_cannot_be_calibrated_is_one_sentence():

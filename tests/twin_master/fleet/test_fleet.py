@@ -14,18 +14,16 @@ import pytest
 from calibration.errors import PosteriorError
 from tests.command_line import refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, edited, flight_of, text_of, written
+from tests.twin_master.runs import check_same, edited, text_of, written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderError
 from twin_master.fleet import flight
 from twin_master.fleet.command import engine_of
-from twin_master.fleet.flight import group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Estimated, group_figures
 from twin_master.fleet.shard import Engine, unflown
 from twin_master.fleet.store import _fallbacks
 from twin_master.mission.journal import JournalFile
-from twin_master.mission.preparation import kept_knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.store.writing import open_run
 from uav_twin import fly as new_run
@@ -198,17 +196,13 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
     assert flight.told_of(outcome.folder) == {"failures": failures, "ended": {}}
 
 
-def test_figures_are_those_of_the_flights(library_file, tmp_path):
-    fleet = growing(library_file, count=4)
-    folder, (group,) = fly_fleet(fleet, tmp_path / "fleet").folder, fleet.groups
-    knowledge = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
-    source = group.scenarios[0].asset.source(group.scenarios[0])
-    flights = [flight_of(knowledge, source, seed=seed) for seed in range(4)]
-    figures = group_figures(open_fleet(folder)["growing_damage"])
-    error = [knowledge.model.states.mean(f.filtered) - f.state for f in flights]
+def test_figures_are_those_of_the_flights(whole):
+    group = open_fleet(whole)["growing_damage"]
+    figures, error = group_figures(group), (group["mean"] - group["state"]).values[..., 1]
     for name, expected in (
-        ("log evidence of a step", np.mean([f.log_evidence.mean() for f in flights])),
-        ("filtered rms error of z2", np.sqrt(np.mean(np.square(error)[:, :, 1]))),
+        ("log evidence of a step", group["log_evidence"].values.mean()),
+        ("filtered rms error of z2", np.sqrt(np.mean(error**2))),
+        ("bias of z2", error.mean()),
     ):
         found = figures[name]
         assert isinstance(found, Estimated)
