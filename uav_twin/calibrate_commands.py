@@ -11,7 +11,6 @@ import typer
 from fe.runtime.state import DigitalState
 from reporting import terminal
 from reporting.files import atomic_write_text, refuse_filled
-from reporting.table_file import table_text
 from uav_twin import parts
 from uav_twin.discrepancy_run import one_thread
 from uav_twin.options import show
@@ -156,7 +155,7 @@ def calibrate_ringdown(
     terminal.print_table(headings, printed)
     if out is not None:
         columns = zip(*written, strict=True)
-        atomic_write_text(out / "ringdown.csv", table_text(dict(zip(headings, columns, strict=True))))
+        atomic_write_text(out / "ringdown.csv", parts.table_text(dict(zip(headings, columns, strict=True))))
         parts.save_figure(parts.ring_down_figure(trials), out / "figures", "ringdown")
 
 

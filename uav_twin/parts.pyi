@@ -136,6 +136,7 @@ from reporting.figures import to_svg as to_svg
 from reporting.provenance import collect_provenance as collect_provenance
 from reporting.provenance import hash_file as hash_file
 from reporting.record_json import plain as plain
+from reporting.table_file import table_text as table_text
 from reporting.toml_file import read_toml as read_toml
 from twin_master.assets.resolution import Overrides as Overrides
 from twin_master.assets.system_export import export_design as export_design
