@@ -182,7 +182,7 @@ def test_a_policy_of_another_shape_costs_no_folder(tmp_path, library_file):
     folder = tmp_path / "run"
     with pytest.raises(InvalidModelError, match="expected a policy of shape"):
         uav_twin.fly("level_turns", folder, {"strain_library": library_file}, policy=np.ones((3, 1)))
-    with pytest.raises(MissionInputError, match="sead came"):
+    with pytest.raises(MissionInputError, match="'sead' is not a key"):
         uav_twin.fly("level_turns", folder, {"sead": 1})
     assert not folder.exists()
 
