@@ -59,7 +59,7 @@ def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
     places = sum(log(len(term.effect.places(setting))) for term in terms)
     free = sum(SHAPE_GAIN for term in terms if term.free_shape)
     share = (1.0 - SEARCH.prior_none) * SEARCH.set_shares[len(terms) - 1]
-    return log(share / comb(count, len(terms))) - places - free
+    return log(share / comb(max(count, len(terms)), len(terms))) - places - free
 
 
 def variants(term: Term) -> list[FloatArray]:

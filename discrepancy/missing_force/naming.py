@@ -362,8 +362,10 @@ class ForceSearch:
             share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
             move = share * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
             effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
+            size, last = (float(np.abs(one).max(initial=0.0)) for one in (step, before))
+            # small steps that hardly become smaller have far to go
+            settled = turn > 0 and size < SETTLED * (1.0 if size < 0.5 * last else 0.1)
             motions, before = found.motions, step
-            settled = turn > 0 and np.abs(step).max(initial=0.0) < SETTLED
         return best
 
     def linear(

@@ -13,6 +13,7 @@ from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
+from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
 from discrepancy.missing_force.shares import ForceShares, missing_force, order_of
 from discrepancy.missing_force.trial import seen_trial
@@ -134,6 +135,13 @@ def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
     (law,) = at_unit(best.candidate.patch(problem.setting, best.effect))
     for key, value in drawn(number, 37)[2]["values"].items():
         assert getattr(law, key.removeprefix(f"{effect}.")) == pytest.approx(value, rel=0.05)
+
+
+def test_one_effect_at_two_places_has_a_prior():
+    """Where it is the only one that is looked for."""
+    setting = chain("ringdown", "coulomb_friction", "joint", friction_ratio=0.004).setting
+    both = Candidate(tuple(Term(FRICTION[0], place) for place in FRICTION[0].places(setting)[:2]))
+    assert log_prior(both, 1, setting) == log_prior(both, 2, setting) > -20.0
 
 
 def test_a_report_opens_with_the_missing_force(tmp_path):
