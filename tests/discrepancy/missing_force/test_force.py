@@ -140,7 +140,7 @@ def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
 def test_one_effect_at_two_places_has_a_prior():
     """Where it is the only one that is looked for."""
     setting = chain("ringdown", "coulomb_friction", "joint", friction_ratio=0.004).setting
-    both = Candidate(tuple(Term(FRICTION[0], place) for place in FRICTION[0].places(setting)[:2]))
+    both = Candidate(tuple(Term(FRICTION, place) for place in FRICTION.places(setting)[:2]))
     assert log_prior(both, 1, setting) == log_prior(both, 2, setting) > -20.0
 
 
