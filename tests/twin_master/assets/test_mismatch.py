@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,7 +28,6 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
-from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model
@@ -152,32 +150,6 @@ def test_the_credible_set_by_enumeration(weights, truth):
     )
     found = in_credible_set(model, probability[None], np.array([truth]) / 100.0)
     assert found.tolist() == [expected]
-
-
-def test_standard_errors_of_a_study():
-    random = np.random.default_rng(1)
-    error = random.standard_normal((50, 2))
-    study = Outcomes.of(
-        {
-            "status": np.ones(50),
-            "delay": np.r_[np.ones(40), np.full(5, np.inf), np.full(5, np.nan)],
-            "early": np.arange(50) < 10,
-            "mean": error[:, None] + 1.0,
-            "state": np.ones((50, 1, 2)),
-            "log_evidence": np.full((50, 1), 3.0),
-            "credible": np.r_[np.zeros(25), np.ones(25)],
-        }
-    )
-    assert study.within.value == pytest.approx(40 / 45)
-    assert study.within.error == pytest.approx(scipy.stats.beta(41, 6).std())
-    assert study.early.error == pytest.approx(scipy.stats.beta(11, 41).std())
-    assert study.evidence.value == 3.0
-    assert study.evidence.error == 0.0
-    assert study.credible.error == pytest.approx(0.5 / 7.0)
-    again = [np.sqrt(np.mean(random.choice(error[:, 0], 50) ** 2)) for _ in range(4000)]
-    assert study.rms[0].value == pytest.approx(np.sqrt(np.mean(error[:, 0] ** 2)))
-    assert study.rms[0].error == pytest.approx(np.std(again), rel=0.1)  # the bootstrap
-    assert study.bias[1].value == pytest.approx(error[:, 1].mean())
 
 
 def test_a_model_error_reaches_the_twin(library_file, tmp_path):

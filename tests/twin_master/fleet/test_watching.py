@@ -1,7 +1,6 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
 import json
-import re
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
@@ -23,12 +22,11 @@ from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import ensemble, load_fleet
-from twin_master.fleet.reading import attention, group_figures, leaving
+from twin_master.fleet.reading import group_figures, leaving
 from twin_master.fleet.report import WORST, fleet_page, serve_fleet, write_fleet_report
 from twin_master.fleet.shard import Engine
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.preparation import kept_knowledge
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begun_watch
@@ -425,25 +423,6 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     np.testing.assert_allclose(found, soon, atol=1e-6)
     again = watched(fleet_file, tmp_path / "out")  # of which nothing is left to read
     assert [again.assets[asset.name].record()["leaving"] for asset in assets] == pytest.approx(found)
-
-
-def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
-    flown = ensemble(str(tmp_path / "wing.toml"), range(60))
-    fly_fleet(flown, tmp_path / "flown", Engine(0))
-    group = open_fleet(tmp_path / "flown")["growing_damage"]
-    kept = tmp_path / "flown" / "groups" / "growing_damage" / "0"
-    knowledge = kept_knowledge(kept, flown.groups[0].scenarios[0])
-    belief, control = group["belief"].values.astype(float), group["control_index"].values[:, -1]
-    soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(belief, control, strict=True)]
-    # Who leaves with the same percentage comes by its state.
-    printed = np.rint(100.0 * np.maximum(soon, 0.0))
-    worst = np.lexsort((-group["mean"].values[:, -1].astype(float).sum(axis=1), -printed))
-    assert max(soon) > min(soon) + 0.1
-    assert len(set(printed)) < len(set(soon))
-    table = fleet_page(tmp_path / "flown", WORST).partition("Who needs attention next")[2]
-    assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]
-    with pytest.raises(RunFolderError, match="not the folder of a fleet"):
-        fleet_page(tmp_path, WORST)
 
 
 @pytest.fixture
