@@ -21,7 +21,7 @@ from twin_master.fleet import flight
 from twin_master.fleet.command import engine_of
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.reading import Estimated, group_figures
+from twin_master.fleet.reading import Outcomes, group_figures
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.shard import Engine, unflown
 from twin_master.fleet.store import _fallbacks
@@ -55,6 +55,9 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_p
     }.items():
         single = tree[part].to_dataset()[name].values
         assert np.array_equal(group[ours].values[row], single.astype(group[ours].dtype)), ours
+    figures, study = group_figures(group), Outcomes.of(group)
+    names = "log evidence of a step", "filtered rms error of z2", "bias of z2"
+    assert [figures[name] for name in names] == [study.evidence, study.rms[1], study.bias[1]]
 
 
 def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
@@ -201,19 +204,6 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
     assert outcome.failures == failures
     (outcome.folder / "journal.jsonl").unlink()
     assert flight.told_of(outcome.folder) == {"failures": failures, "ended": {}}
-
-
-def test_figures_are_those_of_the_flights(whole):
-    group = open_fleet(whole)["growing_damage"]
-    figures, error = group_figures(group), (group["mean"] - group["state"]).values[..., 1]
-    for name, expected in (
-        ("log evidence of a step", group["log_evidence"].values.mean()),
-        ("filtered rms error of z2", np.sqrt(np.mean(error**2))),
-        ("bias of z2", error.mean()),
-    ):
-        found = figures[name]
-        assert isinstance(found, Estimated)
-        assert found.value == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():
