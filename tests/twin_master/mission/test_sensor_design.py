@@ -34,7 +34,7 @@ def test_the_information_of_sensors_is_that_of_an_integral_also_where_something_
     state = np.arange(60_000) % 3
     shown = means[state] + moved[state] * rng.standard_normal(len(state)) + rng.standard_normal(len(state))
     residual = np.stack(((shown[:, None] - means), np.tile(rng.standard_normal((len(state), 1)), 3)), axis=-1)
-    turned = np.array([[0.75**0.5, 0.0, 0.5], [-0.5, 0.0, 0.75**0.5]])  # the sensor between them shows nothing
+    turned = np.array([[0.75**0.5, 0.0, 0.5], [-0.5, 0.0, 0.75**0.5]])  # and one shows nothing
     shares = moved[:, None] * turned[0]
     readings = Readings(state, residual @ turned, shares[..., None], np.zeros((3, 3)))
     spread = np.sqrt(1.0 + moved**2)
