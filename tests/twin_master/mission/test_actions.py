@@ -12,12 +12,12 @@ import pytest
 from scipy.stats import norm
 
 import uav_twin
-from tests.command_line import said
+from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
 from tests.twin_master.runs import edited, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.errors import FleetError, PlanningError, ScenarioError
+from twin_master.errors import FleetError, ScenarioError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.loop import fly
@@ -27,14 +27,14 @@ from twin_master.mission.planning import (
     expected_plan,
     policy_file,
     promised,
-    read_policy,
     risk_of,
 )
-from twin_master.mission.preparation import Knowledge, keep_knowledge, kept_knowledge
+from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
+from twin_master.run_folder import kept_scenario
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Learning, Noticing
@@ -141,12 +141,16 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
     assert found[0].filtered.max() > 0.3  # something was told
 
 
-def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp_path):
+def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_run_keeps_readings(tmp_path):
     learning = ("steps = 120", "steps = 12"), ("[planner]", "[learning]\n[notice]\n[planner]")
-    path, policy = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz"
-    policy.write_bytes(policy_file(BeliefPolicy(np.ones((1, 25)), np.array([INSPECT])), knowledge().model))
-    said("run", path, "--policy", policy, "--out", tmp_path / "run", "--no-report")
-    run = open_run(tmp_path / "run")
+    path, policy, folder = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz", tmp_path / "run"
+    given = BeliefPolicy(np.random.default_rng(0).random((1, 25)), np.array([INSPECT]))
+    policy.write_bytes(policy_file(given, knowledge().model))
+    assert "is no policy" in refused("run", path, "--policy", path, "--out", folder)
+    said("run", path, "--policy", policy, "--out", folder, "--no-report")
+    kept = kept_knowledge(folder, kept_scenario(folder)).plan.on_belief
+    assert np.array_equal(kept.vectors, given.vectors)
+    run = open_run(folder)
     observed, truth = run["observed"], run["truth"]
     inspected = observed["control_index"].values == INSPECT
     for name in ("z1", "z2"):
@@ -214,19 +218,6 @@ def test_a_limit_is_kept_by_the_plan():
     assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
 
 
-def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path):
-    known, (_, plan) = knowledge(), planned()
-    (tmp_path / "policy.npz").write_bytes(policy_file(plan.policy, known.model))
-    policy = read_policy(tmp_path / "policy.npz", known.model)
-    assert np.array_equal(policy.vectors, plan.policy.vectors)
-    keep_knowledge(tmp_path, following(known, policy))
-    again = kept_knowledge(tmp_path, known.scenario).plan.on_belief
-    assert np.array_equal(again.vectors, policy.vectors)
-    (tmp_path / "other.npz").write_bytes(b"no policy")
-    with pytest.raises(PlanningError, match="is no policy"):
-        read_policy(tmp_path / "other.npz", known.model)
-
-
 def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
     words = ("plan", written(tmp_path, TEXT, *of_two_levels(80)), "--value-of")
@@ -278,36 +269,23 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
     flown = text[text.index("# What flies.") : text.index("# What the twin believes")]
     path = written(tmp_path, text[: text.index("[truth]")], (flown, ""))
     known = known_of(scenario(*of_two_levels(40)))
-    plant = known.plant(known.truth(2), asset_of(known))
-    told: list[dict[str, Any]] = []
-    rows: list[np.ndarray] = []
-    controls = ["3g"]
+    flown = fly(known.scenario, known.twin(), known.plant(known.truth(2), asset_of(known)))
+    names = known.scenario.control_names
 
     def messages() -> Iterator[dict[str, Any]]:
-        names = known.scenario.control_names
-        for turn in range(15):
-            before = names.index(controls[-2]) if turn else None
-            row = plant.turn(names.index(controls[-1]), before).observed
-            rows.append(row)
-            read = {
-                f"{name}_percent": 100.0 * value
-                for (*_, name, _), value in zip(known.scenario.readings, row[24:].tolist(), strict=True)
-                if np.isfinite(value)
-            }
-            yield {"turn": turn, "control": controls[-1], "strain": row[:24].tolist()} | read
+        for turn, flight in enumerate(flown.turns[:15]):
+            row = flight.reading.observed
+            read = dict(zip(("inspect_z1_percent", "inspect_z2_percent"), 100.0 * row[24:], strict=True))
+            read = {name: value for name, value in read.items() if np.isfinite(value)}
+            control = names[flown.control_index[turn]]
+            yield {"turn": turn, "control": control, "strain": row[:24].tolist()} | read
 
-    def decide(decision: Mapping[str, Any]) -> None:
-        told.append(dict(decision))
-        controls.append(decision["next_control"])
-
-    uav_twin.watch(path, messages(), tmp_path / "watch", decide=decide, report=False)
-    assert "inspect" in controls
-    twin = known.twin()
-    for row, decision, control in zip(rows, told, controls[:-1], strict=True):
-        turn = twin.turn(row, control)
-        mean = known.model.states.mean(turn.filtered)
-        assert decision["health"]["z2"]["mean"] == pytest.approx(mean[1], abs=0.05)
-    inspected = controls.index("inspect")
-    assert np.isfinite(rows[inspected][24:]).all()
+    told: list[Mapping[str, Any]] = []
+    uav_twin.watch(path, messages(), tmp_path / "watch", decide=told.append, report=False)
+    for turn, decision in enumerate(told):
+        assert decision["next_control"] == names[flown.control_index[turn + 1]]
+        mean = known.model.states.mean(flown.filtered[turn])
+        assert decision["health"]["z2"]["mean"] == pytest.approx(mean[1], abs=1e-5)
+    inspected = flown.control_index.tolist().index(INSPECT)
     spread = [decision["health"]["z2"]["standard_deviation"] for decision in told]
     assert spread[inspected] < 0.7 * spread[inspected - 1]
