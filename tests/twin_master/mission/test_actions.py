@@ -52,14 +52,13 @@ def scenario(*changes: tuple[str, str], **planner: Any) -> Scenario:
     return parse_scenario(table, "x")
 
 
-def of_two_levels(percent: int) -> tuple[tuple[str, str], ...]:
-    """Return the changes that leave four states, whose plan takes a second."""
-    return 2 * ((FIVE_LEVELS, f"levels_percent = [0, {percent}]\nprior = [1, 0]"),)
+FOUR_STATES = 2 * ((FIVE_LEVELS, "levels_percent = [0, 40]\nprior = [1, 0]"),)
+"""A change of the scenario, whose plan takes a second then."""
 
 
 @cache
-def knowledge(policy: str = "mode") -> Knowledge:
-    return known_of(scenario(policy=policy))
+def knowledge(*changes: tuple[str, str]) -> Knowledge:
+    return known_of(scenario(*changes, policy="mode"))
 
 
 def known_of(written: Scenario) -> Knowledge:
@@ -177,7 +176,7 @@ def test_an_action_that_ends_ends_the_mission():
 
 @cache
 def planned() -> tuple[Any, Any]:
-    known = knowledge()
+    known = knowledge(*FOUR_STATES)
     problem = known.problem
     return problem, expected_plan(known.scenario, problem, known.rewards)[0]
 
@@ -185,7 +184,7 @@ def planned() -> tuple[Any, Any]:
 def flown_and(known: Knowledge, said: ComparedPolicy) -> tuple[float, float]:
     """Return what 300 flown missions bring, and half its 99 % interval: what was said lies inside."""
     flown = side_by_side(known, 300)
-    place = np.rint(flown.state * 5.0).astype(int) @ (5, 1)
+    place = np.rint(flown.state / 0.4).astype(int) @ (2, 1)
     reward = known.planning_reward[place, flown.control_index]
     total = reward @ known.scenario.planner.gamma ** np.arange(reward.shape[1])
     half = 2.58 * total.std() / np.sqrt(len(total))
@@ -194,7 +193,7 @@ def flown_and(known: Knowledge, said: ComparedPolicy) -> tuple[float, float]:
 
 
 def test_flown_missions_bring_the_return_that_was_promised():
-    known, (problem, plan) = knowledge(), planned()
+    known, (problem, plan) = knowledge(*FOUR_STATES), planned()
     said = promised(known.scenario, problem, plan.policy)
     mean, half = flown_and(following(known, plan.policy), said)
     assert plan.lower - half <= mean <= plan.upper + half
@@ -204,14 +203,14 @@ def test_flown_missions_bring_the_return_that_was_promised():
 def test_simpler_rules_bring_what_is_said_of_them(decide_on, monkeypatch):
     monkeypatch.setattr("twin_master.mission.planning.PERIODS", ())
     for policy in ("mode", "qmdp"):
-        known = known_of(scenario(policy=policy, decide_on=decide_on))
+        known = known_of(scenario(*FOUR_STATES, policy=policy, decide_on=decide_on))
         flown_and(known, compared(known.scenario, planned()[0])[policy == "qmdp"])
 
 
 def test_a_limit_is_kept_by_the_plan():
-    known, (problem, plan) = knowledge(), planned()
+    known, (problem, plan) = knowledge(*FOUR_STATES), planned()
     free = risk_of(known.scenario, problem, known.rewards, plan.policy)
-    limited = scenario(policy="belief", limit_probability=round(0.6 * free, 4))
+    limited = scenario(*FOUR_STATES, policy="belief", limit_probability=round(0.6 * free, 4))
     careful, price = expected_plan(limited, problem, known.rewards)
     assert price > 0.0
     assert risk_of(limited, problem, known.rewards, careful.policy) <= 0.6 * free
@@ -220,7 +219,8 @@ def test_a_limit_is_kept_by_the_plan():
 
 def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
-    words = ("plan", written(tmp_path, TEXT, *of_two_levels(80)), "--value-of")
+    worse = 2 * (("[0, 40]", "[0, 80]"),)
+    words = ("plan", written(tmp_path, TEXT, *FOUR_STATES, *worse), "--value-of")
     record = json.loads(said(*words, "inspect", "--out", policy, "--picture", picture, "--json"))
     assert record["lower"] < record["upper"]
     assert record["value"]["mean"] > record["value"]["half_width"] > 0.0
@@ -229,9 +229,9 @@ def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
 
 
 def test_inspections_of_a_fleet_go_where_they_are_worth_most():
-    known, (_, plan) = knowledge(), planned()
-    ahead = np.random.default_rng(0).dirichlet(np.full(25, 0.3), 60)
-    model = replace(known.model, transition=TransitionModel((np.tile(np.eye(25), (5, 1, 1)),)))
+    known, (_, plan) = knowledge(*FOUR_STATES), planned()
+    ahead = np.random.default_rng(0).dirichlet(np.full(4, 0.3), 60)
+    model = replace(known.model, transition=TransitionModel((np.tile(np.eye(4), (5, 1, 1)),)))
     chosen = plan.policy.decide(ahead)
     wanting = np.flatnonzero(chosen == INSPECT)
     few = rationed(model.transition, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
@@ -247,7 +247,7 @@ def test_inspections_of_a_fleet_go_where_they_are_worth_most():
 
 
 def test_a_budget_of_inspections_is_kept_in_every_turn():
-    known, (_, plan) = knowledge(), planned()
+    known, (_, plan) = knowledge(*FOUR_STATES), planned()
     settings = known.scenario.planner.model_copy(update={"inspections_a_turn": 3})
     written = known.scenario.model_copy(update={"planner": settings})
     flown = side_by_side(following(known, plan.policy, written), 40)
@@ -265,10 +265,10 @@ def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path):
 
 
 def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
-    text = text_of("inspected_wing", *of_two_levels(40))
+    text = text_of("inspected_wing", *FOUR_STATES)
     flown = text[text.index("# What flies.") : text.index("# What the twin believes")]
     path = written(tmp_path, text[: text.index("[truth]")], (flown, ""))
-    known = known_of(scenario(*of_two_levels(40)))
+    known = known_of(scenario(*FOUR_STATES))
     flown = fly(known.scenario, known.twin(), known.plant(known.truth(2), asset_of(known)))
     names = known.scenario.control_names
 
