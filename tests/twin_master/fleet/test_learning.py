@@ -15,7 +15,7 @@ from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import group_folder
-from twin_master.fleet.learn import _noisier, learn_fleet
+from twin_master.fleet.learn import _noisier
 from twin_master.fleet.plan import Fleet, ensemble
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
 from twin_master.fleet.reading import Estimated, Outcomes, attention, leaving, severity
@@ -201,15 +201,6 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
     found = scenario.observation.standard_deviation
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
-
-
-def test_nothing_is_learnt_of_the_control_that_was_flown_last(library_file, tmp_path):
-    """A turn of 3g, and one of 2g that nothing follows."""
-    text = text_of("growing_damage", ("steps = 50", "steps = 2"), ('"2g" = -0.1, "3g"', '"2g" = 9.0, "3g"'))
-    fleet = ensemble(str(written(tmp_path, text)), range(2), Overrides(strain_library=library_file))
-    (record,) = learn_fleet(fly_fleet(fleet, tmp_path / "fleet").folder)["groups"].values()
-    flown = {control: rate["flown"] for control, rate in record["probability"].items()}
-    assert flown == {"2g": False, "3g": True}
 
 
 def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
