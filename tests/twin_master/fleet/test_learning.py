@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import beta, betabinom, norm, t
 
-from tests.twin_master.network.decision_oracles import enumerate_trajectories
+from tests.twin_master.network.decision_oracles import precise_forward_backward
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
@@ -80,7 +80,7 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability, name, success):
                 given[own] = value
         model = build_graphical_model(tiny(given, name=name, success=success))
         for twin in range(2):
-            *_, expected = enumerate_trajectories(model, control[twin], np.log(likelihood[twin]))
+            *_, expected = precise_forward_backward(model, control[twin], np.log(likelihood[twin]))
             assert found[twin, row] == pytest.approx(expected.sum(), abs=1e-12)
 
 
