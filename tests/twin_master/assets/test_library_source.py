@@ -241,6 +241,7 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         )
         given = replace(given, learnt=written(tmp_path, learnt))
     known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
+    assert ("the observation library is interpolated" in known.draws.source) is (way == "swept")
     assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
     flown = known.scenario.asset.source(known.scenario).parameters()
     assert flown == {"conductance": 6100.0, "specific_heat": pytest.approx(samples[:, 1].mean())}
