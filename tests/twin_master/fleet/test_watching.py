@@ -21,7 +21,7 @@ from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, wri
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.learn import learn_fleet
-from twin_master.fleet.plan import ensemble, load_fleet
+from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving
 from twin_master.fleet.report import WORST, fleet_page, serve_fleet, write_fleet_report
 from twin_master.fleet.shard import Engine
@@ -362,20 +362,6 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     south = '[[group]]\nname = "south"\nscenario = "wing.toml"\nobservations = "none/*.csv"'
     with pytest.raises(FleetError, match="no recording fits"):
         fly_fleet(load_fleet(fleet_of(tmp_path, LOGS, south)), tmp_path / "other", Engine(0))
-
-
-def test_recordings_teach_what_the_flights_taught(fleet_file, tmp_path):
-    fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(4)), tmp_path / "flown", Engine(0))
-    group = open_fleet(tmp_path / "flown")["growing_damage"]
-    for row in range(4):
-        observed = group["observed"].values[row].astype(np.float64)
-        write_csv(log_of(tmp_path, row), observed, group["control_index"].values[row])
-    fly_fleet(load_fleet(fleet_file), tmp_path / "recorded", Engine(0))
-    again = open_fleet(tmp_path / "recorded")["north"]
-    assert np.array_equal(again["observed"].values, group["observed"].values)
-    np.testing.assert_allclose(again["mean"].values, group["mean"].values, atol=1e-4)
-    flown, recorded = (learn_fleet(tmp_path / name)["groups"] for name in ("flown", "recorded"))
-    assert flown["growing_damage"]["probability"] == recorded["north"]["probability"]
 
 
 def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
