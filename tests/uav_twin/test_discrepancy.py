@@ -64,7 +64,7 @@ def laboratory(folder: Path) -> Campaign:
     return campaign
 
 
-def test_a_folder_of_files_becomes_the_campaign(tmp_path, monkeypatch):
+def test_a_folder_of_files_becomes_the_campaign():
     campaign = laboratory(Path())
     files = [f"{trial.name}.csv" for trial in campaign.trials]
     kinds = [f"{trial.name}.csv={trial.kind.value}" for trial in campaign.trials]
@@ -105,7 +105,7 @@ TWO = {
 }
 
 
-def test_everything_that_is_not_said_is_named_at_once(tmp_path, monkeypatch):
+def test_everything_that_is_not_said_is_named_at_once():
     for name, content in TWO.items():
         Path(name).write_bytes(content)
     done = call(*TWO, "--kind", "swing.csv=ringdown")
@@ -137,7 +137,7 @@ def test_everything_that_is_not_said_is_named_at_once(tmp_path, monkeypatch):
     assert read.trials[1].release.displacement == -0.0127
 
 
-def test_faults_of_the_data_name_the_laboratory_s_own_lines(tmp_path, monkeypatch):
+def test_faults_of_the_data_name_the_laboratory_s_own_lines():
     rows = "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14))
     Path("a.csv").write_text(f"Versuch\n\nt [ms];Weg [mm]\n{rows}", "utf-8")
     done = call("a.csv", "--kind", "driven", "--column", "Weg=x")
@@ -150,34 +150,16 @@ def test_faults_of_the_data_name_the_laboratory_s_own_lines(tmp_path, monkeypatc
     assert not Path("b").exists()
 
 
-def test_samples_at_rest_inputs_and_temperatures(tmp_path, monkeypatch):
-    rest = "".join(f"{k / 100},{(k * 7) % 11 - 5},20\n" for k in range(40))
-    Path("rest.csv").write_text(f"time [s],x [um],temperature [degC]\n{rest}", "utf-8")
-    moved = "".join(f"{k / 100},{k % 5},{k},{20 + k / 8}\n" for k in range(16))
-    Path("moved.csv").write_text(f"time [s],x [um],Motor [mA],temperature [°C]\n{moved}", "utf-8")
-    taken(
-        "rest.csv", "moved.csv", "--kind", "rest.csv=noise", "--kind", "moved.csv=driven", "--column", "x=x",
-        "--column", "Motor=input:current", "--reference-temperature", "20", "--out", "lab",
-    )  # fmt: skip
-    read = read_campaign("lab")
-    noise = read.channels["x"].noise
-    assert noise.samples is not None
-    assert noise.interval == pytest.approx(0.01)
-    (trial,) = read.trials
-    assert [item.name for item in trial.inputs] == ["current"]
-    assert trial.inputs[0].values[3] == 3e-3
-    assert trial.temperature[8] == 1.0
-
-
-def test_noise_is_of_one_file_and_remarks_are_the_origins_only(tmp_path, monkeypatch):
+def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
     for name in ("n1", "n2"):
-        rest = "".join(f"{k / 100},{(k * 7) % 11 - 5}\n" for k in range(40))
-        Path(f"{name}.csv").write_text(f"time [s],x [um]\n{rest}", "utf-8")
-    rows = "".join(f"{k / 100},{'' if k == 3 else k % 5},{k},{k / 8}\n" for k in range(16))
-    Path("push.csv").write_text(f"time [s],x [um],pull [N],leaf_strain [mV/V]\n{rows}", "utf-8")
+        rest = "".join(f"{k / 100},{(k * 7) % 11 - 5},20\n" for k in range(40))
+        Path(f"{name}.csv").write_text(f"time [s],x [um],temperature [degC]\n{rest}", "utf-8")
+    rows = "".join(f"{k / 100},{'' if k == 3 else k % 5},{k},{k / 8},{20 + k / 8}\n" for k in range(16))
+    head = "time [s],x [um],pull [mN],leaf_strain [mV/V],temperature [°C]"
+    Path("push.csv").write_text(f"{head}\n{rows}", "utf-8")
     given = (
         "--kind", "noise", "--kind", "push.csv=driven", "--column", "x=displacement", "--column",
-        "pull=input:pull", "--model", MODEL, "--out", "lab",
+        "pull=input:pull", "--reference-temperature", "20", "--model", MODEL, "--out", "lab",
     )  # fmt: skip
     done = call("push.csv", "n1.csv", "n2.csv", *given)
     assert done.returncode == 1
@@ -188,19 +170,23 @@ def test_noise_is_of_one_file_and_remarks_are_the_origins_only(tmp_path, monkeyp
     assert toml.count("Imported from") == toml.split("]\n\n[")[0].count('",\n') == 2
     assert "; 1 cell is empty." in toml
     read = read_campaign("lab")
+    noise = read.channels["x"].noise
+    assert noise.samples is not None
+    assert noise.interval == pytest.approx(0.01)
+    (trial,) = read.trials
+    assert [item.name for item in trial.inputs] == ["pull"]
+    assert trial.inputs[0].values[3] == 3e-3
+    assert trial.temperature[8] == 1.0
     assert read.channels["leaf_strain"].quantity is Quantity.SIGNAL
     assert "(assumed: say `begins`" in " ".join(read.remarks)
     Path("lab/campaign.toml").write_text(toml.replace('"driven"', '"driven"\nbegins = "still"'), "utf-8")
     assert "assumed" not in " ".join(read_campaign("lab").remarks)
-
-
-def test_a_load_factor_in_g_is_its_number(tmp_path, monkeypatch):
     Path("turn.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
     taken("turn.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
     assert read_campaign("turn").trials[0].load_factor.tolist() == [1.0, 2.5]
 
 
-def test_a_force_is_no_input_of_a_driven_trial_unless_it_is_said(tmp_path, monkeypatch):
+def test_a_force_is_no_input_of_a_driven_trial_unless_it_is_said():
     rows = "".join(f"{k / 100},{k % 5},{k}\n" for k in range(16))
     Path("push.csv").write_text(f"time [s],force [N],x [mm]\n{rows}", "utf-8")
     done = call("push.csv", "--kind", "driven", "--column", "x=x")
@@ -214,7 +200,7 @@ def test_a_force_is_no_input_of_a_driven_trial_unless_it_is_said(tmp_path, monke
     assert read_campaign("b").trials[0].force.tolist() == [0.0] * 16
 
 
-def test_the_sheets_of_a_workbook_are_trials(tmp_path, monkeypatch):
+def test_the_sheets_of_a_workbook_are_trials():
     book = Workbook()
     for number in (1, 2):
         sheet = book.create_sheet(f"pull {number}")
@@ -231,7 +217,7 @@ def test_the_sheets_of_a_workbook_are_trials(tmp_path, monkeypatch):
     assert "Imported from lab.xlsx#pull 2 (SHA-256 " in read.remarks[1]
 
 
-def test_the_documented_files_print_the_documented_tables(tmp_path, monkeypatch):
+def test_the_documented_files_print_the_documented_tables():
     page = (Path(__file__).parents[2] / "docs" / "laboratory_files.md").read_text("utf-8")
     blocks = re.findall(r"^```\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     loading, release, asked, given, written, checked = blocks[:6]
