@@ -1,15 +1,13 @@
 """`uav-twin discrepancy` as a user calls it: import, with a terminal and without, example, check and run."""
 
+import io
 import itertools
 import json
-import os
-import pty
 import re
-import select
 import shlex
 import subprocess
 import sys
-import time
+from contextlib import redirect_stderr, redirect_stdout
 from decimal import Decimal
 from pathlib import Path
 
@@ -22,6 +20,7 @@ from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.files.verdict import read_patch, read_verdict_file
 from discrepancy.model_choice import choose_model
 from discrepancy.sources.examples import example_campaign, plan_for
+from tests import command_line
 from tests.command_line import command, refused, said
 
 MODEL = "single_mass_rig"
@@ -222,43 +221,31 @@ def test_the_documented_files_print_the_documented_tables():
 # ---------------------------------------------------------------- a terminal
 
 
-def in_a_terminal(folder: Path, answers: list[str], *words: str) -> tuple[int, str]:
+class Terminal(io.StringIO):
+    """What is typed, or seen, at a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def in_a_terminal(answers: list[str], *words: object) -> tuple[int, str]:
     """Return exit code and screen of the command, its questions answered one after the other."""
-    master, slave = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "uav_twin", "discrepancy", "import", *words],
-        stdin=slave, stdout=slave, stderr=slave, cwd=folder,
-        env={**os.environ, "TERM": "dumb", "COLUMNS": "160"},
-    )  # fmt: skip
-    os.close(slave)
-    screen, until, left = "", time.monotonic() + 120.0, list(answers)
-    try:
-        while time.monotonic() < until:
-            ready, _, _ = select.select([master], [], [], 0.2)
-            if ready:
-                try:
-                    screen += os.read(master, 65536).decode("utf-8")
-                except OSError:  # the other end is closed
-                    break
-            elif left and screen.rstrip(" ").endswith(":") and screen.endswith(": "):
-                os.write(master, (left.pop(0) + "\n").encode())
-            elif process.poll() is not None:
-                break
-        return process.wait(10.0), screen.replace("\r\n", "\n")
-    finally:
-        process.kill()
-        os.close(master)
+    screen = Terminal()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(screen), redirect_stderr(screen):
+        patch.setattr(sys, "stdin", Terminal("\n".join([*answers, ""])))
+        code = command_line.call(patch, "discrepancy", "import", *words)
+    return code, screen.getvalue()
 
 
 def test_a_terminal_is_asked(tmp_path):
     """And a no writes nothing."""
     (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
-    code, screen = in_a_terminal(tmp_path, ["ringdown", ",", "tip", "mm", "12 mm", "n"], "swing.csv")
+    code, screen = in_a_terminal(["ringdown", ",", "tip", "mm", "12 mm", "n"], "swing.csv")
     assert code == 1, screen
     assert "Nothing was written." in screen
     assert [path.name for path in Path().iterdir()] == ["swing.csv"]
     answers = ["swinging", "ringdown", ",", "tip", "miles per hour", "mm", "12 mm", "y"]
-    code, screen = in_a_terminal(tmp_path, answers, "swing.csv", "--out", "lab")
+    code, screen = in_a_terminal(answers, "swing.csv", "--out", "lab")
     assert code == 0, screen
     assert "--kind must be static, ringdown, forced, driven, flight or noise, and 'swinging' came." in screen
     assert "Write lab?" in screen
