@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from reporting import terminal
+from twin_master.errors import said
 from twin_master.fleet.command import engine_of, fly_and_show
-from twin_master.sentences import said
 from twin_master.viewer.command import shown
 
 if TYPE_CHECKING:

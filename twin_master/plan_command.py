@@ -7,8 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from reporting import terminal
-from twin_master.errors import MissionInputError
-from twin_master.sentences import said
+from twin_master.errors import MissionInputError, said
 
 if TYPE_CHECKING:
     import numpy as np

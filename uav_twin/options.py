@@ -1,10 +1,11 @@
-"""What the commands of this package have in common."""
+"""What the commands of this package have in common, and why their options are refused: a file of sentences."""
 
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
+from reporting.sentences import Sentences
 
 if TYPE_CHECKING:
     from reporting.page import Words
@@ -28,3 +29,6 @@ def refused(text: str) -> typer.Exit:
     """Return the end of a command that found something wrong, and say what on the error stream."""
     typer.secho(text, fg="red", err=True)
     return typer.Exit(1)
+
+
+said = Sentences(__file__).said

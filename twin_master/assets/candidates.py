@@ -11,9 +11,8 @@ from fe.structure.mesh_file import read_mesh
 from reporting.toml_file import checked, read_toml
 from twin_master.assets.asset_source import keep_files, read_files
 from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 
 __all__ = ["with_candidates"]
 

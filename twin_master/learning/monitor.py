@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from twin_master.errors import InvalidModelError
+from twin_master.errors import InvalidModelError, said
 from twin_master.learning import switching
 from twin_master.learning.rivals import Shown, mix_onset, weigh_gauges, weigh_model, weigh_none
 from twin_master.learning.switching import GAUGES, MENDED, NONE
@@ -28,7 +28,6 @@ from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothes
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing
-from twin_master.sentences import said
 
 Arrays = dict[str, NDArray[Any]]
 

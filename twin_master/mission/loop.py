@@ -21,6 +21,7 @@ from twin_master.errors import (
     InvalidObservationError,
     NotResumableError,
     TwinMasterError,
+    said,
 )
 from twin_master.learning.expectation import Expected, expected_of
 from twin_master.mission.journal import (
@@ -40,7 +41,6 @@ from twin_master.network.inference import known_control
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.sentences import said
 
 _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 """What is told of a suspicion."""

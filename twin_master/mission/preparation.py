@@ -21,7 +21,7 @@ from reporting.words import brief
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
-from twin_master.errors import RunFolderError
+from twin_master.errors import RunFolderError, said
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
@@ -39,7 +39,6 @@ from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
-from twin_master.sentences import said
 
 
 @dataclass(frozen=True)

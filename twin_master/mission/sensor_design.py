@@ -14,10 +14,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from reporting.arrays import Float, Index
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.mission.preparation import Knowledge
 from twin_master.seeds import generator
-from twin_master.sentences import said
 
 SAMPLES = 300
 """Readings that are drawn for each control, about: as many in each state, or one in each of so many."""

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from fmu_asset.errors import FmuEndedError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, AssetReading
-from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.errors import MissionInputError, TwinMasterError, said
 from twin_master.mission.turns import Happened, History, Reading
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
-from twin_master.sentences import said
 
 
 class SensorStatus(IntEnum):

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
-from twin_master.errors import InvalidModelError, TwinMasterError
-from twin_master.sentences import said
+from twin_master.errors import InvalidModelError, TwinMasterError, said
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""

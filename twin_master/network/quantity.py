@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
-from twin_master.errors import InvalidModelError
+from twin_master.errors import InvalidModelError, said
 from twin_master.network.distributions import distribution, expect_shape
-from twin_master.sentences import said
 
 TIE = 1e-12
 """A cumulative probability reaches a level when it misses it by no more than this (rounding of the sum)."""

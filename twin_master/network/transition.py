@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
-from twin_master.errors import InvalidModelError
+from twin_master.errors import InvalidModelError, said
 from twin_master.network.distributions import expect_shape, stochastic_matrix
 from twin_master.network.kernels import Lists
 from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
-from twin_master.sentences import said
 
 JOINT_NON_ZEROS = 512
 """Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from reporting import toml_file
 from reporting.toml_file import Fault, NotNegative, Positive, shown
-from twin_master.sentences import said
+from twin_master.errors import said
 
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from select import select
 from typing import IO, Any, BinaryIO
 
-from twin_master.sentences import said
+from twin_master.errors import said
 from twin_master.watch.message import LARGEST_MESSAGE, Refused
 
 Place = Mapping[str, Any]

@@ -16,10 +16,10 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import parse_json
 from reporting.words import listing
+from twin_master.errors import said
 from twin_master.mission.turns import Reading
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
-from twin_master.sentences import said
 
 LARGEST_MESSAGE = 1_000_000
 """Bytes of a message; a larger one is refused unread."""
