@@ -126,8 +126,6 @@ def _interruptible(fly: "Callable[[], RunOutcome]", folder: Path) -> "RunOutcome
 
 def show_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
-    from reporting.page import Words
-
     rows: list[list[str]] = []
     sources: dict[str, int] = {}
     for figure in outcome.figures:
@@ -140,7 +138,7 @@ def show_outcome(outcome: "RunOutcome") -> None:
             taken = f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)"
             rows.append([f"{part}, per {outcome.step_name}", taken, ""])
     rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s", ""])
-    terminal.show("run", Words("twin_master"), outcome=outcome, rows=rows, sources=sources)
+    terminal.show("run", "twin_master", outcome=outcome, rows=rows, sources=sources)
 
 
 def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str:

@@ -20,7 +20,7 @@ from twin_master.assets.resolution import Overrides, given_overrides, resolve_sc
 from twin_master.errors import MissionInputError, said
 from twin_master.fleet.flight import source_of
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.truth import Plant, decided_to_end
+from twin_master.mission.turns import Plant, decided_to_end
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 
 try:

@@ -34,7 +34,6 @@ def plan(
 ) -> None:
     """Plan on the belief: expected return with its bounds, beside simpler rules."""
     from reporting.files import atomic_write_bytes
-    from reporting.page import Words
     from twin_master.mission.planning import compared, policy_file, risk_of
     from twin_master.report.structure import plan_figure
 
@@ -59,16 +58,16 @@ def plan(
         rows.append(replace(without, name=f"planned without {value_of}"))
         record["value"] = {"of": value_of, "mean": worth.mean, "half_width": worth.half_width}
     record["rules"] = {row.name: [row.mean, row.half_width] for row in rows}
-    terminal.answer("plan", Words("twin_master"), record, json=json)
+    terminal.answer("plan", "twin_master", record, json=json)
 
 
 def _knowledge(
     scenario: str, seed: int | None, calibration: Path | None, candidates: str | None = None
 ) -> "tuple[Knowledge, tuple[Float | None, list[Float]]]":
     """Return what the twin knows before any plan on the belief, and where its gauges are, see `_places`."""
-    from twin_master.assets.candidates import with_candidates
     from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
     from twin_master.mission.preparation import prepared_alone
+    from twin_master.mission.sensor_design import with_candidates
     from twin_master.scenario.reading import load_scenario
 
     resolved = resolve_scenario(load_scenario(scenario), Overrides(seed=seed, calibration=calibration))
@@ -145,7 +144,6 @@ def design(
     json: bool = False,
 ) -> None:
     """Choose the sensors that tell most of the state, and name what none of them separates."""
-    from reporting.page import Words
     from twin_master.mission.sensor_design import chosen_sensors, drawn_readings, separations
 
     knowledge, places = _knowledge(scenario, None, calibration, candidates)
@@ -170,7 +168,7 @@ def design(
         compared = {"chosen": few, "all": every, "all beyond chosen": every.beyond(few)}
         record["worth"] = {what: [one.mean, one.half_width] for what, one in compared.items()}
     _draw_design(picture, vtu, places, record, found.sensors)
-    terminal.answer("design", Words("twin_master"), record, json=json, candidates=len(pool))
+    terminal.answer("design", "twin_master", record, json=json, candidates=len(pool))
 
 
 def _between(knowledge: "Knowledge", name: str, level: int) -> str:

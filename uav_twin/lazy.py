@@ -27,8 +27,9 @@ class ShadowedPackageError(ImportError):
     """Another file or folder has the name of a package of this project, and is found first."""
 
 
+@cache
 def refuse_shadowing() -> None:
-    """Make sure that each package of this project is the one that will be imported.
+    """Make sure, once, that each package of this project is the one that will be imported.
 
     Raises
     ------
@@ -74,14 +75,7 @@ def handed_on(file: str) -> tuple[dict[str, str], Callable[[str], Any]]:
             raise AttributeError(
                 f"module {own!r} has no attribute {name!r}; it has {', '.join(sorted(homes))}"
             )
-        _ours()
+        refuse_shadowing()
         return getattr(import_module(homes[name]), name)
 
     return homes, found
-
-
-@cache
-def _ours() -> None:
-    from uav_twin.lazy import refuse_shadowing
-
-    refuse_shadowing()

@@ -36,9 +36,8 @@ from twin_master.assets.parameter import (
 )
 from twin_master.errors import MissionInputError, check_names, said
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.asset import AssetSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Flag, Name
+from twin_master.scenario.section import AssetSection, Flag, Name
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:

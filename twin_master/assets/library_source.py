@@ -27,8 +27,8 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import InvalidModelError, MissionInputError, said
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.asset import BeliefSection
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import BeliefSection
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -23,9 +23,8 @@ from twin_master.assets.parameter import (
 from twin_master.errors import MissionInputError, check_names, said
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import packed_row
-from twin_master.scenario.asset import FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import ROLE, ModesSection
+from twin_master.scenario.section import ROLE, FileSection, ModesSection
 from twin_master.seeds import seed_sequence
 
 if TYPE_CHECKING:

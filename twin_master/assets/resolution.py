@@ -13,10 +13,9 @@ from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
 from twin_master.errors import MissionInputError, said
 from twin_master.network.memory import check_scenario_fits
-from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Section
+from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, AssetSection, Section
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from twin_master.errors import (
     said,
 )
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
-from twin_master.scenario.asset import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import AssetSection, BeliefSection
 
 FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from twin_master.fleet.watching import WatchedAsset
 
 
+WORDS = "twin_master.fleet"
+"""Package whose words are printed."""
 ROWS = 20
 """Assets that the table on the console shows, the worst first."""
 
@@ -117,7 +119,7 @@ def _heading(standing: Mapping[str, Any]) -> str:
     from reporting.page import Words
     from twin_master.fleet.watching import counts_of
 
-    return Words("twin_master.fleet").say("heading", counts=counts_of(standing))
+    return Words(WORDS).say("heading", counts=counts_of(standing))
 
 
 def _watched_table(standing: Mapping[str, Any]) -> "Table":
@@ -166,13 +168,8 @@ def learn(
     record = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _report(folder)
-    _answer("learn", {"file": str(out), **record}, json=json, rows=lesson_rows(record), out=out)
-
-
-def _answer(command: str, record: Mapping[str, Any], *, json: bool, **values: Any) -> None:
-    from reporting.page import Words
-
-    terminal.answer(command, Words("twin_master.fleet"), record, json=json, **values)
+    told, rows = {"file": str(out), **record}, lesson_rows(record)
+    terminal.answer("learn", WORDS, told, json=json, rows=rows, out=out)
 
 
 def engine_of(workers: int | None, cluster: str | None) -> "Engine":
@@ -207,8 +204,8 @@ def fly_and_show(
     figures = _figures([outcome.folder])
     told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": len(outcome.failures)}
     told |= {"failures": outcome.failures, "ended": outcome.ended, "groups": figures}
-    _answer(
-        "run", told, json=json, outcome=outcome, rows=figure_rows(figures), groups=list(figures),
+    terminal.answer(
+        "run", WORDS, told, json=json, outcome=outcome, rows=figure_rows(figures), groups=list(figures),
         told=[*outcome.failures.items(), *outcome.ended.items()], page=outcome.folder / "report.html",
     )  # fmt: skip
     return outcome
@@ -226,7 +223,7 @@ def compare(folders: list[Path], *, json: bool = False) -> None:
     from twin_master.fleet.reading import figure_rows
 
     figures = _figures(folders)
-    _answer("compare", figures, json=json, rows=figure_rows(figures), groups=list(figures))
+    terminal.answer("compare", WORDS, figures, json=json, rows=figure_rows(figures), groups=list(figures))
 
 
 Figures = dict[str, dict[str, "Estimated | int"]]

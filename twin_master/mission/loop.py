@@ -33,8 +33,7 @@ from twin_master.mission.journal import (
     turn_record,
 )
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import Plant
-from twin_master.mission.turns import History, Reading, Turn
+from twin_master.mission.turns import History, Plant, Reading, Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control

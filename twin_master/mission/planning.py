@@ -19,7 +19,7 @@ from twin_master.network.belief_planning import (
 )
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy, value_iteration
-from twin_master.network.rewards import RewardModel
+from twin_master.network.quantity import RewardModel
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 

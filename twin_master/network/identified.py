@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidObservationError, said
-from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
+from twin_master.network.kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.section import row_width
 

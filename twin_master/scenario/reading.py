@@ -11,8 +11,8 @@ from reporting.toml_file import checked, read_toml
 from reporting.words import brief
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, said
-from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
 
 _OF_SEVERAL = ("component", "connection", "algorithm", "iterations", "tolerance")

@@ -18,9 +18,11 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from reporting.toml_file import Fault, NotNegative, Number
 from twin_master.errors import said
-from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.section import (
+    AssetSection,
+    BeliefSection,
     Count,
+    FileSection,
     Name,
     ObservationSection,
     Probability,

@@ -10,9 +10,9 @@ from pydantic import BeforeValidator, Field
 
 from reporting.toml_file import Fault, NotNegative, Number, Positive
 from twin_master.errors import said
-from twin_master.scenario.asset import FileSection
 from twin_master.scenario.section import (
     Count,
+    FileSection,
     Flag,
     Name,
     PerSensor,

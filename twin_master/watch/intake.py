@@ -25,8 +25,7 @@ from twin_master.mission.turns import Reading, Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.growing import Place
-from twin_master.watch.message import Fed, Message, Refused
+from twin_master.watch.message import Fed, Message, Place, Refused
 
 POLL_SECONDS = 0.05
 """Between two looks at a feed that may go on."""
