@@ -2,7 +2,7 @@
 
 import sys
 
-from uav_twin.lazy import ShadowedPackageError, refuse_shadowing
+from uav_twin.shadowing import ShadowedPackageError, refuse_shadowing
 
 
 def main() -> None:

@@ -78,7 +78,7 @@ def test_a_file_that_hides_a_package_is_named(hidden, use, tmp_path):
     assert found.returncode == 1
     last = found.stderr.strip().splitlines()[-1]
     name, place = Path(hidden).parts[0].removesuffix(".py"), tmp_path / Path(hidden).parts[0]
-    assert last.startswith("uav_twin.lazy.ShadowedPackageError: ")
+    assert last.startswith("uav_twin.shadowing.ShadowedPackageError: ")
     assert f"{place} hides the package `{name}` of uav-twin" in last
     assert "rename it" in last
 

@@ -1,15 +1,8 @@
-"""Names that are imported from their packages when they are first used; a `.pyi` file lists them.
+"""Files of the user that hide a package of this project, because Python finds them first, are refused."""
 
-Files of the user that hide a package of this project, because Python finds them first, are refused.
-"""
-
-import re
-from collections.abc import Callable
 from functools import cache
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 PACKAGES = (
     "calibration",
@@ -59,23 +52,3 @@ def _place(name: str) -> Path | None:
     if spec.submodule_search_locations:
         return Path(next(iter(spec.submodule_search_locations)))
     return Path(spec.origin) if spec.origin else None
-
-
-_LINE = re.compile(r"^from (\S+) import (\w+) as \2$", re.MULTILINE)
-
-
-def handed_on(file: str) -> tuple[dict[str, str], Callable[[str], Any]]:
-    """Return the module of each name in the `.pyi` beside a file, and a `__getattr__` that imports it."""
-    path = Path(file).with_suffix(".pyi")
-    homes = {name: module for module, name in _LINE.findall(path.read_text(encoding="utf-8"))}
-    own = path.parent.name if path.stem == "__init__" else f"{path.parent.name}.{path.stem}"
-
-    def found(name: str) -> Any:
-        if name not in homes:
-            raise AttributeError(
-                f"module {own!r} has no attribute {name!r}; it has {', '.join(sorted(homes))}"
-            )
-        refuse_shadowing()
-        return getattr(import_module(homes[name]), name)
-
-    return homes, found
