@@ -5,29 +5,20 @@ from hypothesis import strategies as st
 
 from tests.twin_master.network.decision_oracles import (
     eliminate_variables,
-    enumerate_prediction,
     enumerate_trajectories,
     precise_forward_backward,
     random_model,
 )
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.network.graphical_model import Factor, StateSpace, deterministic_policy, worsening_table
+from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.inference import filter_many, predict, smooth, smooth_many
-from twin_master.network.transition import TransitionModel
-from uav_twin import GraphicalModel, filter_sequence
+from twin_master.network.twin import build_graphical_model
+from uav_twin import filter_sequence, load_scenario
 
-LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 EXACT = {"rtol": 1e-10, "atol": 1e-12}
 
 
-def worsening_model(levels=LEVELS, probabilities=(0.05, 0.10)):
-    space = StateSpace((Factor("z1", levels), Factor("z2", levels)))
-    tables = [[worsening_table(len(levels), p)] * 2 for p in probabilities]
-    prior = space.certain((levels[0], levels[0]))
-    return GraphicalModel(space, ("2g", "3g"), prior, TransitionModel.from_factors(tables))
-
-
-MODEL = worsening_model()
+MODEL = build_graphical_model(load_scenario("level_turns").scenario)
 
 
 def infer(model, control, log_likelihood):
@@ -56,34 +47,22 @@ def test_filter_smoother_and_evidence_equal_enumeration(seed):
 
 
 @pytest.mark.parametrize("product", [False, True])
-@pytest.mark.parametrize("seed", range(4))
-def test_prediction_equals_enumeration(seed, product):
-    """The control node is marginalised: every trajectory of states and controls is summed."""
-    rng = np.random.default_rng(seed)
-    model = random_model(rng, product=product)
-    policy = model.policy(rng.dirichlet(np.ones(2), 4) if seed % 2 else np.eye(2)[rng.integers(0, 2, 4)])
-    belief = rng.dirichlet(np.ones(4))
-    predicted = predict(model, belief, seed % 2, policy, 3)
-    oracle = enumerate_prediction(model, belief, seed % 2, policy, 3)
-    np.testing.assert_allclose(predicted.joint, oracle, **EXACT)
-    np.testing.assert_allclose(predicted.predicted, oracle.sum(axis=2), **EXACT)
-    np.testing.assert_allclose(predicted.control_probability, oracle.sum(axis=1), **EXACT)
-
-
 @pytest.mark.parametrize("seed", [0, 1])
-def test_smoothing_and_prediction_equal_variable_elimination(seed):
+def test_smoothing_and_prediction_equal_variable_elimination(seed, product):
+    """The control of each turn to come is a node that is marginalised."""
     rng = np.random.default_rng(seed)
-    model = worsening_model(levels=LEVELS[:3], probabilities=(0.2, 0.4))
+    model = random_model(rng, (2, 3), product=product)
     control = rng.integers(0, 2, 6)
-    log_likelihood = rng.normal(size=(6, 9)) * 3
+    log_likelihood = rng.normal(size=(6, 6)) * 3
     log_likelihood[2] = 0.0
-    policy = model.policy(rng.dirichlet(np.ones(2), 9))
+    policy = model.policy(rng.dirichlet(np.ones(2), 6) if seed else np.eye(2)[rng.integers(0, 2, 6)])
     filtered, smoothed = infer(model, control, log_likelihood)
     predicted = predict(model, filtered.filtered[-1], control[-1], policy, 3)
-    oracle = eliminate_variables(model, control, log_likelihood, policy, 3)
-    np.testing.assert_allclose(smoothed, oracle[0], **EXACT)
-    np.testing.assert_allclose(predicted.predicted, oracle[1], **EXACT)
-    np.testing.assert_allclose(predicted.control_probability, oracle[2], **EXACT)
+    expected, joint = eliminate_variables(model, control, log_likelihood, policy, 3)
+    np.testing.assert_allclose(smoothed, expected, **EXACT)
+    np.testing.assert_allclose(predicted.joint, joint, **EXACT)
+    np.testing.assert_allclose(predicted.predicted, joint.sum(axis=2), **EXACT)
+    np.testing.assert_allclose(predicted.control_probability, joint.sum(axis=1), **EXACT)
 
 
 @settings(max_examples=40, deadline=None)
@@ -140,31 +119,29 @@ def test_an_impossible_observation_names_its_step():
     np.testing.assert_array_equal(failed, [-1, 3, 3])
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_log_likelihoods_must_be_numbers(value):
-    log_likelihood = np.zeros((3, 25))
-    log_likelihood[1, 7] = value
-    with pytest.raises(InvalidObservationError, match=r"log-likelihood at \(1, 7\)"):
-        filter_sequence(MODEL, [1] * 3, log_likelihood)
-
-
 POLICY = deterministic_policy([0] * 25, 2)
 ZEROS = np.zeros((3, 25))
+AT_1_7 = np.arange(75).reshape(3, 25) == 32
+REFUSED = [
+    *(
+        (
+            lambda bad=bad: filter_sequence(MODEL, [1] * 3, np.where(AT_1_7, bad, 0.0)),
+            r"likelihood at \(1, 7\)",
+        )
+        for bad in (np.nan, np.inf)
+    ),
+    (lambda: filter_sequence(MODEL, [1, 1], ZEROS), r"of shape \(2, 25\)"),
+    (lambda: filter_sequence(MODEL, [1, 2], ZEROS[:2]), "between 0 and 1"),
+    (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"controls of shape \(1,\), got \(\)"),
+    (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"controls of shape \(1,\), got \(1, 1\)"),
+    (lambda: predict(MODEL, np.ones(3), 0, POLICY, 1), r"belief of shape \(25,\)"),
+    (lambda: predict(MODEL, np.ones(25), 0, POLICY, -1), "horizon of 0 or more"),
+]
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: filter_sequence(MODEL, [1, 1], ZEROS), r"of shape \(2, 25\)"),
-        (lambda: filter_sequence(MODEL, [1, 2], ZEROS[:2]), "between 0 and 1"),
-        (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"controls of shape \(1,\), got \(\)"),
-        (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"controls of shape \(1,\), got \(1, 1\)"),
-        (lambda: predict(MODEL, np.ones(3), 0, POLICY, 1), r"belief of shape \(25,\)"),
-        (lambda: predict(MODEL, np.ones(25), 0, POLICY, -1), "horizon of 0 or more"),
-    ],
-)
-def test_shapes_and_controls_are_checked(make, sentence):
-    with pytest.raises(InvalidModelError, match=sentence):
+@pytest.mark.parametrize(("make", "sentence"), REFUSED)
+def test_what_does_not_fit_is_refused(make, sentence):
+    with pytest.raises((InvalidModelError, InvalidObservationError), match=sentence):
         make()
 
 
