@@ -107,6 +107,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
         noticing.run(CsvFeed(recorded, noticing.scenario), str, patched=(folder / "patch.json", 21))
     given = (folder / "patch.json", 15)
     counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, turns=25, patched=given)
+    assert noticing.last_decision()["turn"] == 24
     noticing.store(counts, report=False)
     run = open_run(noticing.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
