@@ -176,10 +176,6 @@ def test_what_a_run_folder_holds(flown):
     assert "follows the dynamics" in blind["title"]
     config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     assert config["scenario"]["state"][0]["levels"] == [0.0, 0.2, 0.4, 0.6, 0.8]
-    header, *rows = (folder / "csv" / "observed.csv").read_text(encoding="utf-8").splitlines()
-    assert header.startswith("step,strain_1_microstrain,strain_2_microstrain")
-    assert 2000 < float(rows[0].split(",")[1]) < 4000
-    assert rows[36] == "36" + 24 * ","
     assert json.loads((folder / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
 
 

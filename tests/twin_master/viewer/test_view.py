@@ -1,6 +1,5 @@
 """The view of a flight: its numbers against those of the run, its protocol, its page in a real browser."""
 
-import io
 import json
 import os
 import re
@@ -22,7 +21,6 @@ import pytest
 from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN
 from reporting.figures import new_figure, to_svg
-from reporting.files import atomic_write_bytes
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
 from twin_master.assets.design_source import DESIGN_COPY
@@ -159,21 +157,6 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines):
     assert Teller(flight).answer(asked()) is None  # until it is seen
     assert flight.update()
     assert flight.turns == 3
-
-
-def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(begun, lines):
-    add(begun, *lines)
-    flight = whole(begun)
-    before, number = of_turns(flight, 0, 5).expected.mean, flight.number
-    with np.load(begun / KNOWLEDGE_NAME) as kept:
-        arrays = dict(kept)
-    content = io.BytesIO()
-    np.savez(content, **(arrays | {"predicted": 1.1 * arrays["predicted"]}))
-    atomic_write_bytes(begun / KNOWLEDGE_NAME, content.getvalue())
-    add(begun, line_of({"turn": 49, "model": {}}))
-    assert flight.update()
-    assert flight.number > number
-    np.testing.assert_allclose(of_turns(flight, 0, 5).expected.mean, 1.1 * before)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
