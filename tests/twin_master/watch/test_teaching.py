@@ -89,7 +89,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
-    assert viewed(watch).pictures == []  # turns show no motion, and no force in it
+    assert viewed(watch.folder).pictures == []  # turns show no motion, and no force in it
     # Stopped within the trial, and after the adoption: the same journal.
     stopped = watchful(base, tmp_path / "stopped")
     asked = verdict["to_turn"]
@@ -109,7 +109,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     (folder / "verdict.json").write_text(json.dumps({"verdict": {"sentence": "It is so."}}))
     of_gauge(folder / "patch.json", -0.3)
     ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
-    flight = viewed(noticing)
+    flight = viewed(noticing.folder)
     before, number = flight.believed(flight.seen(0, 5)).expected.mean, flight.number
     assert flight.pictures == []  # turns are no motion
     with pytest.raises(MissionInputError, match="--from-turn names one of the 20 turns"):
@@ -139,7 +139,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     shown = json.loads(str(teller.answer(asked.model_copy(update={"turn": 19}))))["picture"]
     assert shown["said"] == "It is so."
     (picture.drawing.parent.parent / "verdict.json").write_text("{}")
-    assert viewed(noticing).pictures == []
+    assert viewed(noticing.folder).pictures == []
 
 
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):

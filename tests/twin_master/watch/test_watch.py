@@ -35,7 +35,6 @@ from tests.twin_master.watch.watches import (
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, whole_record
 from twin_master.mission.loop import BelievedModel, journalled_decision
-from twin_master.mission.turns import History
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines, mappings
@@ -59,13 +58,6 @@ def journalled(watch: Watch) -> list[Any]:
 
 def belief_of(watch: Watch) -> object:
     return json.loads(last_line(watch.folder))["filtered"]
-
-
-@pytest.fixture(scope="session")
-def plain(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mission as a CSV file."""
-    path = tmp_path_factory.mktemp("plain") / "m.csv"
-    return write_csv(path, mission.observed, mission.control_index)
 
 
 @pytest.fixture(scope="session")
@@ -286,7 +278,7 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
     assert kinds(6)[5:] == [(2, ["heard"])]
     assert journalled(watch) == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
-    shown = viewed(watch).seen(0, 4)  # as the page shows it
+    shown = viewed(watch.folder).seen(0, 4)  # as the page shows it
     seen = [[notice["kind"] for notice in turn.get("notices", ())] for turn in shown]
     assert seen == [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
     assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
