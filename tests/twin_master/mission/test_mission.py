@@ -1,14 +1,11 @@
 """The mission loop, its truth and its journal: timing, faults, resuming at every turn, what is refused."""
 
-import resource
-import signal
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from reporting.errors import DiskFullError
 from tests.twin_master.runs import flight_of, journal, of_library, table_of
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
@@ -237,19 +234,3 @@ def test_large_states_are_kept_less_often_and_their_turns_flown_again(known, tmp
     assert last < 11
     assert flown(known, tmp_path, 12).resumed_at == last + 1
     assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
-
-
-def test_a_full_disk_leaves_the_turns_before(tmp_path):
-    with JournalFile(tmp_path, "abc") as file:
-        file.append({"turn": 0, "observed": [0.1] * 24})
-        size = file.size
-        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-        ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
-            with pytest.raises(DiskFullError, match="No space is left"):
-                file.append({"turn": 1, "observed": [0.1] * 24})
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-            signal.signal(signal.SIGXFSZ, ignored)
-    assert (tmp_path / JOURNAL_NAME).stat().st_size == size
