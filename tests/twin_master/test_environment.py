@@ -1,6 +1,6 @@
 """A scenario as an environment of gymnasium: its checker, and the mission that our own policy flies in it."""
 
-import subprocess
+import importlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,8 +29,10 @@ def test_it_passes_the_checker_of_gymnasium(environment):
 
 
 def test_our_policy_flies_the_mission_of_the_loop(environment):
-    """To the last bit, with the seed of the mission; rewards by enumeration."""
+    """To the last bit, with the seed of the mission; rewards by enumeration. Wrong use is refused."""
     scenario, knowledge = environment.scenario, environment.knowledge
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        environment.step(0)
     flight = flight_of(knowledge, asset_source(scenario))
     for seed in (4, 3):  # an episode leaves nothing to the next one
         twin, (observation, info) = knowledge.twin(), environment.reset(seed=seed)
@@ -55,16 +57,9 @@ def test_our_policy_flies_the_mission_of_the_loop(environment):
     np.testing.assert_allclose(rewards, expected[1:], rtol=1e-14)
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         environment.step(0)
-
-
-def test_wrong_use_is_refused(library_file):
-    environment = ScenarioEnvironment("level_turns", {"strain_library": library_file})
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        environment.step(0)
     environment.reset(seed=1)
     with pytest.raises(gymnasium.error.InvalidAction, match="controls 2g, 3g, got 2"):
         environment.step(2)
-    environment.close()
     environment.close()
     with pytest.raises(MissionInputError, match="is closed"):
         environment.reset()
@@ -95,8 +90,8 @@ def test_chance_inside_the_asset_begins_with_the_seed_of_the_episode():
     other.close()
 
 
-def test_without_gymnasium_there_is_a_sentence():
-    program = "import sys; sys.modules['gymnasium'] = None; import uav_twin; uav_twin.ScenarioEnvironment"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode != 0
-    assert done.stderr.strip().endswith("needs gymnasium: pip install 'uav-twin[gym]'.")
+def test_without_gymnasium_there_is_a_sentence(monkeypatch):
+    monkeypatch.delitem(sys.modules, "twin_master.environment")
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(MissionInputError, match=r"needs gymnasium: pip install 'uav-twin\[gym\]'\.$"):
+        importlib.import_module("twin_master.environment")

@@ -12,12 +12,12 @@ import pytest
 from scipy.stats import norm
 
 import uav_twin
-from tests.command_line import said
+from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
 from tests.twin_master.runs import edited, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.errors import FleetError, PlanningError, ScenarioError
+from twin_master.errors import FleetError, ScenarioError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.loop import fly
@@ -27,14 +27,14 @@ from twin_master.mission.planning import (
     expected_plan,
     policy_file,
     promised,
-    read_policy,
     risk_of,
 )
-from twin_master.mission.preparation import Knowledge, keep_knowledge, kept_knowledge
+from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
+from twin_master.run_folder import kept_scenario
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Learning, Noticing
@@ -52,14 +52,13 @@ def scenario(*changes: tuple[str, str], **planner: Any) -> Scenario:
     return parse_scenario(table, "x")
 
 
-def of_two_levels(percent: int) -> tuple[tuple[str, str], ...]:
-    """Return the changes that leave four states, whose plan takes a second."""
-    return 2 * ((FIVE_LEVELS, f"levels_percent = [0, {percent}]\nprior = [1, 0]"),)
+FOUR_STATES = 2 * ((FIVE_LEVELS, "levels_percent = [0, 40]\nprior = [1, 0]"),)
+"""A change of the scenario, whose plan takes a second then."""
 
 
 @cache
-def knowledge(policy: str = "mode") -> Knowledge:
-    return known_of(scenario(policy=policy))
+def knowledge(*changes: tuple[str, str]) -> Knowledge:
+    return known_of(scenario(*changes, policy="mode"))
 
 
 def known_of(written: Scenario) -> Knowledge:
@@ -141,12 +140,16 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
     assert found[0].filtered.max() > 0.3  # something was told
 
 
-def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp_path):
+def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_run_keeps_readings(tmp_path):
     learning = ("steps = 120", "steps = 12"), ("[planner]", "[learning]\n[notice]\n[planner]")
-    path, policy = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz"
-    policy.write_bytes(policy_file(BeliefPolicy(np.ones((1, 25)), np.array([INSPECT])), knowledge().model))
-    said("run", path, "--policy", policy, "--out", tmp_path / "run", "--no-report")
-    run = open_run(tmp_path / "run")
+    path, policy, folder = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz", tmp_path / "run"
+    given = BeliefPolicy(np.random.default_rng(0).random((1, 25)), np.array([INSPECT]))
+    policy.write_bytes(policy_file(given, knowledge().model))
+    assert "is no policy" in refused("run", path, "--policy", path, "--out", folder)
+    said("run", path, "--policy", policy, "--out", folder, "--no-report")
+    kept = kept_knowledge(folder, kept_scenario(folder)).plan.on_belief
+    assert np.array_equal(kept.vectors, given.vectors)
+    run = open_run(folder)
     observed, truth = run["observed"], run["truth"]
     inspected = observed["control_index"].values == INSPECT
     for name in ("z1", "z2"):
@@ -173,7 +176,7 @@ def test_an_action_that_ends_ends_the_mission():
 
 @cache
 def planned() -> tuple[Any, Any]:
-    known = knowledge()
+    known = knowledge(*FOUR_STATES)
     problem = known.problem
     return problem, expected_plan(known.scenario, problem, known.rewards)[0]
 
@@ -181,7 +184,7 @@ def planned() -> tuple[Any, Any]:
 def flown_and(known: Knowledge, said: ComparedPolicy) -> tuple[float, float]:
     """Return what 300 flown missions bring, and half its 99 % interval: what was said lies inside."""
     flown = side_by_side(known, 300)
-    place = np.rint(flown.state * 5.0).astype(int) @ (5, 1)
+    place = np.rint(flown.state / 0.4).astype(int) @ (2, 1)
     reward = known.planning_reward[place, flown.control_index]
     total = reward @ known.scenario.planner.gamma ** np.arange(reward.shape[1])
     half = 2.58 * total.std() / np.sqrt(len(total))
@@ -190,7 +193,7 @@ def flown_and(known: Knowledge, said: ComparedPolicy) -> tuple[float, float]:
 
 
 def test_flown_missions_bring_the_return_that_was_promised():
-    known, (problem, plan) = knowledge(), planned()
+    known, (problem, plan) = knowledge(*FOUR_STATES), planned()
     said = promised(known.scenario, problem, plan.policy)
     mean, half = flown_and(following(known, plan.policy), said)
     assert plan.lower - half <= mean <= plan.upper + half
@@ -200,36 +203,24 @@ def test_flown_missions_bring_the_return_that_was_promised():
 def test_simpler_rules_bring_what_is_said_of_them(decide_on, monkeypatch):
     monkeypatch.setattr("twin_master.mission.planning.PERIODS", ())
     for policy in ("mode", "qmdp"):
-        known = known_of(scenario(policy=policy, decide_on=decide_on))
+        known = known_of(scenario(*FOUR_STATES, policy=policy, decide_on=decide_on))
         flown_and(known, compared(known.scenario, planned()[0])[policy == "qmdp"])
 
 
 def test_a_limit_is_kept_by_the_plan():
-    known, (problem, plan) = knowledge(), planned()
+    known, (problem, plan) = knowledge(*FOUR_STATES), planned()
     free = risk_of(known.scenario, problem, known.rewards, plan.policy)
-    limited = scenario(policy="belief", limit_probability=round(0.6 * free, 4))
+    limited = scenario(*FOUR_STATES, policy="belief", limit_probability=round(0.6 * free, 4))
     careful, price = expected_plan(limited, problem, known.rewards)
     assert price > 0.0
     assert risk_of(limited, problem, known.rewards, careful.policy) <= 0.6 * free
     assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
 
 
-def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path):
-    known, (_, plan) = knowledge(), planned()
-    (tmp_path / "policy.npz").write_bytes(policy_file(plan.policy, known.model))
-    policy = read_policy(tmp_path / "policy.npz", known.model)
-    assert np.array_equal(policy.vectors, plan.policy.vectors)
-    keep_knowledge(tmp_path, following(known, policy))
-    again = kept_knowledge(tmp_path, known.scenario).plan.on_belief
-    assert np.array_equal(again.vectors, policy.vectors)
-    (tmp_path / "other.npz").write_bytes(b"no policy")
-    with pytest.raises(PlanningError, match="is no policy"):
-        read_policy(tmp_path / "other.npz", known.model)
-
-
 def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
-    words = ("plan", written(tmp_path, TEXT, *of_two_levels(80)), "--value-of")
+    worse = 2 * (("[0, 40]", "[0, 80]"),)
+    words = ("plan", written(tmp_path, TEXT, *FOUR_STATES, *worse), "--value-of")
     record = json.loads(said(*words, "inspect", "--out", policy, "--picture", picture, "--json"))
     assert record["lower"] < record["upper"]
     assert record["value"]["mean"] > record["value"]["half_width"] > 0.0
@@ -238,9 +229,9 @@ def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
 
 
 def test_inspections_of_a_fleet_go_where_they_are_worth_most():
-    known, (_, plan) = knowledge(), planned()
-    ahead = np.random.default_rng(0).dirichlet(np.full(25, 0.3), 60)
-    model = replace(known.model, transition=TransitionModel((np.tile(np.eye(25), (5, 1, 1)),)))
+    known, (_, plan) = knowledge(*FOUR_STATES), planned()
+    ahead = np.random.default_rng(0).dirichlet(np.full(4, 0.3), 60)
+    model = replace(known.model, transition=TransitionModel((np.tile(np.eye(4), (5, 1, 1)),)))
     chosen = plan.policy.decide(ahead)
     wanting = np.flatnonzero(chosen == INSPECT)
     few = rationed(model.transition, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
@@ -256,7 +247,7 @@ def test_inspections_of_a_fleet_go_where_they_are_worth_most():
 
 
 def test_a_budget_of_inspections_is_kept_in_every_turn():
-    known, (_, plan) = knowledge(), planned()
+    known, (_, plan) = knowledge(*FOUR_STATES), planned()
     settings = known.scenario.planner.model_copy(update={"inspections_a_turn": 3})
     written = known.scenario.model_copy(update={"planner": settings})
     flown = side_by_side(following(known, plan.policy, written), 40)
@@ -274,40 +265,27 @@ def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path):
 
 
 def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
-    text = text_of("inspected_wing", *of_two_levels(40))
+    text = text_of("inspected_wing", *FOUR_STATES)
     flown = text[text.index("# What flies.") : text.index("# What the twin believes")]
     path = written(tmp_path, text[: text.index("[truth]")], (flown, ""))
-    known = known_of(scenario(*of_two_levels(40)))
-    plant = known.plant(known.truth(2), asset_of(known))
-    told: list[dict[str, Any]] = []
-    rows: list[np.ndarray] = []
-    controls = ["3g"]
+    known = known_of(scenario(*FOUR_STATES))
+    flown = fly(known.scenario, known.twin(), known.plant(known.truth(2), asset_of(known)))
+    names = known.scenario.control_names
 
     def messages() -> Iterator[dict[str, Any]]:
-        names = known.scenario.control_names
-        for turn in range(15):
-            before = names.index(controls[-2]) if turn else None
-            row = plant.turn(names.index(controls[-1]), before).observed
-            rows.append(row)
-            read = {
-                f"{name}_percent": 100.0 * value
-                for (*_, name, _), value in zip(known.scenario.readings, row[24:].tolist(), strict=True)
-                if np.isfinite(value)
-            }
-            yield {"turn": turn, "control": controls[-1], "strain": row[:24].tolist()} | read
+        for turn, flight in enumerate(flown.turns[:15]):
+            row = flight.reading.observed
+            read = dict(zip(("inspect_z1_percent", "inspect_z2_percent"), 100.0 * row[24:], strict=True))
+            read = {name: value for name, value in read.items() if np.isfinite(value)}
+            control = names[flown.control_index[turn]]
+            yield {"turn": turn, "control": control, "strain": row[:24].tolist()} | read
 
-    def decide(decision: Mapping[str, Any]) -> None:
-        told.append(dict(decision))
-        controls.append(decision["next_control"])
-
-    uav_twin.watch(path, messages(), tmp_path / "watch", decide=decide, report=False)
-    assert "inspect" in controls
-    twin = known.twin()
-    for row, decision, control in zip(rows, told, controls[:-1], strict=True):
-        turn = twin.turn(row, control)
-        mean = known.model.states.mean(turn.filtered)
-        assert decision["health"]["z2"]["mean"] == pytest.approx(mean[1], abs=0.05)
-    inspected = controls.index("inspect")
-    assert np.isfinite(rows[inspected][24:]).all()
+    told: list[Mapping[str, Any]] = []
+    uav_twin.watch(path, messages(), tmp_path / "watch", decide=told.append, report=False)
+    for turn, decision in enumerate(told):
+        assert decision["next_control"] == names[flown.control_index[turn + 1]]
+        mean = known.model.states.mean(flown.filtered[turn])
+        assert decision["health"]["z2"]["mean"] == pytest.approx(mean[1], abs=1e-5)
+    inspected = flown.control_index.tolist().index(INSPECT)
     spread = [decision["health"]["z2"]["standard_deviation"] for decision in told]
     assert spread[inspected] < 0.7 * spread[inspected - 1]

@@ -11,9 +11,9 @@ from twin_master.report.reading import Run
 
 
 @pytest.fixture(scope="session")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The paper's mission, with what the FMU of a wing would have monitored."""
-    run = flown(tmp_path_factory.mktemp("flown") / "wing")
+    run = flown(library_file, tmp_path_factory.mktemp("flown") / "run")
     monitored = {
         name: ("step", [value] * run.steps, {"units": unit})
         for name, value, unit in (("strain_error_bound", 1.2e-6, "1"), ("tip_displacement", 0.18, "m"))

@@ -10,24 +10,17 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tests.conftest import synthetic_library
-from twin_master.assets.resolution import Overrides
+from tests.twin_master.runs import changed_scenario
 from twin_master.network.planner import BeliefPolicy
 from twin_master.report.reading import Run, read_run
 from twin_master.scenario.schema import Scenario
-from uav_twin import fly, load_scenario
+from uav_twin import fly
 
 
-def flown(place: Path, policy: BeliefPolicy | None = None, **mission: int) -> Run:
+def flown(library: Path, folder: Path, policy: BeliefPolicy | None = None, **mission: int) -> Run:
     """Fly the paper's mission, of another length, with the wing of a strain library, and read the run."""
-    loaded = load_scenario("paper_level_turns")
-    section = loaded.scenario.mission.model_copy(update=mission)
-    loaded = replace(loaded, scenario=loaded.scenario.model_copy(update={"mission": section}))
-    place.mkdir(parents=True, exist_ok=True)
-    library = place / "UAVconfig.json"
-    library.write_text(json.dumps(synthetic_library()), encoding="utf-8")
-    given = Overrides(strain_library=library)
-    return read_run(fly(loaded, place / "run", given, policy=policy, report=False).folder)
+    loaded, given = changed_scenario("paper_level_turns", {"mission": mission}), {"strain_library": library}
+    return read_run(fly(loaded, folder, given, policy=policy, report=False).folder)
 
 
 def stored(run: Run, place: Path) -> Path:
