@@ -16,10 +16,10 @@ from fe.runtime.errors import FiniteElementError, InvalidDesignError
 from fe.structure.operators import load_and_assemble
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, cut_off_after, edited, loaded_from, merged, table_of, written
-from twin_master.assets.candidates import with_candidates
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.assets.structure_source import StructureBelief
 from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.mission.sensor_design import with_candidates
 from twin_master.network.identified import packed_row
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.store.writing import open_run
