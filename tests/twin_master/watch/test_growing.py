@@ -50,13 +50,10 @@ def logrotate(directive: str) -> Rotation:
 
 
 def renamed(path: Path) -> None:
-    """Rename a log and begin another one, as `logging.handlers` does."""
-    for number in range(8, 0, -1):
-        older = path.with_name(f"{path.name}.{number}")
-        if older.exists():
-            older.rename(path.with_name(f"{path.name}.{number + 1}"))
-    path.rename(path.with_name(f"{path.name}.1"))
-    path.touch()
+    """Rename a log and begin another one."""
+    handler = RotatingFileHandler(path, backupCount=9)
+    handler.doRollover()
+    handler.close()
 
 
 def dated(path: Path) -> None:
