@@ -1,4 +1,11 @@
-"""Errors of the calibration, named by cause."""
+"""Errors of the calibration, named by cause, and the sentences that say why."""
+
+from pathlib import Path
+
+from reporting.sentences import Sentences
+
+said = Sentences(str(Path(__file__).with_name("sentences.toml"))).said
+"""A sentence by "table.name" with its values."""
 
 
 class CalibrationError(Exception):

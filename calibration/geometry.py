@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calibration.errors import said
 from calibration.result.record import ParameterPrior, Reading
-from calibration.sentences import said
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.dynamics.records import RingDownRecord
+from calibration.errors import said
 from calibration.joint.wing_table import weighed
 from calibration.result.record import Reading
-from calibration.sentences import said
 from calibration.static.experiments import (
     HALF_WIDTH_95,
     LoadDisplacementData,

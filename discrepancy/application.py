@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from calibration.result.file import load_calibration, tailoring
-from discrepancy.errors import DiscrepancyError, ModelError
+from discrepancy.errors import SENTENCES, DiscrepancyError, ModelError, said
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
-from discrepancy.sentences import SENTENCES, said
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState
@@ -141,7 +140,7 @@ def _found(stored: files.StoredVerdict, file: Path, member: str | None) -> files
     best = _hypothesis(verdict, member) if verdict.kind in files.APPLIED else None
     if best is None:
         key = f"nothing_as_{verdict.kind.name.lower()}"
-        why = said(f"applied.{key}" if key in SENTENCES["applied"] else "applied.nothing_there")
+        why = said(f"applied.{key}" if key in SENTENCES.tables["applied"] else "applied.nothing_there")
         raise DiscrepancyError(f"{file} gives nothing to apply: {why}.")
     residuals = file.parent / RESIDUALS_NAME
     channels = files.fmu_outputs(read_residuals(residuals).channels) if residuals.is_file() else {}

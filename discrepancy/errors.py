@@ -1,4 +1,12 @@
-"""Errors of the discrepancy workflow, named by cause."""
+"""Errors of the discrepancy workflow, named by cause, and the sentences that it says."""
+
+from pathlib import Path
+
+from reporting.sentences import Sentences
+
+SENTENCES = Sentences(str(Path(__file__).with_name("sentences.toml")))
+said = SENTENCES.said
+"""A sentence by "table.name" with its values."""
 
 
 class DiscrepancyError(Exception):

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from discrepancy.errors import said
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
 from discrepancy.judgement.conclusion import named_effects
@@ -10,7 +11,6 @@ from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
 from discrepancy.self_calibration import SELF_CALIBRATION_NAME, write_self_calibration
-from discrepancy.sentences import said
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import patch_draws
 from reporting.errors import FileNotWrittenError

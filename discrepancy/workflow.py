@@ -19,7 +19,7 @@ from discrepancy.checks.fault import DataFault
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
-from discrepancy.errors import CampaignDataError
+from discrepancy.errors import CampaignDataError, said
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
@@ -41,7 +41,6 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.search.starts import Tell
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch

@@ -1,6 +1,13 @@
-"""Errors of the FMUs and of their one door, named by cause."""
+"""Errors of the FMUs and of their one door, named by cause, and the sentences that say why."""
 
 from collections.abc import Sequence
+from pathlib import Path
+
+from reporting.sentences import Sentences
+
+said = Sentences(str(Path(__file__).with_name("sentences.toml"))).said
+"""A sentence by "table.name" with its values."""
+
 
 _CONTROLS = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from fmu_asset.sentences import said
+from fmu_asset.errors import said
 
 from .errors import FmuFileError
 

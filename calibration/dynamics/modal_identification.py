@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
-from calibration.errors import ExperimentDataError
-from calibration.sentences import said
+from calibration.errors import ExperimentDataError, said
 
 from .damped_cosine import ComplexArray, DampedCosines, FloatArray, Solution, modal_slopes
 

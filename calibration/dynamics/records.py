@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.errors import ExperimentDataError, ExperimentFileError, said
 from calibration.lab_folder import LAB_ERRORS, places_of
-from calibration.sentences import said
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
 from reporting.words import counted

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import decimate, detrend, find_peaks
 
-from calibration.errors import ExperimentDataError
-from calibration.sentences import said
+from calibration.errors import ExperimentDataError, said
 
 from .damped_cosine import DampedCosines, FloatArray, RingDownMode
 from .records import MINIMUM_COUNT, RingDownRecord

@@ -14,9 +14,8 @@ from calibration.dynamics.trials import (
     RingDownFit,
     amplitude_dependence,
 )
-from calibration.errors import ExperimentDataError
+from calibration.errors import ExperimentDataError, said
 from calibration.result.record import Reading
-from calibration.sentences import said
 
 MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
 """What a ring-down tells of a wing."""

@@ -21,9 +21,8 @@ from scipy.optimize import least_squares
 from scipy.special import softmax
 from scipy.stats import multivariate_t
 
-from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
+from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError, said
 from calibration.result.record import ParameterPrior, Reading
-from calibration.sentences import said
 from calibration.static.errors_in_variables import exact_posterior, residual_variance
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior, Seed, child_seed

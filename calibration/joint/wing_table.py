@@ -10,9 +10,8 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebval3d, chebvander3d
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.errors import OutsideValidityError, PosteriorError
+from calibration.errors import OutsideValidityError, PosteriorError, said
 from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
-from calibration.sentences import said
 from calibration.static.posterior import PRIOR_DEVIATION, StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel

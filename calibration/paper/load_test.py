@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from calibration.errors import OutsideValidityError, PosteriorError
-from calibration.sentences import said
+from calibration.errors import OutsideValidityError, PosteriorError, said
 from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
 from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import (

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from calibration.dynamics.records import STEP_FOLDER
-from calibration.errors import ExperimentDataError
+from calibration.errors import ExperimentDataError, said
 from calibration.joint.measurement import MODAL
 from calibration.joint.posterior import servo_range
 from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
-from calibration.sentences import said
 from fe.runtime.modal_system import rayleigh_coefficients
 
 RESULTS_FILE = "massoptimizationresults.csv"

@@ -18,9 +18,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from calibration.errors import CalibrationError, CalibrationRecordError
+from calibration.errors import CalibrationError, CalibrationRecordError, said
 from calibration.result.record import FROM_CAMPAIGN, FROM_LABORATORY, STATE, Calibration
-from calibration.sentences import said
 from reporting.errors import DamagedFileError, FileNotWrittenError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups

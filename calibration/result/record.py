@@ -12,8 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from calibration.errors import CalibrationRecordError
-from calibration.sentences import said
+from calibration.errors import CalibrationRecordError, said
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState

@@ -34,8 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf
 
-from calibration.errors import OutsideValidityError
-from calibration.sentences import said
+from calibration.errors import OutsideValidityError, said
 
 from .experiments import LoadDisplacementData
 from .posterior import PUBLISHED_LINE, GaussianPrior, ScalarPosterior, StiffnessCurve

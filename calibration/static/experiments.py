@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import ExperimentDataError
+from calibration.errors import ExperimentDataError, said
 from calibration.lab_folder import lab_table
-from calibration.sentences import said
 from reporting.provenance import hash_record
 
 STANDARD_GRAVITY = 9.81

@@ -9,8 +9,7 @@ from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
-from calibration.errors import PosteriorError
-from calibration.sentences import said
+from calibration.errors import PosteriorError, said
 
 Seed = int | np.random.SeedSequence
 """A seed: a whole number, or a SeedSequence spawned for the purpose."""

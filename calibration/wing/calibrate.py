@@ -11,7 +11,7 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from calibration.dynamics.figures import ring_down_figure
-from calibration.errors import CalibrationRecordError
+from calibration.errors import CalibrationRecordError, said
 from calibration.geometry import Lengths, tailored_design
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import QUANTITIES, tabulate_wing, wing_priors
@@ -38,7 +38,6 @@ from calibration.result.record import (
     check_name,
     prior_samples,
 )
-from calibration.sentences import said
 from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import PUBLISHED_LINE, child_seed

@@ -3,8 +3,8 @@
 import numpy as np
 
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence, average
+from calibration.errors import said
 from calibration.result.record import Calibration
-from calibration.sentences import said
 from calibration.static.errors_in_variables import FitQuality
 from calibration.static.experiments import published_measurements
 from reporting.words import capital, plus_minus

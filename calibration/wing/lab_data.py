@@ -10,14 +10,13 @@ import numpy as np
 
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_records, read_records
 from calibration.dynamics.trials import Fits, fit_trials, refine_by_extremes
-from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.errors import ExperimentDataError, ExperimentFileError, said
 from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths, published_lengths, read_lengths
 from calibration.joint.measurement import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed
 from calibration.lab_folder import lab_place, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
 from calibration.result.record import Reading
-from calibration.sentences import said
 from calibration.static.experiments import (
     MEASUREMENTS_FILE,
     LoadDisplacementData,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
-from discrepancy.sentences import said
+from discrepancy.errors import said
 
 SHARE = 0.25
 """Share of the trials of a kind that is held out."""

@@ -10,8 +10,7 @@ from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
-from discrepancy.errors import CampaignFileError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignFileError, said
 from reporting.provenance import hash_record
 from reporting.table_file import TextTable
 from reporting.words import be, counted, listing

@@ -16,8 +16,7 @@ from scipy.stats import f as f_distribution
 
 from discrepancy.campaign.noise_tests import ljung_box
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRecord, Trial
-from discrepancy.errors import CampaignDataError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignDataError, said
 from reporting.words import counted
 
 MAINS = (50.0, 60.0, 400.0)

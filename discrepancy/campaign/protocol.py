@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from discrepancy.errors import CampaignFileError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignFileError, said
 from fe.runtime.expression import RESERVED
 from reporting.toml_file import Name, NotNegative, Number, Positive
 

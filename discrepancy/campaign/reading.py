@@ -27,8 +27,7 @@ from discrepancy.campaign.records import (
 from discrepancy.campaign.remarks import remarks_on
 from discrepancy.campaign.sampling import check_sampling, nearly_even
 from discrepancy.campaign.units import conversion_of
-from discrepancy.errors import CampaignDataError, CampaignFileError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.provenance import hash_file, hash_record
 from reporting.table_file import TableErrors, TextTable, read_table
 from reporting.toml_file import read_toml

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from discrepancy.campaign.noise import noise_model
 from discrepancy.campaign.records import Channel, Start, Trial, TrialKind
 from discrepancy.campaign.sampling import spacing_sentence
-from discrepancy.sentences import said
+from discrepancy.errors import said
 from reporting.words import counted
 
 

@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.errors import CampaignDataError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignDataError, said
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]

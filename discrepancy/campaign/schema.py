@@ -27,8 +27,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.units import conversion, conversion_of
-from discrepancy.errors import CampaignFileError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignFileError, said
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, checked
 

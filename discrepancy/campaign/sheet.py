@@ -18,8 +18,7 @@ from decimal import Decimal
 from pathlib import Path
 
 from discrepancy.campaign.units import conversion, quantities_of
-from discrepancy.errors import CampaignFileError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignFileError, said
 from reporting.provenance import hash_file
 from reporting.text_file import read_text
 from reporting.toml_file import shown

@@ -20,8 +20,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.units import UNITS, conversion_of
-from discrepancy.errors import CampaignFileError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignFileError, said
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
 from reporting.toml_file import toml_text

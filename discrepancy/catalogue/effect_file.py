@@ -50,8 +50,7 @@ from typing import Annotated
 from pydantic import Field
 
 from discrepancy.campaign.records import TrialKind
-from discrepancy.errors import CatalogueError
-from discrepancy.sentences import said
+from discrepancy.errors import CatalogueError, said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive, Window

@@ -8,8 +8,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from discrepancy.errors import CatalogueError
-from discrepancy.sentences import said
+from discrepancy.errors import CatalogueError, said
 from fe.runtime.patch import SENSORS, ModelPatch, Window
 
 from .effect_file import effects_of_file

@@ -8,9 +8,9 @@ import numpy as np
 
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.errors import SENTENCES, said
 from discrepancy.models.interface import ACROSS
 from discrepancy.models.scales import PortScale
-from discrepancy.sentences import SENTENCES, said
 from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
 
@@ -243,7 +243,7 @@ PLACES: dict[str, Callable[[Asked], Names]] = {
 
 KIND_NAMES = {kind: kind.value for kind in TrialKind} | {TrialKind.RINGDOWN: "ring-down"}
 """How a kind of trial is called in a sentence."""
-NO_PORT: str = SENTENCES["needs"]["no_port"]
+NO_PORT: str = SENTENCES.tables["needs"]["no_port"]
 """Reason against effects that are forces within a structure or between it and the ground."""
 TEMPERATURE_STEP = 0.1
 """Least range of temperatures [K] in a campaign from which an effect of temperature can show."""
@@ -277,7 +277,7 @@ def _law(asked: Asked) -> str | None:
 def _place(asked: Asked) -> str | None:
     if asked.found_places():
         return None
-    return SENTENCES["places"].get(asked.places) or said("needs.place", effect=asked.identifier)
+    return SENTENCES.tables["places"].get(asked.places) or said("needs.place", effect=asked.identifier)
 
 
 def _port(asked: Asked) -> str | None:

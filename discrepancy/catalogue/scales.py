@@ -17,9 +17,8 @@ from operator import attrgetter
 import numpy as np
 from scipy.special import beta
 
-from discrepancy.errors import CatalogueError
+from discrepancy.errors import CatalogueError, said
 from discrepancy.models.scales import PortScale
-from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
 
 from .entry import Setting

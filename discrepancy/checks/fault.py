@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from discrepancy.campaign.records import Channel, Trial
-from discrepancy.sentences import said
+from discrepancy.errors import said
 
 
 class FaultKind(StrEnum):

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter1d
 from discrepancy.campaign.noise import repeated
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
 from discrepancy.campaign.sampling import digit_of, is_even
-from discrepancy.sentences import said
+from discrepancy.errors import said
 
 LARGEST_SHARE = 0.03
 """Largest share of a record in time that may be left out; above it the record is at fault."""

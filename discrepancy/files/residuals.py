@@ -17,9 +17,8 @@ import xarray as xr
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import USUAL_REGIONS, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
-from discrepancy.errors import DiscrepancyError, VerdictFileError
+from discrepancy.errors import DiscrepancyError, VerdictFileError, said
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.sentences import said
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups

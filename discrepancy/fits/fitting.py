@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.errors import DiscrepancyError, FitError
-from discrepancy.sentences import said
+from discrepancy.errors import DiscrepancyError, FitError, said
 
 from .candidate import Candidate, Linearisation, Point, Remainder, State
 from .normal_equations import finite, normal_equations, solved, upper_factor

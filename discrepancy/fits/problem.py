@@ -16,10 +16,9 @@ from discrepancy.campaign.noise import NoiseModel, noise_model
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.catalogue.entry import Setting
-from discrepancy.errors import CampaignDataError, DiscrepancyError
+from discrepancy.errors import CampaignDataError, DiscrepancyError, said
 from discrepancy.models.interface import Model
 from discrepancy.models.sensing import observe
-from discrepancy.sentences import said
 from fe.runtime.patch import ModelPatch
 from reporting.memory import Memory
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
+from discrepancy.errors import said
 from discrepancy.fits.candidate import FREE_SHAPE
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.naming import Explained
 from discrepancy.search.strategy import Search
-from discrepancy.sentences import said
 from discrepancy.verdict import (
     CalibratedParameter,
     Estimate,

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
+from discrepancy.errors import said
 from discrepancy.fits.candidate import Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.fits.trial_data import TrialData
-from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 from fe.runtime.patch import SENSORS
 from reporting.words import counted

@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.errors import DiscrepancyError
+from discrepancy.errors import DiscrepancyError, said
 from discrepancy.fits.candidate import Candidate, Key, Point, Term
 from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.fitting import fit as fit_to
@@ -27,7 +27,6 @@ from discrepancy.search.honest_evidence import noise_levels, refitted
 from discrepancy.search.starts import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
 from .conclusion import Hypothetic

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from discrepancy.errors import said
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
@@ -19,7 +20,6 @@ from discrepancy.missing_force.shares import Share
 from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.sentences import said
 from discrepancy.verdict import ExplainedShare, RemainderEstimate, Verdict, VerdictKind
 from reporting.words import capital, counted, listing
 

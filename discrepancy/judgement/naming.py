@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from discrepancy.catalogue.entry import Effect
+from discrepancy.errors import said
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
@@ -16,7 +17,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.search.starts import Tell, acts_within, in_silence
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
-from discrepancy.sentences import said
 from discrepancy.verdict import Gate, Verdict, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 from reporting.words import listing

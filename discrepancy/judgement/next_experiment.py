@@ -11,12 +11,11 @@ import numpy as np
 from scipy.special import logsumexp
 
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
-from discrepancy.errors import DiscrepancyError
+from discrepancy.errors import SENTENCES, DiscrepancyError
 from discrepancy.fits.candidate import Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.normal_equations import finite
 from discrepancy.fits.problem import Problem
-from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
 
@@ -168,7 +167,7 @@ def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
     swings : bool
         Whether a release oscillates: a longer record of one that does not shows rest.
     """
-    for row in SENTENCES["proposal"]:
+    for row in SENTENCES.tables["proposal"]:
         done = [
             trial
             for trial in problem.campaign.trials

@@ -15,14 +15,13 @@ from scipy.sparse.csgraph import connected_components
 
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord, Start, Trial
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.errors import DiscrepancyError
+from discrepancy.errors import DiscrepancyError, said
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen
 from discrepancy.fits.trial_data import stand_in
 from discrepancy.models.interface import Model
-from discrepancy.sentences import said
 
 CONFUSED = 9.0
 """Squared distance [sigma^2] below which two effects form a confusion group."""

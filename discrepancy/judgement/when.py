@@ -5,8 +5,8 @@ from dataclasses import replace
 from math import floor, log10
 
 from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.errors import said
 from discrepancy.search.starts import are_related
-from discrepancy.sentences import said
 from discrepancy.verdict import GapWindow, Moment, NamedEffect, Verdict, VerdictKind
 from reporting.words import listing
 

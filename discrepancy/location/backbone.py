@@ -16,8 +16,7 @@ import numpy as np
 
 from calibration.dynamics.damped_cosine import DampedCosines, Solution
 from discrepancy.campaign.records import FloatArray
-from discrepancy.errors import FitError
-from discrepancy.sentences import said
+from discrepancy.errors import FitError, said
 
 SMALLEST_SIGNAL = 4.0
 """A mode counts in a window while its amplitude there is this many standard errors."""

@@ -13,8 +13,7 @@ from scipy import stats
 
 from discrepancy.campaign.noise_tests import holm, variance_p_value
 from discrepancy.campaign.records import FloatArray
-from discrepancy.errors import FitError
-from discrepancy.sentences import said
+from discrepancy.errors import FitError, said
 
 from .dependence import dependences, excess, mode_shares, predicted_frequencies
 from .map import Cell, residual_map

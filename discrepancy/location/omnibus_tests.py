@@ -10,7 +10,7 @@ import numpy as np
 
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
-from discrepancy.sentences import said
+from discrepancy.errors import said
 
 from .residuals import ResidualSet, quadratic_moments
 

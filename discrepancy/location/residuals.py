@@ -15,8 +15,7 @@ import numpy as np
 from discrepancy.campaign.noise import noise_model
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, Trial
-from discrepancy.errors import FitError
-from discrepancy.sentences import said
+from discrepancy.errors import FitError, said
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Sampled
@@ -15,7 +15,6 @@ from discrepancy.models.fmu_system import Case
 from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.scales import PortScale, Scales
-from discrepancy.sentences import said
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 from fmu_asset.door.runs import State

@@ -13,11 +13,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.acting import Acting, Load
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace, state_motion
-from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import ALIKE, Boundaries, Laws, static_solution, steps_under

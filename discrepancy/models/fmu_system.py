@@ -13,10 +13,9 @@ from scipy.optimize import root_scalar
 from scipy.signal import periodogram
 
 from discrepancy.campaign.records import FloatArray, Hold, Trial
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Course, Load, straight
 from discrepancy.models.fmu_file import FmuModelDescription, FmuVariables, ReleaseOf
-from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem

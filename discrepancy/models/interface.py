@@ -11,9 +11,8 @@ import numpy as np
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.scales import Scales
-from discrepancy.sentences import said
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses

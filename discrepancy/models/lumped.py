@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
 from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
@@ -24,7 +24,6 @@ from discrepancy.models.lumped_file import (
 )
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.system_model import Case, State, SystemModel
-from discrepancy.sentences import said
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of

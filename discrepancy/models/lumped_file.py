@@ -10,9 +10,8 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from discrepancy.campaign.records import FloatArray, Quantity
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
-from discrepancy.sentences import said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
-from discrepancy.errors import CatalogueError, ModelError
+from discrepancy.errors import CatalogueError, ModelError, said
 from discrepancy.models.interface import ACROSS, Conditions, Model, Response
-from discrepancy.sentences import said
 from fe.high_pass import filtered_record
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation

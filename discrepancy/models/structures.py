@@ -13,13 +13,12 @@ from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
 from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
-from discrepancy.sentences import said
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, said
 from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, divided, release_of
 from discrepancy.models.interface import (
     NO_PATCH,
@@ -24,7 +24,6 @@ from discrepancy.models.interface import (
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of
 from discrepancy.models.scales import PortScale, Scales
-from discrepancy.sentences import said
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of

@@ -14,13 +14,12 @@ from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import LEFT
-from discrepancy.errors import CampaignDataError, ModelError
+from discrepancy.errors import CampaignDataError, ModelError, said
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
 from discrepancy.search.honest_evidence import left_by
-from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
 from reporting.progress import Progress, reporter

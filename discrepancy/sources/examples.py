@@ -13,10 +13,9 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.checks.model_check import prior_mean
-from discrepancy.errors import CampaignFileError, ModelError
+from discrepancy.errors import CampaignFileError, ModelError, said
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
-from discrepancy.sentences import said
 from fe.runtime.patch import ModelPatch
 
 ExampleKind = Literal["static", "ringdown", "flight", "laboratory", "complete"]

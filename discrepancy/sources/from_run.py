@@ -24,9 +24,8 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.sampling import FloatArray
-from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
+from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError, said
 from discrepancy.models.structures import WingModel
-from discrepancy.sentences import said
 from fmu_asset.door.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch

@@ -16,8 +16,7 @@ from calibration.errors import CalibrationError
 from calibration.static.experiments import read_measurements
 from discrepancy.campaign.reading import CAMPAIGN_FILE
 from discrepancy.campaign.sampling import FloatArray
-from discrepancy.errors import CampaignDataError, CampaignFileError
-from discrepancy.sentences import said
+from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
 from reporting.toml_file import toml_text

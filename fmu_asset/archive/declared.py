@@ -11,9 +11,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from fmu_asset.errors import FmuInputError, FmuUnsupportedError, visible
+from fmu_asset.errors import FmuInputError, FmuUnsupportedError, said, visible
 from fmu_asset.instances.plan import FmuIdentity, Interface
-from fmu_asset.sentences import said
 from reporting.units import BASE_UNITS
 
 NUMERIC_KINDS = frozenset(

@@ -15,10 +15,9 @@ from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 from fmpy import platform as fmi_platform
 from fmpy import platform_tuple, read_model_description, sharedLibraryExtension
 
-from fmu_asset.errors import FmuFileError, FmuUnsupportedError
+from fmu_asset.errors import FmuFileError, FmuUnsupportedError, said
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
-from fmu_asset.sentences import said
 from reporting.words import one_line
 
 from .declared import FmuDescription, read_declared

@@ -11,8 +11,7 @@ from typing import Literal
 
 from fmpy import platform as fmi_platform
 
-from fmu_asset.errors import FmuBuildError
-from fmu_asset.sentences import said
+from fmu_asset.errors import FmuBuildError, said
 
 COMPILERS = ("cc", "gcc", "clang")
 """Tried in this order where the environment variable CC names none."""

@@ -22,9 +22,8 @@ from fmu_asset.description import (
     description_members,
     rendered,
 )
-from fmu_asset.errors import FmuBuildError
+from fmu_asset.errors import FmuBuildError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.sentences import said
 from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import ENUMERATIONS, TRANSIENT, FmuVariable
 

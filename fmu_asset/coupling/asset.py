@@ -6,8 +6,7 @@ from typing import Any, Literal, cast
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.exchange import Exchange, Values
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError
-from fmu_asset.sentences import said
+from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError, said
 
 from .instance import CoupledFmus, naming
 from .structure import SystemStructure

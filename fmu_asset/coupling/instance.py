@@ -16,9 +16,8 @@ from fmu_asset.door.life import PackedState
 from fmu_asset.door.placement import Housing, ResetTrial, Start
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import IDENTITY
-from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationError
+from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationError, said
 from fmu_asset.instances.plan import Instance, Settings
-from fmu_asset.sentences import said
 
 from .structure import Endpoint
 from .system import Part, SystemDescription

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.door.binding import expand
 from fmu_asset.door.units import IDENTITY, Conversion
-from fmu_asset.errors import CouplingError
+from fmu_asset.errors import CouplingError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.sentences import said
 
 CONNECTOR_KINDS = ("input", "output", "parameter")
 """What a connector of a system can be."""

@@ -10,9 +10,8 @@ from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.units import IDENTITY
-from fmu_asset.errors import BindingError, CouplingError
+from fmu_asset.errors import BindingError, CouplingError, said
 from fmu_asset.instances.plan import Settings
-from fmu_asset.sentences import said
 
 from .structure import Component, Endpoint
 from .wiring import ConnectedVariable, Wiring

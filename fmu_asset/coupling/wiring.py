@@ -22,8 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.units import IDENTITY, Conversion, between
-from fmu_asset.errors import CouplingError
-from fmu_asset.sentences import said
+from fmu_asset.errors import CouplingError, said
 
 from .structure import Component, Connection, Endpoint, Setting, SystemStructure
 

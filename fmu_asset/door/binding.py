@@ -30,9 +30,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field
 
-from fmu_asset.errors import BindingError
+from fmu_asset.errors import BindingError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerLimits
 from reporting.toml_file import Fault, Section, checked, read_toml
 

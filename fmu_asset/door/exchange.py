@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription, VariableInfo
-from fmu_asset.errors import BindingError, FmuInputError
+from fmu_asset.errors import BindingError, FmuInputError, said
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
-from fmu_asset.sentences import said
 
 from .binding import INPUT_ROLES, Binding, Input, Vector
 from .layout import BlockLayout, OutputTable, Place, Slot, configured, find, start_values

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription
-from fmu_asset.errors import BindingError, FmuInputError
-from fmu_asset.sentences import said
+from fmu_asset.errors import BindingError, FmuInputError, said
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
-from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
+from fmu_asset.errors import BindingError, FmuFileError, FmuInputError, said
 from fmu_asset.instances.plan import Floats, Group, Settings
-from fmu_asset.sentences import said
 
 from .binding import Binding
 from .units import IDENTITY, Conversion

@@ -16,10 +16,9 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.errors import FmuError, FmuOutputError, FmuStateError
+from fmu_asset.errors import FmuError, FmuOutputError, FmuStateError, said
 from fmu_asset.instances.base import status_name
 from fmu_asset.instances.plan import Instance
-from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding

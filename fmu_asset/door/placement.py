@@ -20,12 +20,11 @@ import numpy as np
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import extract_fmu
-from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
+from fmu_asset.errors import FmuCallError, FmuError, FmuInputError, said
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
 from fmu_asset.instances.plan import Floats, Instance, Plan, Settings
-from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 

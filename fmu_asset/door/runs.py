@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fmu_asset.errors import FmuOutputError
-from fmu_asset.sentences import said
+from fmu_asset.errors import FmuOutputError, said
 from reporting.memory import Memory
 
 from .binding import Binding

@@ -4,9 +4,8 @@ from typing import Self
 
 import numpy as np
 
-from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError
+from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, said
 from fmu_asset.instances.plan import Floats, Instance
-from fmu_asset.sentences import said
 from reporting.progress import Progress, Stage, reporter
 
 from .exchange import Histories, Values, plain_values

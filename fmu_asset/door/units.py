@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo, VariableInfo
-from fmu_asset.errors import BindingError
-from fmu_asset.sentences import said
+from fmu_asset.errors import BindingError, said
 from reporting.units import Meaning, meaning_of
 
 

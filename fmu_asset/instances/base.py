@@ -17,8 +17,15 @@ from fmpy import calloc, fmi1, fmi2, free
 from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
 
-from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError, visible
-from fmu_asset.sentences import said
+from fmu_asset.errors import (
+    FmuCallError,
+    FmuEndedError,
+    FmuError,
+    FmuStateError,
+    FmuWorkerError,
+    said,
+    visible,
+)
 
 from .plan import Group, Instance, Lines, Plan, Settings, exchanged, prepared
 

@@ -16,8 +16,7 @@ from fmpy.sundials import CVodeSolver
 from fmpy.sundials.libraries import sundials_core
 from fmpy.sundials.nvector_serial import N_VDestroy_Serial
 
-from fmu_asset.errors import FmuCallError, FmuError
-from fmu_asset.sentences import said
+from fmu_asset.errors import FmuCallError, FmuError, said
 
 from .base import ACCEPTED, DISCARD, OK, Calls, FmuInstance
 from .plan import Lines, Plan, Settings

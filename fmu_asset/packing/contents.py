@@ -29,8 +29,7 @@ from uuid import UUID
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
-from fmu_asset.errors import FmuBuildError, FmuError
-from fmu_asset.sentences import said
+from fmu_asset.errors import FmuBuildError, FmuError, said
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
 from reporting.units import BASE_UNITS, meaning_of

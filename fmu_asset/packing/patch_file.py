@@ -34,8 +34,7 @@ from fe.runtime.patch import (
     RunOffset,
 )
 from fe.runtime.sensors import check_channels
-from fmu_asset.errors import PatchFileError
-from fmu_asset.sentences import said
+from fmu_asset.errors import PatchFileError, said
 from fmu_asset.slaves.effects import output_channels
 from reporting.json_file import parse_json, read_json
 

@@ -27,9 +27,8 @@ from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
 from fmu_asset.description import PLACEHOLDER, Declaration
-from fmu_asset.errors import FmuBuildError, PatchFileError
+from fmu_asset.errors import FmuBuildError, PatchFileError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.sentences import said
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.progress import Progress

@@ -12,9 +12,8 @@ from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring, loop_sentence
 from fmu_asset.door.experiment import whole_binding
 from fmu_asset.door.units import IDENTITY, between
-from fmu_asset.errors import FmuError, SspError
+from fmu_asset.errors import FmuError, SspError, said
 from fmu_asset.folders import scratch_folder
-from fmu_asset.sentences import said
 
 from .reader import read_ssp
 

@@ -11,9 +11,8 @@ from urllib.parse import unquote, urlsplit
 from lxml import etree
 
 from fmu_asset.archive.fmu_file import check_archive
-from fmu_asset.errors import FmuFileError, SspError
+from fmu_asset.errors import FmuFileError, SspError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.sentences import said
 
 SSD_NAME = "SystemStructure.ssd"
 NAMESPACES = {

@@ -26,8 +26,7 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
 )
 from fmu_asset.door.units import IDENTITY, Conversion
-from fmu_asset.errors import SspError
-from fmu_asset.sentences import said
+from fmu_asset.errors import SspError, said
 from reporting.files import atomic_write_bytes
 from reporting.units import BASE_UNITS
 

@@ -9,9 +9,8 @@ from typing import Any
 from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import rendered
-from fmu_asset.errors import SspError
+from fmu_asset.errors import SspError, said
 from fmu_asset.packing.contents import archive_bytes, checked_target
-from fmu_asset.sentences import said
 from reporting.files import atomic_write_bytes
 from reporting.units import BASE_UNITS
 

@@ -4,8 +4,7 @@ import numpy as np
 
 from fe.structure.design import Load, MatrixDesign, MatrixLoad, MeshDesign, NodeOutput, PointOutput
 from fmu_asset.description import rendered
-from fmu_asset.errors import FmuBuildError
-from fmu_asset.sentences import said
+from fmu_asset.errors import FmuBuildError, said
 
 
 def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:

@@ -12,10 +12,9 @@ from typing import Annotated
 from pydantic import Field
 
 from fmu_asset import errors
-from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError, said
 from fmu_asset.folders import remove_folder
 from fmu_asset.instances.plan import REPORT_PERIOD, Floats, Instance, Plan, Settings
-from fmu_asset.sentences import said
 from reporting.toml_file import Section
 
 from .process import CLOSE_LIMIT, WorkerProcess

@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from discrepancy.campaign.records import NoiseRecord
+from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.judgement.court import Court
@@ -17,7 +18,6 @@ from discrepancy.judgement.naming import Case, name
 from discrepancy.judgement.when import look_alike_remark, with_untested
 from discrepancy.missing_force.shares import OF_READINGS, Share
 from discrepancy.search_settings import SEARCH
-from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch, PowerDamping
 from tests.refusals import Inputs
@@ -221,7 +221,7 @@ def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched):
 
 def test_the_rules_stand_in_the_page_in_their_order():
     page = (Path(__file__).parents[3] / "docs" / "discrepancy.md").read_text(encoding="utf-8")
-    rules = SENTENCES["rule"]
+    rules = SENTENCES.tables["rule"]
     table = "".join(f"| {rule['verdict']} | {rule['when']} |\n" for rule in rules)
     assert f"| verdict | where |\n| --- | --- |\n{table}\n" in page
 

@@ -1,5 +1,0 @@
-"""Why FMUs, bindings and systems are refused: one file of sentences, filled in here."""
-
-from reporting.sentences import Sentences
-
-said = Sentences(__file__).said
