@@ -73,7 +73,7 @@ def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
     return checked(Overrides, dict(given or {}), where, MissionInputError, what="`Overrides`")
 
 
-def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
+def resolve_scenario(loaded: LoadedScenario, given: Overrides | Mapping[str, Any] | None = None) -> Scenario:
     """Return the scenario with the overrides, its paths absolute.
 
     Relative paths of a scenario file start at the folder of that file.
@@ -85,6 +85,7 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     ScenarioError
         The scenario does not hold with them.
     """
+    overrides = given_overrides(given)
     table = loaded.scenario.moved(loaded.path.resolve().parent).to_dict()
     _change_asset(table, overrides)
     if overrides.library:

@@ -275,7 +275,6 @@ def grid_of_fmu(
     *,
     role: str | None = None,
     settling_steps: int = 0,
-    step_timeout: float | None = None,
 ) -> SamplingGrid:
     """Return the grid over the values of the inputs; controls are all their combinations.
 
@@ -314,7 +313,7 @@ def grid_of_fmu(
         load=_single("load", given["load"]),
         parameters={k: v[0] for k, v in given["parameter"].items() if k != parameter},
         settling_steps=settling_steps,
-        step_timeout=step_timeout or binding.limits.step_time or STEP_TIMEOUT,
+        step_timeout=binding.limits.step_time or STEP_TIMEOUT,
     )
 
 
@@ -346,7 +345,7 @@ def grid_of_scenario(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         The asset of the scenario cannot be prepared.
     """
-    scenario = resolve_scenario(_without_library(loaded), overrides or Overrides())
+    scenario = resolve_scenario(_without_library(loaded), overrides)
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
         raise MissionInputError(said("library.kind", scenario=scenario))

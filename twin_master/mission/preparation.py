@@ -20,7 +20,7 @@ from reporting.progress import Progress, SilentProgress
 from reporting.words import brief
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import RunFolderError, said
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
@@ -329,8 +329,7 @@ def prepare_twin(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         With one clear sentence.
     """
-    loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
-    resolved = resolve_scenario(loaded, given_overrides(overrides))
+    resolved = resolve_scenario(load_scenario(scenario), overrides)
     return prepared_alone(resolved, asset_source(resolved), progress)
 
 
