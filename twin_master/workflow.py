@@ -23,6 +23,7 @@ from twin_master.assets.resolution import (
     asset_source,
     believed_source,
     resolve_scenario,
+    scenario_bytes,
 )
 from twin_master.errors import NotResumableError, said
 from twin_master.mission import loop
@@ -30,7 +31,6 @@ from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.planning import policy_file, read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
-from twin_master.network.memory import scenario_bytes
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import (

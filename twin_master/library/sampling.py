@@ -34,7 +34,7 @@ from twin_master.assets.library_source import (
 )
 from twin_master.errors import MissionInputError, check_names, said
 from twin_master.library.grid import Float, GridSampler, SamplingGrid
-from twin_master.network.memory import NUMBER, check_fits
+from twin_master.network.transition import NUMBER, check_fits
 
 PLAN_NAME, ROWS_NAME = "grid.json", "observations.npy"
 _COPIES = 3  # of what was sampled: the blocks, all of them, and the library

@@ -25,11 +25,10 @@ from twin_master.errors import RunFolderError, said
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
-from twin_master.learning.words import Words
 from twin_master.mission.planning import discounts, expected_plan
 from twin_master.mission.turns import Plant, Truth
 from twin_master.network.belief_planning import DecisionProblem
-from twin_master.network.estimator import Estimator, ExactFilter
+from twin_master.network.estimator import Estimator, ExactFilter, Words
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration

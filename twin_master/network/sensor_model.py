@@ -196,7 +196,8 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             If the shape is another one or a value is infinite; if there is no such control.
         """
-        return np.asarray(self.log_likelihood_sequence(np.asarray(observation)[None], [control_index])[0])
+        values, told = self.apart(observation)
+        return np.asarray(self._densities(values[None], [control_index], 1)[0, :, 0] + told)
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).

@@ -17,10 +17,9 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, written
 from twin_master.errors import TwinMasterError, said
-from twin_master.learning.words import Words
 from twin_master.mission.journal import state_text, turn_record
 from twin_master.mission.turns import Reading, Turn
-from twin_master.network.estimator import Notice
+from twin_master.network.estimator import Notice, Words
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.message import Fed, Message, Place, Refused
