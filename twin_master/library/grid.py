@@ -345,7 +345,11 @@ def grid_of_scenario(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         The asset of the scenario cannot be prepared.
     """
-    scenario = resolve_scenario(_without_library(loaded), overrides)
+    belief = loaded.scenario.belief
+    if isinstance(belief, LibraryBelief):  # which is to be sampled
+        plain = AssetBelief() if belief.design is None else DesignBelief(design=belief.design)
+        loaded = replace(loaded, scenario=loaded.scenario.model_copy(update={"belief": plain}))
+    scenario = resolve_scenario(loaded, overrides)
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
         raise MissionInputError(said("library.kind", scenario=scenario))
@@ -378,12 +382,3 @@ def grid_of_scenario(
         settling_steps=settling_steps,
         step_timeout=flown.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )
-
-
-def _without_library(loaded: LoadedScenario) -> LoadedScenario:
-    """Return the scenario as it is where its twin does not believe the library that is to be sampled."""
-    belief = loaded.scenario.belief
-    if not isinstance(belief, LibraryBelief):
-        return loaded
-    plain = AssetBelief() if belief.design is None else DesignBelief(design=belief.design)
-    return replace(loaded, scenario=loaded.scenario.model_copy(update={"belief": plain}))

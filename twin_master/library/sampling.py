@@ -66,11 +66,6 @@ class SamplingOutcome:
     seconds: float
 
 
-def processor_count() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def blocks_folder(out: Path) -> Path:
     """Return where the finished blocks of a library that is being sampled are kept."""
     return out.with_name(f"{out.name}.blocks")
@@ -113,7 +108,8 @@ def sample_library(
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    count = processor_count() if workers is None else workers
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = own if workers is None else workers
     if count < 1:
         raise MissionInputError(f"the number of workers must be at least 1, and {count} came.")
     binding = load_binding(grid.binding)

@@ -1,4 +1,4 @@
-"""What holds the belief of a twin, and how it speaks: one protocol, and the exact filter of the graphical model.
+"""What holds the belief of a twin, and its notices: one protocol, the exact filter of the graphical model.
 
 An estimator has no state of its own. What it carries from turn to turn are arrays that it hands out with each
 estimate and is given back for the next: a twin that keeps them can smooth over them, go back and take in what
