@@ -23,8 +23,7 @@ from discrepancy.campaign.sampling import digit_of
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.quality import is_still, rest_faults, roughness
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import fit
-from discrepancy.fits.normal_equations import normal_equations
+from discrepancy.fits.fitting import fit, normal_equations
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.separability import begun
 from discrepancy.models.interface import Conditions, Model

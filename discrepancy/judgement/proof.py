@@ -11,8 +11,7 @@ import numpy as np
 from scipy import stats
 
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
-from discrepancy.campaign.records import BoolArray, FloatArray
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError, said
 from discrepancy.location.omnibus_tests import mean_square
 from discrepancy.location.residuals import FittedTrial, ResidualSet
