@@ -64,13 +64,17 @@ def read_campaign(folder: str | Path) -> Campaign:
     folder = Path(folder)
     if folder.name == CAMPAIGN_FILE:
         folder = folder.parent
-    section = _read_section(folder)
+    path = folder / CAMPAIGN_FILE
+    if not path.exists():
+        missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
+        raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
+    section = schema.parse_campaign(read_toml(path, CampaignFileError, what="campaign"), str(path))
     names = {CAMPAIGN_FILE, *(trial.file for trial in section.trial)}
     if section.noise is not None:
         names.add(section.noise.file)
     for name in sorted(names):
-        path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
+        own = PurePosixPath(name)
+        if own.is_absolute() or ".." in own.parts or "\\" in name or "\0" in name:
             raise CampaignFileError(said("campaign.outside", name=name))
     tables = {name: _read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
     data_hash = hash_record({name: hash_file(folder / name) for name in sorted(names)})
@@ -168,14 +172,6 @@ def _read_table(folder: Path, name: str) -> TextTable:
         there = ", ".join(sorted(item.name for item in folder.glob("*.csv"))) or "none"
         raise CampaignFileError(said("campaign.no_file", name=name, folder=folder, there=there))
     return read_table(folder / name, TABLE_ERRORS, name=name)
-
-
-def _read_section(folder: Path) -> schema.CampaignSection:
-    path = folder / CAMPAIGN_FILE
-    if not path.exists():
-        missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
-        raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
-    return schema.parse_campaign(read_toml(path, CampaignFileError, what="campaign"), str(path))
 
 
 # ---------------------------------------------------------------- trials

@@ -48,21 +48,19 @@ wing, a force acts at each place by its share w of the area, on the place's moti
 is sum w r^(p + a + 1) times as large.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, pi
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 from scipy.special import beta
 
 from discrepancy.campaign.records import TrialKind
-from discrepancy.catalogue.entry import ROW, Effect, EffectKeys, Number, Setting
-from discrepancy.catalogue.needs import DYNAMIC, NEEDS, PLACES, USUAL, Asked, Target
+from discrepancy.catalogue.entry import Effect, EffectKeys, Setting
+from discrepancy.catalogue.needs import DYNAMIC, NEEDS, PLACES, Asked, EffectSection, Target
 from discrepancy.errors import CatalogueError, said
 from discrepancy.models.scales import PortScale
 from fe.runtime.errors import InvalidPatchError
@@ -130,7 +128,7 @@ def _known(scale: str, usual: str) -> Callable[[Here], float]:
 
 def _largest_reading(here: Here) -> float:
     """Return the largest magnitude among the used readings of the place [its unit], 1 if all are zero."""
-    target, kept, key = here.target, here.setting.largest, (here.target, here.asked.kinds)
+    target, kept, key = here.target, here.setting.largest, (here.target, here.asked.section.acts_on)
     if key not in kept:  # patches are built at every step of a fit
         every = here.asked.channels_of(lambda item: target.quantity in ("", item.quantity.value))
         names = every if target.name == EVERY_CHANNEL else (target.name,)
@@ -187,32 +185,11 @@ SCALES: dict[str, Callable[[Here], float]] = {
 `number` is what the place has of it (side of a skin, frequency of a line), `mean_power` of the motion of a
 spread force with `exponent`.
 """
-_OF_SHAPES = {
+_OF_SHAPES: dict[str, set[str]] = {
     "mean_power": {"exponent"},
     "cycle_loss": {"velocity_exponent", "displacement_exponent"},
     "port_holding_force": {"velocity_exponent"},
 }
-
-
-def names_with(parameters: Collection[str]) -> frozenset[str]:
-    """Return the names that may be used beside an effect's parameters; some need a shape among these."""
-    return frozenset(name for name in SCALES if _OF_SHAPES.get(name, set()) <= {*parameters})
-
-
-Text = Annotated[str, Field(min_length=0)]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EffectSection(EffectKeys):
-    """`[[effect]]`, or the whole of a file with one."""
-
-    __pydantic_config__ = ROW
-
-    primitives: tuple[dict[str, Text | Number], ...] = ()
-    places: str | tuple[str, ...] | None = None
-    preferred: tuple[str, ...] = ()
-    needs: tuple[str, ...] = USUAL
-    events: tuple[str, ...] = ()
 
 
 def effects_of_file(path: Path) -> tuple[Effect, ...]:
@@ -346,7 +323,7 @@ def _recipe(
     types = primitive.values()
     times = ("begin", "end") if primitive.in_windows else ()
     keys = ("kind", *types, *times, "if")
-    known = names | names_with(names)
+    known = names | {name for name in SCALES if _OF_SHAPES.get(name, set()) <= names}
     values: dict[str, str | float | Expression] = {}
     when: dict[str, Expression] = {}
     try:
@@ -381,12 +358,9 @@ class _Law:
     recipes: tuple[_Recipe, ...]
 
     def _asked(self, setting: Setting) -> Asked:
-        section = self.section
-        return Asked(
-            setting, section.identifier, section.acts_on, section.places, section.preferred, section.needs,
-            primitives=tuple(PRIMITIVES[recipe.kind] for recipe in self.recipes),
-            moments=frozenset().union(*(recipe.moments for recipe in self.recipes)),
-        )  # fmt: skip
+        kinds = tuple(PRIMITIVES[recipe.kind] for recipe in self.recipes)
+        moments = frozenset[str]().union(*(recipe.moments for recipe in self.recipes))
+        return Asked(setting, self.section, kinds, moments)
 
     def places(self, setting: Setting) -> tuple[str, ...]:
         return self._asked(setting).found_places()

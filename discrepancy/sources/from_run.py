@@ -97,7 +97,11 @@ def run_campaign(
 def _campaign(
     folder: Path, turns: tuple[int | None, int | None], held_out_share: float, scenario: dict[str, Any]
 ) -> Campaign:
-    _refuse_others(folder, scenario)
+    states = {item["name"] for item in scenario["state"]}
+    if scenario["observation"].get("role") != STRAIN or states != {*USUAL_REGIONS}:
+        raise CampaignFileError(said("runs.no_wing", folder=folder))
+    if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
+        raise CampaignDataError(said("runs.force", force=force, folder=folder))
     run = _run(folder)
     # Turns before a patch that was adopted on the way were believed with another model.
     adopted = run.attrs.get(PATCH_STEP)
@@ -200,15 +204,6 @@ def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
 
 
 # ---------------------------------------------------------------- parts
-
-
-def _refuse_others(folder: Path, scenario: dict[str, Any]) -> None:
-    """Refuse the run of another asset than the wing, and one with a force beside the load factor."""
-    states = {item["name"] for item in scenario["state"]}
-    if scenario["observation"].get("role") != STRAIN or states != {*USUAL_REGIONS}:
-        raise CampaignFileError(said("runs.no_wing", folder=folder))
-    if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
-        raise CampaignDataError(said("runs.force", force=force, folder=folder))
 
 
 def _config(folder: Path) -> dict[str, Any]:
