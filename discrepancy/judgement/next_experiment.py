@@ -50,7 +50,7 @@ class Proposal:
 
 
 def next_experiments(
-    problem: Problem, open_fits: Sequence[tuple[CandidateFit, float]], count: int = PROPOSED
+    problem: Problem, open_fits: Sequence[tuple[CandidateFit, float]]
 ) -> tuple[Experiment, ...]:
     """Return the experiments that decide most among open hypotheses.
 
@@ -60,8 +60,6 @@ def next_experiments(
         Campaign and model of the fits.
     open_fits : sequence of (CandidateFit, float)
         Hypotheses that are still open, with their probabilities.
-    count : int
-        Largest number of proposals.
 
     Returns
     -------
@@ -79,7 +77,7 @@ def next_experiments(
             continue
         if information >= LEAST_INFORMATION:
             found.append(Experiment(proposal.description, information, proposal.cost, proposal.reason))
-    return tuple(sorted(found, key=lambda item: -item.information / item.cost)[:count])
+    return tuple(sorted(found, key=lambda item: -item.information / item.cost)[:PROPOSED])
 
 
 def mutual_information(

@@ -220,12 +220,12 @@ class SeenTrial:
         return np.asarray(columns / self.deviation * self.used)
 
 
-def decaying_part(noise: NoiseModel, interval: float) -> tuple[float, float] | None:
+def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, float] | None:
     """Return the share of a noise's variance that decays in time, and its rate [1/s]; None: it is white.
 
     From the correlation at one and two samples: exact for an autoregression of first order.
     """
-    if not noise.applies(interval):
+    if interval is None or not noise.applies(interval):
         return None
     answer = lfilter([1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)])
     at = [float(answer[: len(answer) - lag] @ answer[lag:]) for lag in range(3)]
@@ -259,7 +259,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     coloured = [
         (number, *part)
         for number, item in enumerate(data.noise)
-        if trial.whitened_at is not None and (part := decaying_part(item, trial.whitened_at)) is not None
+        if (part := decaying_part(item, trial.whitened_at)) is not None
     ]
     interval = float(np.median(np.diff(trial.time)))
     fastest = float(np.max(np.abs(np.linalg.eigvals(base.generator)), initial=0.0))
