@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from reporting.errors import StandsForOthersError
 from reporting.sentences import Sentences
 
 SENTENCES = Sentences(str(Path(__file__).with_name("sentences.toml")))
@@ -9,7 +10,7 @@ said = SENTENCES.said
 """A sentence by "table.name" with its values."""
 
 
-class DiscrepancyError(Exception):
+class DiscrepancyError(StandsForOthersError):
     """Any error that the discrepancy workflow raises on purpose."""
 
 

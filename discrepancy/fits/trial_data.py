@@ -15,8 +15,7 @@ from math import inf, isinf, prod
 import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Quantity, Start, Trial, TrialKind
 from discrepancy.models.interface import Conditions, Model
 
 FREE_MOTION = 3.0
