@@ -17,7 +17,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
 from twin_master.fleet.plan import ensemble
-from twin_master.mission.truth import Plant, Truth
+from twin_master.mission.turns import Plant, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.store.writing import open_run

@@ -30,7 +30,7 @@ from tests.twin_master.runs import (
     table_of,
     written,
 )
-from twin_master.assets.library_source import ObservationLibrary, load_observation_library
+from twin_master.assets.library_source import load_observation_library
 from twin_master.assets.resolution import Overrides, asset_source
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.library.grid import grid_of_scenario
@@ -71,20 +71,6 @@ def sampled(folder: Path, *grid: str) -> Path:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sampled(tmp_path_factory.mktemp("library"), "viscosity_factor=0.9:1.1:21")
-
-
-@pytest.fixture
-def library(made: Path) -> ObservationLibrary:
-    return load_observation_library(made)
-
-
-def test_a_table_over_another_parameter_grid_is_interpolated(library):
-    nodes = library.at_draws("viscosity_factor", library.draws[[3, 7]])
-    np.testing.assert_array_equal(nodes, library.values[[3, 7]])
-    between = library.at_draws("viscosity_factor", np.array([0.955]))
-    np.testing.assert_allclose(between[0], 0.5 * (library.values[5] + library.values[6]), rtol=1e-14)
-    assert library.holds_draws(library.draws)
-    assert not library.holds_draws(np.array([0.955]))
 
 
 def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
@@ -255,6 +241,7 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         )
         given = replace(given, learnt=written(tmp_path, learnt))
     known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
+    assert ("the observation library is interpolated" in known.draws.source) is (way == "swept")
     assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
     flown = known.scenario.asset.source(known.scenario).parameters()
     assert flown == {"conductance": 6100.0, "specific_heat": pytest.approx(samples[:, 1].mean())}

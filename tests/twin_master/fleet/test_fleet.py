@@ -18,13 +18,13 @@ from tests.twin_master.runs import check_same, edited, text_of, written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderError
 from twin_master.fleet import flight
-from twin_master.fleet.command import engine_of
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import Outcomes, group_figures
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.shard import Engine, unflown
 from twin_master.fleet.store import _fallbacks
+from twin_master.fleet_command import engine_of
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.side_by_side import Flights
 from twin_master.store.writing import open_run

@@ -33,6 +33,8 @@ from twin_master.watch.opening import begun_watch
 from uav_twin import fly_fleet, learn_from_fleet, load_scenario, open_fleet
 
 TURNS = 6
+FLOWN = [1, 1, 1, 1, 1, 0]
+"""Control of each turn: what the last one does to the wing nobody sees."""
 LOGS = 'observations = "logs/*.csv"'
 Decision = Mapping[str, Any]
 
@@ -47,7 +49,7 @@ def fleet_file(library_file: Path, tmp_path: Path) -> Path:
     (tmp_path / "logs").mkdir()
     noise = np.random.default_rng(3).normal(1e-3, 1e-4, (3, TURNS, 24))
     for number, rows in enumerate(noise):
-        write_csv(log_of(tmp_path, number), rows, np.ones(TURNS, dtype=int), number == 1)
+        write_csv(log_of(tmp_path, number), rows, np.array(FLOWN), number == 1)
     lines = log_of(tmp_path, 2).read_text().splitlines()
     lines[3], lines[4] = lines[4], lines[3]
     log_of(tmp_path, 2).write_text("\n".join(lines) + "\n")
@@ -342,7 +344,7 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     group = open_fleet(outcome.folder)["north"]
     for row, turns in enumerate((3, TURNS, TURNS)):
         last = {record["turn"]: record for record in journal(tmp_path / "alone" / f"wing-{row}")}
-        assert group["control_index"].values[row].tolist() == [1] * turns + [-1] * (TURNS - turns)
+        assert group["control_index"].values[row].tolist() == FLOWN[:turns] + [-1] * (TURNS - turns)
         assert np.isnan(group["log_evidence"].values[row, turns:]).all()
         assert np.array_equal(group["belief"].values[row], np.array(last[turns - 1]["filtered"], np.float32))
         for turn in range(turns):

@@ -16,7 +16,7 @@ from twin_master.learning.learning_filter import (
 )
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
-from twin_master.network.rewards import RewardModel
+from twin_master.network.quantity import RewardModel
 from twin_master.scenario.tables import Learning
 from uav_twin import Carried, Estimate, GaussianSensorModel, GraphicalModel
 

@@ -242,7 +242,8 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
         assert not loaded.remark
         kept = loaded.scenario.to_dict()
         assert (kept["notice"] is None) is off
-        assert parse_scenario(kept, name).notice == loaded.scenario.notice  # as a run folder says it
+        assert parse_scenario(kept, name) == loaded.scenario  # as a run folder says it
+        assert loaded.scenario.mission.name == name
     of_its_own = ("[transition]", 'average_over_draws = "inside"\n[transition]')
     levels = "[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]"
     many = [(levels, f"{[*range(90)]}\nprior = {[1] + [0] * 89}")] * 2

@@ -13,9 +13,9 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.learning import switching
+from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.switching import at_first, one_turn_later
+from twin_master.learning.rivals import at_first, one_turn_later
 from twin_master.learning.words import Words
 from twin_master.mission.journal import line_of, turn_record
 from twin_master.mission.preparation import Knowledge
@@ -115,7 +115,7 @@ def test_shares_of_hypotheses_switch_as_their_chain_says():
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
     share = at_first(0.01, begins)
     np.testing.assert_allclose(np.exp(share), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
-    hazard, ends, chain = 0.03, switching.ENDS, np.zeros((7, 7))
+    hazard, ends, chain = 0.03, rivals.ENDS, np.zeros((7, 7))
     chain[0] = hazard * np.array([0.0, 0.0, 0.5, *[0.125] * 4])
     chain[0, 0] = 1.0 - hazard
     chain[1, [0, 2]], chain[1, 1] = (ends, 0.5 * hazard), 1.0 - ends - 0.5 * hazard

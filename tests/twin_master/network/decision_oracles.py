@@ -1,6 +1,5 @@
-"""Independent answers for tests of inference: enumeration, arbitrary precision, variable elimination."""
+"""Independent answers for tests of inference: arbitrary precision, variable elimination."""
 
-import itertools
 import logging
 import warnings
 from decimal import Decimal, localcontext
@@ -27,34 +26,8 @@ def random_model(rng, shape=(2, 2), zeros=0.4, product=False):
     return GraphicalModel(space, ("u0", "u1"), prior / prior.sum(), TransitionModel(tuple(tables)))
 
 
-def enumerate_trajectories(model, control, log_likelihood):
-    """Filtered, smoothed and log evidence by summing over every joint trajectory."""
-    steps, size = log_likelihood.shape
-    matrix = model.transition.matrix
-    likelihood = np.exp(log_likelihood)
-    filtered, evidence = np.zeros((steps, size)), np.zeros(steps)
-    forecast, smoothed = np.zeros((steps, size)), np.zeros((steps, size))
-    for length in range(1, steps + 1):
-        for path in itertools.product(range(size), repeat=length):
-            joint = model.prior[path[0]]
-            for t in range(1, length):
-                joint *= matrix[control[t - 1], path[t - 1], path[t]]
-            for t in range(length - 1):
-                joint *= likelihood[t, path[t]]
-            forecast[length - 1, path[-1]] += joint
-            joint *= likelihood[length - 1, path[-1]]
-            filtered[length - 1, path[-1]] += joint
-            evidence[length - 1] += joint
-            if length == steps:
-                for t in range(steps):
-                    smoothed[t, path[t]] += joint
-    forecast /= forecast.sum(axis=1, keepdims=True)
-    log_evidence = np.diff(np.log(evidence), prepend=0.0)
-    return forecast, filtered / evidence[:, None], smoothed / evidence[-1], log_evidence
-
-
 def precise_forward_backward(model, control, log_likelihood, digits=40):
-    """Filtered, smoothed, log filtered and log evidence with `digits` digits and an unbounded exponent."""
+    """Forecast, filtered and smoothed beliefs, log filtered and log evidence, with an unbounded exponent."""
 
     def decimals(values, of=lambda x: Decimal(float(x))):
         return np.vectorize(of, otypes=[object])(values)
@@ -65,9 +38,10 @@ def precise_forward_backward(model, control, log_likelihood, digits=40):
         likelihood = decimals(
             log_likelihood, lambda x: Decimal(float(x)).exp() if np.isfinite(x) else Decimal(0)
         )
-        filtered, evidence = [], []
+        forecast, filtered, evidence = [], [], []
         for t, row in enumerate(likelihood):
-            belief = (belief @ matrix[control[t - 1]] if t else belief) * row
+            forecast.append(belief @ matrix[control[t - 1]] if t else belief)
+            belief = forecast[-1] * row
             evidence.append(belief.sum())
             belief = belief / evidence[-1]
             filtered.append(belief)
@@ -79,12 +53,8 @@ def precise_forward_backward(model, control, log_likelihood, digits=40):
             smoothed.insert(0, joint / joint.sum())
         log_filtered = [[float(x.ln()) if x else -np.inf for x in row] for row in filtered]
         log_evidence = [float(x.ln()) for x in evidence]
-    return (
-        np.array(filtered, float),
-        np.array(smoothed, float),
-        np.array(log_filtered),
-        np.array(log_evidence),
-    )
+    beliefs = (np.array(values, float) for values in (forecast, filtered, smoothed))
+    return *beliefs, np.array(log_filtered), np.array(log_evidence)
 
 
 def eliminate_variables(model, control, log_likelihood, policy, horizon):
