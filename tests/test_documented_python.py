@@ -17,8 +17,6 @@ import pytest
 
 from calibration.result.file import save_calibration
 from calibration.result.record import Calibration
-from discrepancy.sources.examples import write_example
-from fmu_asset.packing.structure_fmu import build_fmu
 from tests import command_line
 from tests.refusals import Inputs
 
@@ -54,18 +52,6 @@ def strain_library(folder: Path) -> None:
     (folder / "path" / "to" / "UAV-Digital-Twin").symlink_to(reference("uav_digital_twin"))
 
 
-def wing_fmu(folder: Path) -> None:
-    from fe.reduction.model_cache import reduced_model
-
-    build_fmu(reduced_model(), folder / "wing.fmu")
-
-
-def wing_of_fmi_3(folder: Path) -> None:
-    from fe.reduction.model_cache import reduced_model
-
-    build_fmu(reduced_model(), folder / "wing3.fmu", kind="compiled", fmi=3)
-
-
 def checkout(folder: Path) -> None:
     """The folder of the project, where the shipped bindings are."""
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
@@ -81,42 +67,10 @@ def empty_cart(folder: Path) -> None:
     (folder / "my_cart").mkdir()
 
 
-def campaign_folder(folder: Path) -> None:
-    from discrepancy.models.structures import WingModel
-
-    write_example(WingModel.of_design(), folder / "my_campaign", "static", seed=1)
-
-
-def verdict_folder(folder: Path) -> None:
-    """A verdict on a mass on a spring, its load cell with a tare."""
-    for words in (
-        ["example", "static", "campaign", "--model", "single_mass_rig", "--effect", "load_cell"],
-        ["run", "campaign", "--model", "single_mass_rig", "--out", "verdict"],
-    ):
-        command(folder, "discrepancy", *words)
-
-
 def command(folder: Path, *words: str) -> None:
     with contextlib.chdir(folder):
         done = command_line.command(*words)
     assert done.returncode == 0, done.stderr
-
-
-def pump_library(folder: Path) -> None:
-    command(folder, "library", "sample", "pump_wear", "--out", "pump.nc")
-
-
-def wing_with_effects(folder: Path) -> None:
-    command(folder, "fmu", "build", "--patch", "patch.json", "--out", "wing_with_effects.fmu")
-
-
-def drafted_binding(folder: Path) -> None:
-    command(folder, "fmu", "bind", "wing.fmu", "--out", "wing.toml")
-
-
-def without_the_fmu(folder: Path) -> None:
-    """The page packs it itself."""
-    (folder / "wing.fmu").unlink()
 
 
 def converted_wing(folder: Path) -> None:
@@ -131,9 +85,8 @@ def converted_wing(folder: Path) -> None:
     command(folder, "discrepancy", "convert", "real_wing", "--data", "UAV-Experimental-Calibration")
 
 
-def fmu_rig(folder: Path) -> None:
+def rig(folder: Path) -> None:
     """The wing's FMU as the model of a rig."""
-    wing_fmu(folder)
     shutil.copy(INPUTS.folder / "rig.toml", folder)
 
 
@@ -160,23 +113,29 @@ def bracket(folder: Path) -> None:
     (folder / "bracket.inp").write_text("\n".join(deck) + "\n", encoding="ascii")
 
 
-Prepare = Callable[[Path], None]
+WING_FMU = "fmu build --out wing.fmu"
+VERDICT = (
+    "discrepancy example static campaign --model single_mass_rig --effect load_cell",
+    "discrepancy run campaign --model single_mass_rig --out verdict",
+)
+"""A verdict on a mass on a spring, its load cell with a tare."""
 
-READER_HAS: dict[str, tuple[Prepare, ...]] = {
-    "docs/another_asset.md": (pump_library,),
+READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
+    "docs/another_asset.md": ("library sample pump_wear --out pump.nc",),
     "docs/calibration.md": (calibration_data,),
-    "docs/campaign.md": (campaign_folder,),
+    "docs/campaign.md": ("discrepancy example static my_campaign --seed 1",),
     "docs/cart_in_ten_minutes.md": (empty_cart,),
-    "docs/fmu_models.md": (fmu_rig,),
-    "docs/fmu.md": (checkout, patch_file, wing_with_effects),
+    "docs/fmu_models.md": (WING_FMU, rig),
+    "docs/fmu.md": (checkout, patch_file, "fmu build --patch patch.json --out wing_with_effects.fmu"),
     "docs/inference.md": (strain_library,),
-    "docs/python.md": (wing_fmu, drafted_binding, without_the_fmu, verdict_folder),
+    # The page packs the FMU itself.
+    "docs/python.md": ("fmu build --out drafted.fmu", "fmu bind drafted.fmu --out wing.toml", *VERDICT),
     "docs/real_wing.md": (converted_wing,),
     "docs/structures.md": (bracket,),
-    "docs/use_the_wing_in.md": (wing_fmu, wing_of_fmi_3),
-    "docs/verdict.md": (verdict_folder,),
+    "docs/use_the_wing_in.md": (WING_FMU, "fmu build --kind compiled --fmi 3 --out wing3.fmu"),
+    "docs/verdict.md": VERDICT,
 }
-"""What is in the reader's folder before the first block."""
+"""What is in the reader's folder before the first block: commands that were run, and what makes more."""
 
 TABLES = INPUTS.table("pages.toml")
 
@@ -226,8 +185,11 @@ def test_what_a_page_of_minutes_imports_is_there(name):
     ],
 )
 def test_the_blocks_of_a_page_run_as_printed(name, tmp_path, monkeypatch, request):
-    for prepare in READER_HAS.get(name, ()):
-        prepare(tmp_path)
+    for step in READER_HAS.get(name, ()):
+        if isinstance(step, str):
+            command(tmp_path, *step.split())
+        else:
+            step(tmp_path)
     if name in TABLES["made"]:
         fixture, place = TABLES["made"][name]
         shutil.copytree(request.getfixturevalue(fixture), tmp_path / place)

@@ -1,6 +1,5 @@
 """Pages use the terms of the glossary, their links lead somewhere, the picture is what its script draws."""
 
-import ast
 import re
 import runpy
 from functools import cache
@@ -69,25 +68,6 @@ def test_pages_use_the_terms_of_the_glossary():
         if page != glossary and (words := {*other.findall(PLAIN.sub("", page.read_text(encoding="utf-8")))})
     }
     assert not found
-
-
-def test_what_people_read_spells_chi_square_in_one_way():
-    """Pages, and the texts of the code that are no docstrings, say χ² and χ²/dof."""
-    other = re.compile(r"chi\^2|chi2|chi²|χ² / dof|χ2|chi-square", re.IGNORECASE)
-    texts = [
-        page.read_text(encoding="utf-8")
-        for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))
-        if page.name != "glossary.md"  # which lists what is not to be written
-    ]
-    for package in ("calibration", "discrepancy", "uav_twin", "twin_master", "fe", "reporting"):
-        for file in (ROOT / package).rglob("*.py"):
-            tree = ast.parse(file.read_text(encoding="utf-8"))
-            aside = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
-            constants = [node for node in ast.walk(tree) if isinstance(node, ast.Constant)]
-            told = [node.value for node in constants if isinstance(node.value, str) and id(node) not in aside]
-            texts += [" ".join(word for word in text.split() if not word.isidentifier()) for text in told]
-    assert len(texts) > 1000
-    assert [text for text in texts if other.search(text)] == []
 
 
 IMAGES = ROOT / "docs" / "images"

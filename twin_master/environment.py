@@ -17,12 +17,11 @@ from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import Asset
 from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.fleet.flight import source_of
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.truth import Plant, decided_to_end
+from twin_master.mission.turns import Plant, decided_to_end
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.sentences import said
 
 try:
     import gymnasium

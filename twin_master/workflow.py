@@ -25,7 +25,7 @@ from twin_master.assets.resolution import (
     given_overrides,
     resolve_scenario,
 )
-from twin_master.errors import NotResumableError
+from twin_master.errors import NotResumableError, said
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.planning import policy_file, read_policy
@@ -45,7 +45,6 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import WATCHED_KIND, Scenario
-from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight

@@ -10,60 +10,49 @@ from calibration.dynamics.trials import average
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import read_lengths
 from calibration.paper.procedure import read_published_results
-from calibration.static.experiments import LOAD_STANDARD_DEVIATION, published_measurements, read_measurements
-from calibration.wing.lab_data import WEIGHED_MASS_FILE, published_data, read_lab_folder, read_weighed_mass
+from calibration.static.experiments import (
+    LOAD_STANDARD_DEVIATION,
+    LoadDisplacementData,
+    published_measurements,
+    read_measurements,
+)
+from calibration.wing.lab_data import (
+    WEIGHED_MASS_FILE,
+    published_data,
+    read_lab_folder,
+    read_weighed_mass,
+)
 from tests.refusals import Inputs, refused
 
-PAIRS = np.array([[2.4525, 3.937], [4.905, 7.6962], [7.3575, 10.8712], [2.4525, 3.3528], [4.905, 7.2898]])
+INPUTS = Inputs(__file__)
 
 
-def write(folder, text):
-    file = folder / "step2" / "load_displacement_measurements.csv"
-    file.parent.mkdir(exist_ok=True, parents=True)
-    file.write_text(text, encoding="utf-8")
-    return folder
+def test_columns_and_runs_of_a_load_test(tmp_path):
+    """A run begins where the load falls; equal readings of two runs, or numbered ones, may be."""
 
+    def read(text: str) -> LoadDisplacementData:
+        (tmp_path / "pairs.csv").write_text(text, encoding="utf-8")
+        return read_measurements(tmp_path / "pairs.csv")
 
-def table(pairs, header="load,displacement"):
-    return "\n".join([header, *(f"{load:.10g},{displacement:.10g}" for load, displacement in pairs)]) + "\n"
-
-
-def test_published_pairs():
-    data = published_measurements()
-    assert data.run.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
-    assert data.load / 9.81 == pytest.approx(np.tile([0.25, 0.5, 0.75, 1.0], 2))
-    assert data.load_standard_deviation == pytest.approx(0.0981 / 1.96)
-    assert data.displacement_standard_deviation == pytest.approx(0.5e-3 / 1.96)
-    with pytest.raises(ExperimentDataError, match="load of reading 2 is 0"):
-        dataclasses.replace(data, load=np.where(np.arange(8) == 1, 0.0, data.load))
-
-
-@pytest.mark.parametrize("above", ["", "datafiles", "src/datafiles"])
-def test_folders_files_columns_and_runs(tmp_path, above):
-    write(tmp_path / above, "\ufeff" + table(PAIRS, "load , displacement").replace("\n", "\r\n"))
-    data = read_measurements(tmp_path)
-    assert data.load.tolist() == PAIRS[:, 0].tolist()
-    assert data.displacement == pytest.approx(PAIRS[:, 1] * 1e-3)
+    text = INPUTS.text("load_test.csv")
+    data = read("\ufeff" + text.replace(",", " , ").replace("\n", "\r\n"))
+    assert data.load.tolist() == [2.4525, 4.905, 7.3575, 2.4525, 4.905]
     assert data.run.tolist() == [0, 0, 0, 1, 1]
-    file = tmp_path / above / "step2" / "load_displacement_measurements.csv"
-    assert read_measurements(file).sha256 == data.sha256
-    rows = "\n".join(f"{displacement},x,{load}" for load, displacement in PAIRS)
-    other = read_measurements(write(tmp_path / above, f"displacement,remark,load\n{rows}\n"))
-    assert other.load.tolist() == data.load.tolist()
-    # equal readings of two runs, or two numbered ones, are no repetition
+    assert data.displacement[0] == pytest.approx(3.937e-3)
+    swapped = (",x,".join(reversed(line.split(","))) for line in text.split())
+    assert read("\n".join(swapped)).sha256 == data.sha256
     runs = "load,displacement\n4.905,7.6\n9.81,14.5\n4.905,7.6\n9.81,14.5\n"
-    assert read_measurements(write(tmp_path / above, runs)).run.tolist() == [0, 0, 1, 1]
-    numbered = "reading,load,displacement\n1,9.81,14.5\n2,9.81,14.5\n"
-    assert read_measurements(write(tmp_path / above, numbered)).count == 2
+    assert read(runs).run.tolist() == [0, 0, 1, 1]
+    assert read("reading,load,displacement\n1,9.81,14.5\n2,9.81,14.5\n").count == 2
 
 
-def test_the_hash_sees_figures_and_not_names():
+def test_the_hash_of_a_load_test_sees_figures_and_not_names():
     data = published_measurements()
     assert dataclasses.replace(data, source="another name").sha256 == data.sha256
-    assert dataclasses.replace(data, load=data.load + 1e-12).sha256 != data.sha256
-    assert (
-        dataclasses.replace(data, load_standard_deviation=2 * LOAD_STANDARD_DEVIATION).sha256 != data.sha256
-    )
+    for other in ({"load": data.load + 1e-12}, {"load_standard_deviation": 2 * LOAD_STANDARD_DEVIATION}):
+        assert dataclasses.replace(data, **other).sha256 != data.sha256
+    with pytest.raises(ExperimentDataError, match="load of reading 2 is 0"):
+        dataclasses.replace(data, load=np.where(np.arange(8) == 1, 0.0, data.load))
 
 
 def test_the_published_figures_are_those_of_the_authors_folder(reference):
@@ -90,46 +79,6 @@ def test_digitised_records_are_fitted_by_their_extremes(reference):
     assert read.origins[2].text == said
 
 
-def folder_with(root, above, *steps):
-    for step in steps:
-        place = root / above / f"step{step}"
-        place.mkdir(parents=True)
-        if step == 1:
-            rows = "length,1828.8,1829\nchord_{root},435.61,434\nchord_{tip},261.112,260\n"
-            text = f"parameter,designed,manufactured\n{rows}"
-            (place / "geometry_data.csv").write_text(text, encoding="utf-8")
-        if step == 2:
-            text = "load,displacement\n2.45,3.6\n4.9,7.2\n"
-            (place / "load_displacement_measurements.csv").write_text(text, encoding="utf-8")
-    return root
-
-
-@pytest.mark.parametrize("above", ["", "datafiles", "src/datafiles"])
-def test_parts_of_a_folder(tmp_path, above):
-    lab = read_lab_folder(folder_with(tmp_path, above, 1, 3))
-    assert [origin.read for origin in lab.origins] == [True, False, False]
-    assert lab.lengths.semi_span.measured == pytest.approx(1.829)
-    assert lab.pairs.sha256 == published_data().pairs.sha256
-    assert lab.input_hashes["lengths"] != published_data().input_hashes["lengths"]
-    assert lab.readings[0].value == 0.472
-
-
-def test_a_weighed_mass(tmp_path):
-    folder = folder_with(tmp_path, "datafiles", 2, 3)
-    file = folder / "datafiles" / "step3" / "weighed_mass.csv"
-    file.write_text("mass,standard_deviation\n455,2\n", encoding="utf-8")
-    lab = read_lab_folder(folder)
-    assert (lab.readings[0].value, lab.readings[0].deviation) == pytest.approx((0.455, 2e-3))
-    assert "weighed_mass" in lab.input_hashes
-    assert "weighed_mass.csv read" in lab.origins[2].text
-
-
-def test_records_that_are_asked_for_must_be_there(tmp_path):
-    with pytest.raises(ExperimentFileError, match="no ring-down record, and --measured asks for them"):
-        read_lab_folder(folder_with(tmp_path, "", 1, 2), "measured")
-
-
-INPUTS = Inputs(__file__)
 READERS = {
     "lengths": read_lengths,
     "load_test": read_measurements,

@@ -8,10 +8,9 @@ import pytest
 from calibration import virtual_wing
 from calibration.dynamics.records import read_records
 from calibration.dynamics.trials import average, fit_trials
-from calibration.errors import ExperimentDataError
-from calibration.geometry import published_lengths, read_lengths
+from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.joint.wing_table import weighed
-from calibration.static.experiments import published_measurements, read_measurements
+from calibration.static.experiments import published_measurements
 from calibration.virtual_wing import (
     RECORDED_GAUGE,
     SENSITIVITY,
@@ -22,7 +21,7 @@ from calibration.virtual_wing import (
     measure_ring_down,
     weigh,
 )
-from calibration.wing.lab_data import read_weighed_mass, write_lab_folder
+from calibration.wing.lab_data import published_data, read_lab_folder, write_lab_folder
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
 from tests.refusals import Inputs
@@ -127,25 +126,36 @@ def test_bad_settings(settings, words):
         measure_ring_down(Beam(), 1, **settings)
 
 
-@pytest.mark.parametrize("rate", [500.0, 100_000.0])
-def test_the_laboratory_folder_is_read_back(tmp_path, rate):
-    load_test = measure_load_test(Beam(), 2)
+@pytest.mark.parametrize(("above", "rate"), [("", 500.0), ("datafiles", 100_000.0), ("src/datafiles", 500.0)])
+def test_a_folder_is_read_back_and_what_is_not_there_is_as_published(tmp_path, above, rate):
+    lengths, load_test = measure_lengths(Geometry(), 2), measure_load_test(Beam(), 2)
     records = measure_ring_down(Beam(), 2, trials=2, duration=1.0, sampling_rate=rate)
-    lengths = measure_lengths(Geometry(), 2)
+    folder = tmp_path / above
     files = write_lab_folder(
-        tmp_path, lengths=lengths, load_test=load_test, records=records, total_mass=weighed(0.4711, 2e-3)
+        folder, lengths=lengths, load_test=load_test, records=records, total_mass=weighed(0.4711, 2e-3)
     )
-    assert all(file.is_file() for file in files)
-    seen = read_measurements(tmp_path)
-    np.testing.assert_allclose(seen.load, load_test.load, rtol=1e-9)
-    np.testing.assert_allclose(seen.displacement, load_test.displacement, rtol=1e-9)
-    np.testing.assert_array_equal(seen.run, load_test.run)
-    for written, read in zip(records, read_records(tmp_path), strict=True):
+    lab, published = read_lab_folder(tmp_path, free=True), published_data()
+    assert [origin.read for origin in lab.origins] == [True] * 3
+    assert "weighed_mass.csv read" in lab.origins[2].text
+    assert lab.input_hashes.keys() == {"lengths", "load_test", "weighed_mass", "ring_down_1", "ring_down_2"}
+    assert not lab.input_hashes.items() & published.input_hashes.items()
+    np.testing.assert_allclose(lab.pairs.load, load_test.load, rtol=1e-9)
+    np.testing.assert_allclose(lab.pairs.displacement, load_test.displacement, rtol=1e-9)
+    np.testing.assert_array_equal(lab.pairs.run, load_test.run)
+    for written, read in zip(records, read_records(folder / "step3"), strict=True):
         np.testing.assert_allclose(read.time, written.time, atol=1e-6)
         np.testing.assert_allclose(read.signal, written.signal, rtol=1e-8, atol=1e-12)
         assert read.sampling_rate == pytest.approx(rate, rel=1e-6)
-    measured = read_lengths(tmp_path)
-    assert measured.root_chord.measured == pytest.approx(lengths.root_chord.measured, rel=1e-9)
-    assert measured.root_chord.designed == published_lengths().root_chord.designed
-    scale = read_weighed_mass(tmp_path)
-    assert (scale.value, scale.deviation) == pytest.approx((0.4711, 2e-3))
+    assert len(lab.trials) == 2
+    assert lab.lengths.root_chord.measured == pytest.approx(lengths.root_chord.measured, rel=1e-9)
+    assert lab.lengths.root_chord.designed == published.lengths.root_chord.designed
+    assert (lab.readings[0].value, lab.readings[0].deviation) == pytest.approx((0.4711, 2e-3))
+    for file in files[1:]:
+        file.unlink()
+    (folder / "step2").rmdir()
+    rest = read_lab_folder(tmp_path)
+    assert [origin.read for origin in rest.origins] == [True, False, False]
+    assert rest.input_hashes == published.input_hashes | {"lengths": lab.input_hashes["lengths"]}
+    assert (rest.readings, rest.trials) == (published.readings, None)
+    with pytest.raises(ExperimentFileError, match="no ring-down record, and --measured asks for them"):
+        read_lab_folder(tmp_path, "measured")

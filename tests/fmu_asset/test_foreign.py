@@ -32,11 +32,6 @@ def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu, iso
             asset.step({"u": 2e6})
         asset.restore_state(saved)
         np.testing.assert_array_equal(asset.step({"u": -1.0}).values, following)
-    wrong = changed(FIXED, header={"decimation": 1, "step_size": 1.0})
-    words = r"(?s)fmi2DoStep returned Error.*the sample time is 0\.01 s"
-    asset = FmiAsset(foreign_fmu("fixed2"), wrong, isolated=isolated)
-    with asset, pytest.raises(errors.FmuCallError, match=words):
-        asset.step()
 
 
 def test_fmi_3_asks_to_end_or_returns_early(foreign_fmu, isolated) -> None:
@@ -115,10 +110,6 @@ def test_ports_are_sent_and_read(foreign_fmu) -> None:
         expected = steady + (293.15 - steady) * math.exp(-60.0 * 100.0 / 5e4)
         assert shown.extra["p.displacement"] == pytest.approx(1e3 * expected)
         assert asset.recorded_units == {"p.displacement": "mm", "p.velocity": "m/s"}
-    given = root.model_dump(exclude_none=True, mode="json")["port"]["p"]
-    both = {"p": given | {"displacement": {"variables": "ambient.T", "unit": "m"}}}
-    with pytest.raises(errors.BindingError, match=r"force and motion are both inputs of the FMU"):
-        FmiAsset(beam, changed(root, port=both))
     # Elements of an array go in, a whole array comes out.
     fmu = foreign_fmu.changed("array3", "forces", ('min="-10" max="10"', 'min="-10" max="10" unit="N"'))
     with FmiAsset(fmu, tip) as asset:
@@ -127,10 +118,6 @@ def test_ports_are_sent_and_read(foreign_fmu) -> None:
         np.testing.assert_allclose(found, [-1e-3, 2e-3], rtol=1e-12)
         with pytest.raises(errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"):
             asset.step(port={"p.force": 1.0})
-    whole = tip.model_dump(exclude_none=True, mode="json")["port"]["p"]
-    wrong = {"p": whole | {"force": {"variables": "u", "unit": "N"}}}
-    with pytest.raises(errors.BindingError, match=r"port\.p\.displacement .* has 2 values and the force 3"):
-        FmiAsset(fmu, changed(tip, port=wrong))
 
 
 def test_both_interfaces_in_one_fmu(foreign_fmu) -> None:

@@ -57,7 +57,7 @@ def page(title: str = "Title") -> Page:
     result.add_paragraph("if a < b & b > c")
     result.add_highlights([("3.5 %", "damage <1>")])
     result.add_notice("<script>alert('x')</script>")
-    assert result.add_figure(svg(), "What is seen, in µε.", title="A figure") == 1
+    assert result.add_figure(svg(), "What is seen, in µε.", title='What & "whose" <size>') == 1
     result.add_section("Second")
     assert result.add_figure(svg(), "The same.", title="Another") == 2
     columns = (Column("quantity"), Column("value", unit="N/mm", numeric=True))
@@ -90,10 +90,13 @@ def test_page_asks_nothing_of_any_server_and_its_links_lead_somewhere(text):
     for tag, attributes in seen:
         assert tag not in {"link", "iframe", "object", "embed"}
         assert "src" not in attributes
-        for name in ("href", "xlink:href"):
-            assert (attributes.get(name) or "#").startswith("#")
-        assert tag != "a" or (attributes["href"] or "").removeprefix("#") in identifiers
+        for value in (attributes.get(name) for name in ("href", "xlink:href") if name in attributes):
+            assert value
+            assert value.startswith("#")
+            assert value[1:] in identifiers
     assert not re.search(r"@import|url\((?!#)", text)
+    assert set(re.findall(r"url\(#(.*?)\)", text)) <= set(identifiers)
+    assert 'What & "whose" <size>' in [attributes.get("aria-label") for _, attributes in seen]
 
 
 def test_a_server_can_allow_the_script_and_no_other(text):

@@ -6,7 +6,7 @@ import pytest
 
 from fe.wing.design import SHIPPED_DESIGN
 from scenarios import asset_scripts, binding_files, recording_files, scenario_files
-from twin_master.mission.truth import Truth
+from twin_master.mission.turns import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 
@@ -52,14 +52,3 @@ def test_the_wing_with_a_third_region_is_the_shipped_one_with_a_third_region() -
     assert scenario.state_names == ("z1", "z2", "z3")
     build_source = scenario.belief.source(scenario, scenario.asset.source(scenario))
     build_source.check()
-
-
-def test_the_papers_figures() -> None:
-    """Those with units: `tests/twin_master/scenario`."""
-    scenario = load_scenario("level_turns").scenario
-    assert scenario.mission.steps == 50
-    assert scenario.mission.prediction_steps == 10
-    assert scenario.planner.gamma == 0.6
-    assert scenario.transition.probability == {"2g": 0.05, "3g": 0.10}
-    assert (scenario.rewards.health_weight, scenario.rewards.control_weight) == (1.0, 2.5)
-    assert scenario.rewards.control == {"2g": -0.1, "3g": 0.1}

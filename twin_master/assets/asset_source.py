@@ -23,11 +23,10 @@ from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.parameter import ParameterDraws, draw_parameter
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
-from twin_master.sentences import said
+from twin_master.scenario.section import AssetSection, BeliefSection, FileSection
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel

@@ -34,13 +34,11 @@ from twin_master.assets.parameter import (
     check_calibration,
     read_calibration,
 )
-from twin_master.errors import MissionInputError, check_names
+from twin_master.errors import MissionInputError, check_names, said
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.asset import AssetSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Flag, Name
+from twin_master.scenario.section import AssetSection, Flag, Name
 from twin_master.seeds import generator
-from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.asset import CoupledAsset

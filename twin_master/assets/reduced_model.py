@@ -20,14 +20,12 @@ from twin_master.assets.parameter import (
     calibrated_means,
     check_calibration,
 )
-from twin_master.errors import MissionInputError, check_names
+from twin_master.errors import MissionInputError, check_names, said
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import packed_row
-from twin_master.scenario.asset import FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import ROLE, ModesSection
+from twin_master.scenario.section import ROLE, FileSection, ModesSection
 from twin_master.seeds import seed_sequence
-from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel

@@ -11,13 +11,11 @@ from reporting.toml_file import checked, read_toml
 from twin_master.assets.asset_source import AssetSource, PairedSource
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.network.memory import check_scenario_fits
-from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Section
-from twin_master.sentences import said
+from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, AssetSection, Section
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,9 @@ from twin_master.assets.asset_source import (
 )
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection, FmuSource
 from twin_master.assets.reduced_model import NamedStructure, RecordedStructure, ReducedModelSource
-from twin_master.errors import MissionInputError
-from twin_master.scenario.asset import BeliefSection, FileSection
+from twin_master.errors import MissionInputError, said
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
+from twin_master.scenario.section import BeliefSection, FileSection
 
 if TYPE_CHECKING:
     pass

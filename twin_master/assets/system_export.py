@@ -27,9 +27,8 @@ from scenarios import binding_files
 from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.scenario.reading import LoadedScenario
-from twin_master.sentences import said
 
 
 def export_scenario(

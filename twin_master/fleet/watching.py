@@ -16,13 +16,12 @@ from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text, written
 from reporting.json_file import read_json
 from reporting.progress import SilentProgress
-from twin_master.errors import FleetError
+from twin_master.errors import FleetError, said
 from twin_master.fleet.flight import WATCHED_KIND, held_fleet
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
 from twin_master.fleet.reading import attention, severity
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
-from twin_master.sentences import said
 from twin_master.watch.feeds import broker_of, file_feed, is_broker
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed

@@ -21,10 +21,9 @@ from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.library_source import LibraryBelief
 from twin_master.assets.parameter import read_calibration
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.scenario.section import LARGEST_COUNT
-from twin_master.sentences import said
 
 Float = NDArray[np.float64]
 

@@ -32,10 +32,9 @@ from twin_master.assets.library_source import (
     ObservationLibrary,
     write_observation_library,
 )
-from twin_master.errors import MissionInputError, check_names
+from twin_master.errors import MissionInputError, check_names, said
 from twin_master.library.grid import Float, GridSampler, SamplingGrid
 from twin_master.network.memory import NUMBER, check_fits
-from twin_master.sentences import said
 
 PLAN_NAME, ROWS_NAME = "grid.json", "observations.npy"
 _COPIES = 3  # of what was sampled: the blocks, all of them, and the library

@@ -20,9 +20,8 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.files import synchronise, write_error, written
 from reporting.record_json import plain
-from twin_master.errors import NotResumableError
+from twin_master.errors import NotResumableError, said
 from twin_master.mission.turns import Happened, Reading, Turn
-from twin_master.sentences import said
 
 JOURNAL_NAME = "journal.jsonl"
 _DIGEST = 64

@@ -21,6 +21,7 @@ from twin_master.errors import (
     InvalidObservationError,
     NotResumableError,
     TwinMasterError,
+    said,
 )
 from twin_master.learning.expectation import Expected, expected_of
 from twin_master.mission.journal import (
@@ -32,15 +33,13 @@ from twin_master.mission.journal import (
     turn_record,
 )
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import Plant
-from twin_master.mission.turns import History, Reading, Turn
+from twin_master.mission.turns import History, Plant, Reading, Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.sentences import said
 
 _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 """What is told of a suspicion."""

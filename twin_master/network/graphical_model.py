@@ -13,10 +13,8 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
 from reporting.words import brief
-from twin_master.errors import InvalidModelError
-from twin_master.network.distributions import distribution, expect_shape, stochastic_matrix
-from twin_master.network.transition import TransitionModel
-from twin_master.sentences import said
+from twin_master.errors import InvalidModelError, said
+from twin_master.network.transition import TransitionModel, distribution, expect_shape, stochastic_matrix
 
 
 @dataclass(frozen=True)

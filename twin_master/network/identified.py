@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from reporting.arrays import Float, Index
-from twin_master.errors import InvalidObservationError
-from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
+from twin_master.errors import InvalidObservationError, said
+from twin_master.network.kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.section import row_width
-from twin_master.sentences import said
 
 
 def packed_row(values: Float, covariance: Float) -> Float:

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from math import prod
 
 from reporting.memory import memory_left
-from twin_master.errors import InvalidModelError
+from twin_master.errors import InvalidModelError, said
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 
 NUMBER = 8
 """Bytes of a number."""

@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
-from twin_master.errors import PlanningError
-from twin_master.network.distributions import expect_shape
+from twin_master.errors import PlanningError, said
 from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.kernels import sweep
-from twin_master.network.transition import TransitionModel
-from twin_master.sentences import said
+from twin_master.network.transition import TransitionModel, expect_shape
 
 
 @dataclass(frozen=True)

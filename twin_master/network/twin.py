@@ -12,9 +12,8 @@ from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
 from reporting.arrays import Float
 from reporting.words import brief
-from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.errors import InvalidModelError, InvalidObservationError, said
 from twin_master.network import graphical_model
-from twin_master.network.distributions import expect_controls
 from twin_master.network.estimator import (
     Carried,
     Estimate,
@@ -27,8 +26,8 @@ from twin_master.network.estimator import (
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
 from twin_master.network.planner import BeliefPolicy, decision
+from twin_master.network.transition import expect_controls
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 
 _LARGEST = np.float64(1e150)
 """What is carried is below this, so that what follows from it are numbers, too."""

@@ -10,11 +10,10 @@ from typing import Any
 from reporting.toml_file import checked, read_toml
 from reporting.words import brief
 from scenarios import scenario_files
-from twin_master.errors import ScenarioError
-from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME
+from twin_master.errors import ScenarioError, said
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
-from twin_master.sentences import said
 
 _OF_SEVERAL = ("component", "connection", "algorithm", "iterations", "tolerance")
 _OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")

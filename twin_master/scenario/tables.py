@@ -9,9 +9,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field
 
 from reporting.toml_file import Fault, NotNegative, Number, Positive
-from twin_master.scenario.asset import FileSection
+from twin_master.errors import said
 from twin_master.scenario.section import (
     Count,
+    FileSection,
     Flag,
     Name,
     PerSensor,
@@ -23,7 +24,6 @@ from twin_master.scenario.section import (
     one_or_each,
     short,
 )
-from twin_master.sentences import said
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""

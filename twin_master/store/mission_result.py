@@ -15,8 +15,7 @@ from reporting.record_json import plain
 from reporting.words import capital, parameter_title
 from twin_master.mission.loop import BelievedModel, in_turn
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import Truth
-from twin_master.mission.turns import History
+from twin_master.mission.turns import History, Truth
 from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
 

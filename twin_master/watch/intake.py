@@ -18,16 +18,14 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, written
-from twin_master.errors import TwinMasterError
+from twin_master.errors import TwinMasterError, said
 from twin_master.learning.words import Words
 from twin_master.mission.journal import turn_record
 from twin_master.mission.turns import Reading, Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
-from twin_master.watch.growing import Place
-from twin_master.watch.message import Fed, Message, Refused
+from twin_master.watch.message import Fed, Message, Place, Refused
 
 POLL_SECONDS = 0.05
 """Between two looks at a feed that may go on."""

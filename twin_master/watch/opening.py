@@ -17,7 +17,7 @@ from twin_master.assets.resolution import (
     given_overrides,
     resolve_scenario,
 )
-from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.errors import MissionInputError, NotResumableError, said
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
 from twin_master.run_folder import (
     CONFIG_NAME,
@@ -30,7 +30,6 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of

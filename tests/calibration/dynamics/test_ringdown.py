@@ -52,13 +52,10 @@ def test_two_modes_are_recovered():
         assert cmath.phase(mode.wave) == pytest.approx(p, rel=1e-6)
         assert mode.damped_frequency == pytest.approx(f * math.sqrt(1.0 - z**2), rel=1e-8)
     assert fit.residual_deviation < 1e-10
-
     first, second = fitted(time, ring_down(time), free=False).modes
-    assert (first.frequency, first.damping_ratio) == (
-        pytest.approx(5.65, rel=2e-3), pytest.approx(0.0281, rel=2e-2),
-    )  # fmt: skip
+    assert first.frequency == pytest.approx(5.65, rel=2e-3)
+    assert first.damping_ratio == pytest.approx(0.0281, rel=2e-2)
     assert second.frequency == pytest.approx(29.97, rel=2e-2)
-
     width = 0.0081
     fine = np.arange(0.0, 6.5, width / 400.0) + 0.5 * width / 400.0
     columns = fine.size // 400
@@ -238,32 +235,20 @@ def test_any_record_is_fitted_or_refused(seed, rates, noise, free):
     amplitude_dependence(fit)
 
 
-def text_of(columns, separator):
-    return "\n".join(separator.join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True)) + "\n"
-
-
-def test_the_three_layouts_of_files(tmp_path):
-    good = ring_down(TIME)
-    (tmp_path / "raw").mkdir()
-    (tmp_path / "raw" / "step3").mkdir()
-    for trial in (1, 2):
-        raw = tmp_path / "raw" / "step3" / f"initialconditiondata_{trial}.DAT"
-        raw.write_text(text_of([TIME, good, 0.1 * good], "\t"), encoding="utf-8")
-    assert len(read_records(tmp_path / "raw")) == 2
-    assert len(read_records(tmp_path / "raw" / "step3")) == 2
-    named = tmp_path / "trial.csv"
-    named.write_text(
-        "chordwise (V),time (s),spanwise [V]\n" + text_of([0.1 * good, TIME, good], ","), encoding="utf-8"
-    )
-    plot = tmp_path / "plot.csv"
-    plot.write_text(
-        "# t_s,V_low,V_mid,V_high  (from a plot)\n" + text_of([TIME, good - 1e-4, good, good + 1e-4], ","),
-        encoding="utf-8",
-    )
-    for file, width in ((raw, 0.0), (named, 0.0), (plot, 0.005)):
-        (record,) = read_records(file)
-        assert record.signal == pytest.approx(good, abs=1e-9)
-        assert record.averaging_width == pytest.approx(width)
+@pytest.mark.parametrize(
+    ("header", "columns", "width"),
+    [
+        ("chordwise (V),time (s),spanwise [V]", [0.1 * GOOD, TIME, GOOD], 0.0),
+        ("# t_s,V_low,V_mid,V_high  (from a plot)", [TIME, GOOD - 1e-4, GOOD, GOOD + 1e-4], 0.005),
+    ],
+)
+def test_layouts_of_files(tmp_path, header, columns, width):
+    """The authors' own is in the folder of a laboratory, in `test_lab_files.py`."""
+    file = tmp_path / "trial.csv"
+    np.savetxt(file, np.transpose(columns), "%.9g", ",", header=header, comments="", encoding="utf-8")
+    (record,) = read_records(file)
+    assert record.signal == pytest.approx(GOOD, abs=1e-9)
+    assert record.averaging_width == pytest.approx(width)
 
 
 # ---------------------------------------------------------------- the extremes of a drawn record

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
-from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Term
+from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit, upper_factor
 from discrepancy.fits.predictive import residual_set
 
@@ -18,6 +18,7 @@ from . import kit
 
 STEP = 1e-4
 TOLERANCE = 0.03  # of the column's norm: the code's one-sided step by nuisances is 1e-2 of a prior deviation
+CENTRAL = 1e-3  # by effects no curvature is in them: of frequencies nuisances leave less than that errs by
 BOTH = Candidate((kit.OFFSET, kit.DRIFT))
 
 
@@ -56,9 +57,12 @@ def check(problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):
         columns[index, at:stop] = shared[:, counts]
         columns[first : first + len(local), at:stop] = local[:, counts]
         at, first = stop, first + len(local)
+    limits = np.full(linear.size, tolerance)
+    if tolerance == TOLERANCE:
+        limits[problem.shared.size : problem.shared.size + candidate.size] = CENTRAL
     for number, (have, want) in enumerate(zip(columns, numerical, strict=True)):
         error = np.linalg.norm(have - want)
-        assert error <= tolerance * np.linalg.norm(want) + 1e-9, f"unknown {number}: {error}"
+        assert error <= limits[number] * np.linalg.norm(want) + 1e-9, f"unknown {number}: {error}"
 
 
 @pytest.mark.parametrize("at_rest", [True, False])
@@ -93,27 +97,6 @@ def test_derivatives_by_effects_on_the_chain(identifier, place, tolerance, free)
     assert candidate.size == len(effect.parameters) + free * len(effect.shape)
     about, spread = (candidate.start() + 0.1, 0.2) if free else (0.3, 0.3)
     check(kit.BENCH.problem(1), candidate, effect=about, spread=spread, tolerance=tolerance)
-
-
-def test_derivatives_by_an_effect_have_no_curvature_in_them():
-    """Of an effect on frequencies nuisances leave less than a one-sided difference errs by."""
-    problem = kit.BENCH.problem(4, kit.BENCH.patch("root_compliance", {"compliance_share": 0.3}))
-    candidate = Candidate((Term(kit.chosen("root_compliance")[0]),))
-    point = problem.start(candidate)
-
-    def response(number, move):
-        patch = candidate.patch(problem.setting, point.effect + move)
-        return problem.response(number, point.shared, point.local[number], patch)[0]
-
-    rings = [n for n, data in enumerate(problem.trials) if data.trial.is_dynamic]
-    assert rings
-    for number in rings:
-        exact = (response(number, STEP) - response(number, -STEP)) / (2.0 * STEP)
-        one_sided = (response(number, PARAMETER_STEP) - response(number, 0.0)) / PARAMETER_STEP
-        found = problem.linearise(number, point, candidate).effect[0]
-        size = np.linalg.norm(exact)
-        assert np.linalg.norm(one_sided - exact) > 2e-3 * size
-        assert np.linalg.norm(found - exact) < 1e-4 * size
 
 
 def test_samples_that_do_not_count_change_nothing():

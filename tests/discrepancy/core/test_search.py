@@ -19,28 +19,14 @@ from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import _distance
 from discrepancy.location.locate import locate
-from discrepancy.models.lumped import LumpedModel
 from discrepancy.search.honest_evidence import left_by, refitted, widened
-from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
-from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
+from fe.runtime.patch import ModelPatch, PowerStiffness
 from tests.discrepancy.rigs import measured
 from tests.refusals import Inputs
 
 from . import kit
-
-
-def test_friction_that_ends_motions_is_found_among_its_many_optima():
-    model = LumpedModel.load("single_mass_rig")
-    plan = plan_for(model, ("displacement", "leaf_strain"), "mass")
-    friction = PowerDamping("slide", 0.316, 0.0, 0.0, 1.0, 1.0)
-    found = example_campaign(model, "laboratory", 4, plan, ModelPatch((friction,)))
-    verdict = investigate(found, model, kit.chosen("coulomb_friction"), thorough=False).verdict
-    assert verdict.kind is VerdictKind.NAMED
-    (named,) = verdict.effects
-    assert named.patch.primitives[0].coefficient == pytest.approx(0.316, rel=2e-3)
-
 
 # ---------------------------------------------------------------- candidates that no fit can follow
 

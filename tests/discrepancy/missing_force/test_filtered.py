@@ -323,7 +323,8 @@ def test_moments_of_residuals_are_where_they_were_made(kind, seed):
         np.testing.assert_allclose(found[:, 0], truth, atol=0.01 * time[-1])
 
 
-def test_a_window_of_a_campaign_is_told_and_drawn():
+def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
+    """Where none can be weighed (the filter breaks down beside millions of noises), it is told as a whole."""
     event = np.zeros((300, 4))
     event[120:200, 1] = 16.0  # eight noises, from 1.2 s to 2 s
     fitted = Bench(count=300).fit(np.random.default_rng(4), extra={1: event})
@@ -342,17 +343,11 @@ def test_a_window_of_a_campaign_is_told_and_drawn():
     assert residual_windows(replace(fitted, trials=once)) == ()
     assert time_line_figure(()) is None
 
-
-def test_a_record_in_which_no_event_can_be_weighed_is_off_throughout(monkeypatch):
-    """It is told, not left out: the filter breaks down where a hypothesis leaves millions of noises."""
-
     def broken(*_):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
-    event = np.zeros((300, 4))
-    event[120:200, 1] = 16.0
     monkeypatch.setattr("discrepancy.missing_force.windows.events", broken)
-    (window,) = residual_windows(Bench(count=300).fit(np.random.default_rng(4), extra={1: event}))
+    (window,) = residual_windows(fitted)
     assert (window.trial, window.channels, window.begin, window.end) == ("release 2", ("g2",), None, None)
     assert window.size > 1.0
     assert when_sentence((window,)) == "The gap is there throughout the records."
@@ -365,7 +360,6 @@ def test_words_of_windows():
     throughout = "in 'a' throughout the record, 4 times the noise."
     assert not begins_inside((whole,))
     for windows, sentence in (
-        ((whole,), "The gap is there throughout the records."),
         ((whole, part), "The gap is there in 'b' since 1.000 s (0.980 to 1.040), to the end of the record, "
          f"3 times the noise; {throughout}"),
         ((whole, part, part, part), f"The gap comes and goes, 4 times; the largest is {throughout}"),

@@ -1,5 +1,6 @@
 """The missing force of simulated rigs: where it is, how large, and what a law is of it."""
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,6 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
-from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
@@ -27,7 +27,7 @@ from discrepancy.sources.examples import example_campaign, plan_for, plan_of
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness
-from tests.discrepancy.core.kit import problem_of
+from tests.discrepancy.core.kit import fitted, problem_of
 from tests.discrepancy.rigs import chosen, fmu_rig, hiding
 from tests.refusals import Inputs
 
@@ -184,7 +184,8 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
     """The same campaign with the model's own response and noise alone as its readings; a gain is no law."""
     problem = blind(tmp_path, CART)
     show(problem, gain)
-    assert gain != 1.0 or seen_force(problem) is None
+    search = ForceSearch(problem)
+    assert gain != 1.0 or missing_force(search, search.whole) is None
     found = investigate(problem.campaign, problem.model)
     if gain == 1.0:
         assert found.verdict.kind is VerdictKind.NOTHING_MISSING
@@ -218,21 +219,13 @@ def assert_alike(campaign, one, other, share):
 
 def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tmp_path):
     campaign, lumped = released(ModelPatch((STIFF,))), LumpedModel.load("single_mass_rig")
-    fmu = FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2")))
-    try:
+    with closing(FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2")))) as fmu:
         assert_alike(campaign, lumped, fmu, 2e-3)
-    finally:
-        fmu.close()
-
-
-def test_an_fmu_whose_system_is_not_known_shows_no_force(foreign_fmu, tmp_path):
+    # of one whose system is not known no force is seen
     unknown = ("isolated = false", "isolated = false\nsuperposition = false")
-    fmu = FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2"), unknown))
-    try:
-        problem = problem_of(released(ModelPatch((STIFF,))), fmu)
-        assert Search(problem, (), fit(problem, Candidate(), problem.start(Candidate()))).force is None
-    finally:
-        fmu.close()
+    with closing(FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2"), unknown))) as fmu:
+        problem = problem_of(campaign, fmu)
+        assert Search(problem, (), fitted(problem)).force is None
 
 
 def test_a_patch_and_the_same_in_the_file_of_a_model_miss_the_same_force():
@@ -248,15 +241,11 @@ def test_a_patch_and_the_same_in_the_file_of_a_model_miss_the_same_force():
     assert not len(linear.apart()[1])
 
 
-def seen_force(problem, effect=None, place=""):
-    """Return the missing force of a problem, an effect drawn through it if one is given."""
-    search = ForceSearch(problem)
-    found = None
-    if effect is not None:
-        term = Term(effect, place)
-        start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2][0]
-        found = search.followed(search.whole, Candidate((term,)), start)
-    return missing_force(search, found or search.whole)
+def drawn_through(search, effect, place):
+    """Return an effect along the missing force, from where it is first seen."""
+    term = Term(effect, place)
+    start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2][0]
+    return search.followed(search.whole, Candidate((term,)), start)
 
 
 @pytest.mark.parametrize("high", [3.0, 1.05])
@@ -267,10 +256,7 @@ def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(hi
     rows = [first, damper.model_copy(update={"high": high})]
     rig = LumpedModel(rig.description.model_copy(update={"parameter": rows}))
     problem = problem_of(released(ModelPatch((DAMPED,))), rig)
-    search = ForceSearch(problem)
-    term = Term(drag, "slide")
-    start = next(item for item in search.screened(search.whole, [drag]) if item[1] == term)[2][0]
-    found = search.followed(search.whole, Candidate((term,)), start)
+    found = drawn_through(ForceSearch(problem), drag, "slide")
     (law,) = found.candidate.patch(problem.setting, found.effect)
     at_one = law.coefficient / law.reference_velocity**2
     assert at_one == pytest.approx(DAMPED.coefficient / DAMPED.reference_velocity**2, rel=0.06)
@@ -327,8 +313,8 @@ def chain(kind, effect, place, **values):
 
 def test_friction_that_holds_is_the_law_of_the_missing_force():
     """The joint sticks half of the time; what is told of it is of the trials in motion."""
-    problem = chain("laboratory", "coulomb_friction", "joint", friction_ratio=0.004)
-    missing = seen_force(problem, FRICTION, "joint")
+    search = ForceSearch(chain("laboratory", "coulomb_friction", "joint", friction_ratio=0.004))
+    missing = missing_force(search, drawn_through(search, FRICTION, "joint"))
     assert (missing.told.port, missing.law) == ("joint", "Coulomb friction")
     assert share_of(missing) > 0.95
     for item in missing.courses:

@@ -12,22 +12,19 @@ import pytest
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
 from discrepancy.model_choice import choose_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
-from fe.runtime import patch
 from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from tests.discrepancy.asking import FloatArray, campaign, integrated
 from tests.discrepancy.asking import seen as shown
 from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import fmu_rig, laws
+from tests.discrepancy.rigs import chosen, fmu_rig, laws, measured
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
@@ -218,27 +215,19 @@ def test_a_release_can_be_held_by_a_force(rig: FmuModel, make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("hidden", "kind", "words"),
+    ("hidden", "value", "places"),
     [
-        pytest.param(
-            (PowerDamping("slide", 0.008 * STIFFNESS * 0.008, 0.0, 0.0, 1.0, 1.0),), VerdictKind.NAMED,
-            "Coulomb friction at slide", marks=pytest.mark.long,
-        ),
-        ((patch.SensorGain("leaf_strain", 0.08),), VerdictKind.NAMED, "gain error of a sensor at leaf_str"),
-        ((), VerdictKind.NOTHING_MISSING, ""),
+        pytest.param("coulomb_friction", 0.008, ["slide"], marks=pytest.mark.long),
+        ("gauge_gain", 0.08, ["displacement"]),
+        ("", 0.0, []),
     ],
-)  # fmt: skip
-def test_what_is_hidden_is_named_and_nothing_where_nothing_is(rig, lumped, hidden, kind, words: str) -> None:
+)
+def test_what_is_hidden_is_named_and_nothing_where_nothing_is(rig, hidden: str, value: float, places) -> None:
     """In trials of the lumped model; each further internal force of the catalogue costs a second or two."""
-    plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
-    plan = replace(plan, duration=0.5 * plan.duration, interval=2.0 * plan.interval)
-    names = {"coulomb_friction", "cubic_stiffness", "gauge_gain", "load_cell"}
-    few = [effect for effect in load_catalogue() if effect.identifier in names]
-    assert len(few) == len(names)
-    given = example_campaign(lumped, "laboratory", 4, plan, ModelPatch(hidden))
-    found = investigate(given, rig, few, thorough=False)
-    assert found.verdict.kind is kind
-    assert words in found.verdict.sentence
+    few = chosen("coulomb_friction", "cubic_stiffness", "gauge_gain", "load_cell")
+    found = investigate(measured(hidden, value)[0], rig, few, thorough=False).verdict
+    assert found.kind is (VerdictKind.NAMED if hidden else VerdictKind.NOTHING_MISSING)
+    assert [(item.identifier, item.place) for item in found.effects] == [(hidden, place) for place in places]
 
 
 # ---------------------------------------------------------------- refusals

@@ -11,7 +11,6 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course, straight
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.system_model import FORCES
 from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
@@ -207,14 +206,6 @@ def test_plain_models_take_driven_trials_and_other_begins() -> None:
     assert still[0, 0] == 0.0
     blank = trial(np.r_[0.0, time + 1e-9], force=np.r_[0.0, force], **said)
     np.testing.assert_allclose(still, seen(model, blank, outputs)[1:], atol=1e-6 * np.abs(still).max())
-
-
-def test_straight_lines_have_the_mean_effect_of_a_spline() -> None:
-    """Those of t^2 over a step h have its mean and its first moment: both ends lie h^2 / 6 lower."""
-    time, steps = np.linspace(0.0, 3.0, 13), np.array([0.0, 0.5, 0.7, 1.6])
-    found = straight(Course(time, time**2, Hold.SMOOTH).at, steps)
-    lower = np.diff(steps) ** 2 / 6.0
-    np.testing.assert_allclose(found, (steps[:-1] ** 2 - lower, steps[1:] ** 2 - lower), atol=1e-12)
 
 
 # ---------------------------------------------------------------- controllers and own laws

@@ -1,4 +1,4 @@
-"""Effects that act in a window of a record: closed forms, a general integrator, and nothing else changed."""
+"""Effects in windows of a record against closed forms and a general integrator; clocks of its loggers."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import Channel, Quantity, Start, Trial, TrialKind
-from discrepancy.errors import ModelError
+from discrepancy.campaign.records import Campaign, Channel, Quantity, RecordedInput, Start, Trial, TrialKind
+from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import BoucWen, ChannelOffset, Line, PortLoad, PowerDamping, Primitive, Window
+from fe.runtime.patch import LoggerClock, PortLoad, PowerDamping, Primitive, Window
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import one_mass
+from tests.discrepancy.rigs import INPUTS, model_of, one_mass
 
 MASS, STIFFNESS = 2.0, 200.0
 OMEGA = (STIFFNESS / MASS) ** 0.5
@@ -98,7 +98,7 @@ def test_a_law_between_two_moments_against_a_general_integrator(item: Primitive,
 
 @pytest.mark.parametrize("kind", [TrialKind.FORCED, TrialKind.RINGDOWN])
 def test_without_edges_within_the_record_nothing_changes(kind: TrialKind) -> None:
-    given, law = replace(trial(kind), begins=Start.SETTLED), BoucWen("slide", 60.0, 0.01, 1.5)
+    given, law = replace(trial(kind), begins=Start.SETTLED), patch.BoucWen("slide", 60.0, 0.01, 1.5)
     own, other, open_ = Window("a trial"), Window("another", 1.0, 2.0), Window("another", 1.0)
     for windows, same in (((own,), (law,)), ((other,), ()), ((open_, own), (law,))):
         np.testing.assert_array_equal(response(given, replace(law, windows=windows)), response(given, *same))
@@ -112,7 +112,11 @@ def test_sensors_are_wrong_within_their_windows_only() -> None:
         return observe(MODEL, measured, given, patch.ModelPatch(items), Conditions(np.zeros(0))).values[:, 0]
 
     right, inside = read(), (TIME >= 2.0) & (TIME < 3.5)
-    for wrong in (patch.SensorGain("x", 0.1), Line("x", 3.0, 0.01, 0.02), ChannelOffset("x", "0.01 * time")):
+    for wrong in (
+        patch.SensorGain("x", 0.1),
+        patch.Line("x", 3.0, 0.01, 0.02),
+        patch.ChannelOffset("x", "0.01 * time"),
+    ):
         found = read(replace(wrong, windows=(Window("a trial", 2.0, 3.5), Window("other"))))
         np.testing.assert_array_equal(found, np.where(inside, read(wrong), right))
 
@@ -131,3 +135,38 @@ def test_sensors_are_wrong_within_their_windows_only() -> None:
 def test_what_cannot_be_in_a_window_says_so(make: Callable[[], object], sentence: str) -> None:
     with pytest.raises((InvalidPatchError, ModelError), match=sentence):
         make()
+
+
+# ---------------------------------------------------------------- clocks of loggers
+
+SHAKEN = model_of(INPUTS.text("shaken_mass.toml"))
+STAMPS = np.arange(0.0, 4.0, 0.01)
+SWEEP = RecordedInput("shaker", Quantity.FORCE, np.sin(9 * STAMPS**1.3))
+SEEN = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
+SWEPT = asked(TrialKind.DRIVEN, STAMPS, channels=tuple(SEEN), inputs=(SWEEP,), begins=Start.STILL)
+LOGGED = replace(campaign(SWEPT, **SEEN), loggers={"rack": ("shaker", "laser"), "film": ("camera",)})
+RATE = 4e-3
+
+
+def shown(
+    *changes: Primitive, given: Campaign = LOGGED, at: Any = (1.0, 1.0), what: Trial = SWEPT
+) -> FloatArray:
+    return observe(SHAKEN, given, what, patch.ModelPatch(changes), Conditions(np.array(at))).values
+
+
+def test_each_logger_has_its_own_clock_and_one_alone_is_a_stiffer_rig_under_a_larger_load() -> None:
+    one, square = shown(LoggerClock("*", RATE), given=replace(LOGGED, loggers={})), (1.0 + RATE) ** 2
+    alias = shown(patch.LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
+    np.testing.assert_allclose(one, alias, atol=1e-9 * np.abs(alias).max())
+    clocks = LoggerClock("film", RATE), LoggerClock("rack", RATE), patch.Clock(RATE, 0.0)
+    film, rack, motion = map(shown, clocks)
+    assert np.abs(one - motion).max() > 0.05 * np.abs(alias).max()
+    np.testing.assert_array_equal(film[:, 0], shown()[:, 0])
+    np.testing.assert_array_equal(film[:, 1], motion[:, 1])
+    np.testing.assert_allclose(rack[:, 0], one[:, 0], atol=1e-12)
+    # the camera sees the stretched motion at its own, right times
+    stretched = replace(SWEPT, time=(1.0 + RATE) * STAMPS)
+    true = shown(patch.Clock(1.0 / (1.0 + RATE) - 1.0, 0.0), what=stretched)
+    np.testing.assert_allclose(rack[:, 1], true[:, 1], atol=1e-12)
+    with pytest.raises(CatalogueError, match="no logger 'tape'; it has 'rack', 'film'"):
+        shown(LoggerClock("tape", RATE))

@@ -28,7 +28,7 @@ from fe.runtime.patch import (
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import load_design
-from tests.discrepancy.asking import FloatArray, campaign, integrated, trial
+from tests.discrepancy.asking import FloatArray, integrated, trial
 
 OUTPUTS = (
     *((f"strain[{gauge}]", Quantity.STRAIN) for gauge in (1, 9, 21)),
@@ -185,25 +185,6 @@ def test_drag_over_the_planform_is_the_integral_over_the_area(wing: Wing) -> Non
 
     assert off(drag) < 2e-3
     assert off(0.0) > 0.1
-
-
-def test_a_harmonic_force_reaches_the_frequency_response(wing: Wing) -> None:
-    stiffness, mass, damping = wing.matrices()
-    omega, time = 2.0 * np.pi * 9.0, np.arange(12000) / 1000.0
-    values = wing.seen(trial(TrialKind.FORCED, time, force=3.0 * np.sin(omega * time)))[-1000:]
-    dynamic = stiffness - omega**2 * mass + 1j * omega * damping
-    amplitude = wing.rows() @ np.linalg.solve(dynamic, 3.0 * wing.tip)
-    wanted = (amplitude[:, None] * np.exp(1j * omega * time[-1000:])).imag.T
-    assert np.abs((values - wanted) / np.abs(amplitude)).max() < 2e-3
-
-
-def test_a_force_over_the_planform_has_its_share_in_the_first_mode(wing: Wing) -> None:
-    planform = wing.model.scales(campaign(STATIC, RING)).ports["planform"]
-    _, shapes, _ = wing.modes(count=1)
-    motion, weights = wing.arrays.line_rows[2] @ shapes[:, 0], wing.arrays.station_weights
-    cubed = float(weights @ np.abs(motion / float(weights @ motion)) ** 3)
-    assert planform.mean_power(1.0) == pytest.approx(1.0)
-    assert planform.mean_power(3.0) == pytest.approx(cubed, rel=1e-2)
 
 
 def test_the_posterior_of_a_calibration_is_the_prior(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.public_rigs.__main__ import BLOWN, RIGS, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import TrialKind
 from discrepancy.checks.model_check import check_against_model
@@ -138,34 +137,6 @@ def test_the_pendulum_has_no_name_and_its_share_is_said(rig):
     assert verdict.kind is VerdictKind.UNEXPLAINED
     assert "is missing at 'pivot', ordered by" in verdict.sentence
     assert verdict.explained is None or verdict.explained.value < 0.5
-
-
-def write_public(folder):
-    """Write records in the form in which they were published: a fall, a cooling and a swing."""
-    time = 0.1 * np.arange(500)
-    tables = {
-        "falling.txt": ("// a fall\nTime\tPosition", "\t", (time[:27] / 4.0, 0.5 - 0.3 * time[:27])),
-        "CoolingWater.csv": ('"","time","temp"', ",", (time, 10.0 * time, 22.0 + 70.0 * np.exp(-0.2 * time))),
-        "Q1.txt": ("Voltage\nTime\tVoltage", "\t", (time, 0.1 * np.exp(-0.03 * time) * np.cos(0.7 * time))),
-    }
-    for name, (heading, separator, columns) in tables.items():
-        np.savetxt(folder / name, np.column_stack(columns), "%.6f", separator, header=heading, comments="")
-
-
-@pytest.mark.parametrize("name", RIGS)
-def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name, tmp_path):
-    write_public(tmp_path)
-    folder = write(name, tmp_path, tmp_path / name)
-    campaign = read_campaign(folder)
-    assert is_sound(campaign, load_model(folder / "model.toml"))
-    (trial,) = campaign.trials
-    swing = [0.1 * np.exp(-0.03 * t) * np.cos(0.7 * t) for t in BLOWN + 0.1 * np.arange(4)]
-    last, value = {  # of the swing means of four, from the moment on at which nobody blows any more
-        "coffee_filter": (0.65, 0.5),
-        "cooling_water": (29940.0, 92.0),
-        "swinging_gate": (40.4, np.mean(swing)),
-    }[name]
-    assert (trial.time[0], trial.time[-1], trial.values[0, 0]) == pytest.approx((0.0, last, value), rel=1e-4)
 
 
 # ---------------------------------------------------------------- the real wing's measurements

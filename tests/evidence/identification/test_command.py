@@ -1,8 +1,6 @@
 """`python -m evidence.identification` as a developer calls it."""
 
 import json
-import subprocess
-import sys
 import tomllib
 
 import pytest
@@ -11,17 +9,15 @@ from evidence.identification.__main__ import main
 from evidence.identification.design_file import design_toml
 from fe.wing.design import load_design, parse_design
 from tests import command_line
-from tests.kept import ROOT
 
 
-def test_the_command_is_that_of_the_module(tmp_path):
+def test_a_folder_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
     out = tmp_path / "out"
-    words = ("--data", str(tmp_path / "none"), "--out", str(out), "--quiet")
-    command = (sys.executable, "-m", "evidence.identification", *words)
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.returncode == 1
-    assert done.stderr.endswith("is not a folder; give the one that holds the authors' two folders.\n")
-    assert done.stderr.count("\n") == 1
+    words = "--data", tmp_path / "none", "--out", out, "--quiet"
+    assert command_line.call(monkeypatch, *words, main=main) == 1
+    said = capsys.readouterr().err
+    assert said.endswith("is not a folder; give the one that holds the authors' two folders.\n")
+    assert said.count("\n") == 1
     assert not out.exists()
 
 

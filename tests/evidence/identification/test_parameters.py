@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evidence.identification.comparison import _row
-from evidence.identification.design_file import DIGITS, HEADER, _number, design_toml, rounded
+from evidence.identification.design_file import HEADER, design_toml, rounded
 from evidence.identification.errors import IdentificationError
 from evidence.identification.parameters import (
     CLUSTERS,
@@ -47,15 +47,6 @@ def test_what_is_written_is_read_back(steps):
     assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
-def test_writing_one_number_changes_nothing_else():
-    for parameter in PARAMETERS:
-        if not parameter.path:
-            continue
-        moved = with_values(DESIGN, [parameter], np.array([parameter.mean * 1.001 + 1e-6]))
-        others = [other for other in PARAMETERS if other.name != parameter.name]
-        assert values_of(moved, others).tolist() == values_of(DESIGN, others).tolist()
-
-
 def test_the_layout_is_two_rows_and_two_staggered_clusters():
     content = {"planform": {"semi_span": 2.0}, "gauges": {"positions": [(0.0, 0.0)] * 24}}
     layout = {
@@ -89,27 +80,17 @@ def test_a_start_laid_out_otherwise_is_refused():
         values_of(DESIGN.changed(gauges={"positions": DESIGN.gauges.positions[:8]}), PARAMETERS)
 
 
-def test_a_written_design_is_read_back():
-    design = load_design().changed(name='a "wing" \\ of mine')
+def test_a_written_design_is_read_back_and_the_shipped_file_is_such_a_one():
+    design = DESIGN.changed(name='a "wing" \\ of mine')
     text = design_toml(design, {"skin.stations.0.young_modulus": "identified", "webs.*.shear_modulus": "too"})
     again = parse_design(tomllib.loads(text))
     assert again == parse_design(rounded(design))
     assert sum(line.endswith("# too") for line in text.splitlines()) == len(design.webs)
     assert design_toml(again, {}) == design_toml(design, {})
     assert "row A is gauges 1-16, row B gauges 17-24" in text
-
-
-def test_the_shipped_file_is_such_a_file():
-    shipped = load_design()
-    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
-    assert text.startswith("".join(f"# {line}".rstrip() + "\n" for line in HEADER))
-    assert parse_design(rounded(shipped)) == shipped
-
-
-@given(st.floats(1e-9, 1e13))
-def test_numbers_keep_their_digits(value):
-    text = _number(float(f"{value:.{DIGITS}g}"))
-    assert tomllib.loads(f"x = {text}")["x"] == pytest.approx(value, rel=10.0 ** (1 - DIGITS))
+    shipped = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    assert shipped.startswith("".join(f"# {line}".rstrip() + "\n" for line in HEADER))
+    assert parse_design(rounded(DESIGN)) == DESIGN
 
 
 def test_the_first_gauge_is_gauge_1():

@@ -64,26 +64,7 @@ def test_a_folder_without_the_files_is_one_sentence(tmp_path, library_file):
         read_targets(tmp_path)
 
 
-FILE, DATA = ExperimentFileError, ExperimentDataError
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "sentence"),
-    [
-        (lambda lines: [lines[0].replace("freq_2", "second"), *lines[1:]], FILE, "no column 'freq_2'"),
-        (
-            lambda lines: [*lines[:3], f"nan,{lines[3].partition(',')[2]}", *lines[4:]],
-            DATA,
-            "line 4: column 'e_sample' holds nan",
-        ),
-        (lambda lines: lines[:6], DATA, "holds 5 rows; at least 10"),
-    ],
-)
-def test_other_results_are_refused(published_folder, change, error, sentence):
-    results = published_folder / RESULTS
-    results.write_text("\n".join(change(results.read_text().splitlines())) + "\n")
-    with pytest.raises(error, match=sentence):
-        read_targets(published_folder)
+FILE, DATA, INPUT = ExperimentFileError, ExperimentDataError, MissionInputError
 
 
 def strains(content: dict[str, Any]) -> list[float]:
@@ -91,27 +72,27 @@ def strains(content: dict[str, Any]) -> list[float]:
     return content["observations"]["20"]["0"]["3g"]["mean"]
 
 
-LIBRARY_ERROR = MissionInputError
-
-
 @pytest.mark.parametrize(
-    ("change", "error", "sentence"),
+    ("file", "change", "error", "sentence"),
     [
-        (lambda content: strains(content).append(np.nan), LIBRARY_ERROR, "NaN is no number in JSON"),
-        (
-            lambda content: strains(content).pop(),
-            LIBRARY_ERROR,
-            r"\[20\]\[0\]\[3g\]\[mean\] must hold 24 finite",
-        ),
-        (lambda content: strains(content).insert(4, -strains(content).pop(4)), DATA, "must be positive"),
-        (lambda content: content["states"][0].pop(), DATA, "the levels of z1"),
-        (lambda content: content["controls"].pop(), DATA, "has no control 3g"),
+        (RESULTS, lambda lines: lines.insert(0, lines.pop(0).replace("freq_2", "second")), FILE,
+         "no column 'freq_2'"),
+        (RESULTS, lambda lines: lines.insert(3, f"nan,{lines.pop(3).partition(',')[2]}"), DATA,
+         "line 4: column 'e_sample' holds nan"),
+        (RESULTS, lambda lines: lines.__delitem__(slice(6, None)), DATA, "holds 5 rows; at least 10"),
+        (LIBRARY, lambda content: strains(content).append(np.nan), INPUT, "NaN is no number in JSON"),
+        (LIBRARY, lambda content: strains(content).pop(), INPUT,
+         r"\[20\]\[0\]\[3g\]\[mean\] must hold 24 finite"),
+        (LIBRARY, lambda content: strains(content).insert(4, -strains(content).pop(4)), DATA,
+         "must be positive"),
+        (LIBRARY, lambda content: content["states"][0].pop(), DATA, "the levels of z1"),
+        (LIBRARY, lambda content: content["controls"].pop(), DATA, "has no control 3g"),
     ],
-)
-def test_other_levels_and_signs_are_refused(published_folder, change, error, sentence):
-    library = published_folder / LIBRARY
-    content = json.loads(library.read_text())
+)  # fmt: skip
+def test_other_files_are_refused(published_folder, file, change, error, sentence):
+    path = published_folder / file
+    content = path.read_text().splitlines() if file is RESULTS else json.loads(path.read_text())
     change(content)
-    library.write_text(json.dumps(content))
+    path.write_text("\n".join(content) + "\n" if file is RESULTS else json.dumps(content))
     with pytest.raises(error, match=sentence):
         read_targets(published_folder)

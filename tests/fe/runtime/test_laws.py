@@ -10,8 +10,6 @@ from numpy.polynomial import Polynomial
 from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
-from scipy.optimize import brentq
-from scipy.special import ellipk
 
 from fe.compilation import compiled_kernel
 from fe.runtime import laws as functions
@@ -438,56 +436,15 @@ def test_less_and_less_flexibility_tends_to_none(exponent: float) -> None:
 # ---------------------------------------------------------------- stiffness
 
 
-def potential(law: Primitive, x: Any) -> Any:
-    """Energy of spring and law at a displacement."""
-    if isinstance(law, FreePlay):
-        inner = np.minimum(np.abs(x), law.half_width)
-        extra = -law.stiffness * (0.5 * inner**2 + law.half_width * (np.abs(x) - inner))
-    else:
-        size = law.coefficient * law.reference_displacement / (law.exponent + 1.0)
-        extra = size * np.abs(x / law.reference_displacement) ** (law.exponent + 1.0) * (law.side * x >= 0.0)
-    return 0.5 * STIFFNESS * x**2 + extra
-
-
-def first_integral(law: Primitive) -> float:
-    """Quarter [s] of the period of a law that is the same on both sides, released from 1 m."""
-    return float(quad(
-        lambda u: np.cos(u) / np.sqrt(2.0 * (potential(law, 1.0) - potential(law, np.sin(u)))),
-        0.0, np.pi / 2, points=[np.arcsin(0.2)], epsabs=1e-12, limit=400,
-    )[0])  # fmt: skip
-
-
-CRACK, PLAY = PowerStiffness("mass", -0.4 * STIFFNESS, 1.0, -1, 1.0), FreePlay("mass", 0.5 * STIFFNESS, 0.2)
-SOFT = 1.0 / np.sqrt(0.6)
-
-
-@pytest.mark.parametrize(
-    ("law", "period", "least", "tolerance"),
-    [
-        *(
-            (PowerStiffness("mass", share * STIFFNESS, 3.0, 0, 1.0),
-             4.0 * ellipk(-share / (2.0 + share)) / (OMEGA * np.sqrt(1.0 + share / 2.0)), -1.0, 2e-6)
-            for share in (-0.3, 0.05, 0.3, 2.0)
-        ),
-        (CRACK, (1.0 + SOFT) * np.pi / OMEGA, -SOFT, 2e-6),  # half a period of each spring
-        (PLAY, 4.0 * first_integral(PLAY), -1.0, 1e-5),
-    ],
-)  # fmt: skip
-def test_a_nonlinear_spring_has_its_period_and_keeps_its_energy(law, period, least, tolerance):
-    # in default steps it goes to and fro, and does not drift
-    moved = ring(law, duration=200.0, count=4001)
-    energies = 0.5 * moved.v[:, 0] ** 2 + potential(law, moved.q[:, 0])
+@pytest.mark.parametrize(("share", "exponent", "side"), [(0.3, 3.0, 0), (-0.4, 1.0, -1)])
+def test_a_nonlinear_spring_keeps_its_energy(share, exponent, side):
+    """In default steps it goes to and fro over two hundred periods, and does not drift."""
+    moved = ring(PowerStiffness("mass", share * STIFFNESS, exponent, side, 1.0), duration=200.0, count=4001)
+    x, v = moved.q[:, 0], moved.v[:, 0]
+    spring = share / (exponent + 1.0) * np.abs(x) ** (exponent + 1.0) * (side * x >= 0.0)
+    energies = 0.5 * v**2 + STIFFNESS * (0.5 * x**2 + spring)
     assert np.ptp(energies) < 2e-3 * energies[0]
     assert energies[2000:].mean() == pytest.approx(energies[:2000].mean(), rel=1e-4)
-    x = ring(law, duration=20.0, count=4001, substeps=40).q[:, 0]
-    times = []  # of rising zero crossings, from the cubic through four samples
-    for i in np.flatnonzero((x[:-1] < 0.0) & (x[1:] >= 0.0)):
-        cubic = np.polyfit(np.arange(-1.0, 3.0), x[i - 1 : i + 3], 3)
-        times.append((i + brentq(lambda u, c=cubic: np.polyval(c, u), 0.0, 1.0)) * 0.005)
-    assert np.mean(np.diff(times)) == pytest.approx(period, rel=tolerance)
-    assert x.min() == pytest.approx(least, rel=1e-4)
-    if law is not CRACK:
-        assert 4.0 * first_integral(law) == pytest.approx(period, rel=1e-10)
 
 
 # ---------------------------------------------------------------- hysteresis
@@ -540,28 +497,17 @@ def test_motions_of_almost_nothing_stay_finite():
 # ---------------------------------------------------------------- steps of modes, and their damping
 
 
-def transition(omega: float, damping: float, duration: float, unit: float) -> np.ndarray:
-    """Of displacements times a unit, such that all entries are of order one."""
-    found, *_ = ModalSystem(np.array([omega]), np.array([[damping]])).exact_steps(np.array([duration]))
-    return np.asarray(found[0]) * np.array([unit, 1.0])[:, None] / [unit, 1.0]
-
-
-def is_the_exponential(omega: float, damping: float, duration: float) -> None:
-    unit = max(omega, 1.0)
-    wanted = expm(np.array([[0.0, unit], [-omega * omega / unit, -damping]]) * duration)
-    np.testing.assert_allclose(transition(omega, damping, duration, unit), wanted, rtol=1e-7, atol=9e-10)
-
-
-@given(omega=st.floats(0.0, 500.0), damping=st.floats(0.0, 2000.0), duration=st.floats(1e-6, 1.0))
-@settings(max_examples=60, deadline=None)
-def test_the_step_of_any_oscillator_is_the_exponential(omega, damping, duration):
-    is_the_exponential(omega, damping, duration)
-
-
+@pytest.mark.parametrize("omega", [0.0, 9.0, 500.0])
 @pytest.mark.parametrize("zeta", [0.0, 0.03, 0.7, 1 - 1e-9, 1.0, 1 + 1e-9, 1 + 1e-4, 1.5, 20.0, 1e4])
-def test_a_step_near_critical_damping_is_the_exponential(zeta):
+def test_the_step_of_any_oscillator_is_the_exponential(omega, zeta):
+    """Of displacements times the frequency and of speeds, all of which are of order one."""
+    unit = max(omega, 1.0)
+    system = ModalSystem(np.array([omega]), np.array([[2.0 * zeta * unit]]))
     for duration in (1e-5, 0.01, 0.3, 2.0):
-        is_the_exponential(9.0, 18.0 * zeta, duration)
+        (found,), *_ = system.exact_steps(np.array([duration]))
+        wanted = expm(np.array([[0.0, unit], [-omega * omega / unit, -2.0 * zeta * unit]]) * duration)
+        scaled = found * [[1.0, unit], [1.0 / unit, 1.0]]
+        np.testing.assert_allclose(scaled, wanted, rtol=1e-7, atol=9e-10)
 
 
 @given(

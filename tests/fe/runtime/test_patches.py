@@ -15,7 +15,6 @@ from fe.high_pass import filtered_record, high_pass
 from fe.runtime import patch, sensors
 from fe.runtime.errors import InvalidPatchError, InvalidStateError
 from fe.runtime.expression import Expression
-from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.patch import (
     PRIMITIVES,
     Clock,
@@ -77,15 +76,6 @@ def test_kinds_are_the_keys_of_patches_that_were_kept():
 
 
 # ---------------------------------------------------------------- the digital state
-
-
-def test_the_default_state_is_the_healthy_wing_as_built():
-    state = DigitalState()
-    assert (state.geometry, state.young_modulus_factor) == (Geometry(1.828, 0.433, 0.260), 1.0)
-    assert losses_of(state.stiffness_loss, region_names(2)) == (0.0, 0.0)
-    # Kapteyn et al. 2021, step 3
-    ratio = rayleigh_damping_ratio(state.damping_alpha, state.damping_beta, (5.6492, 29.9699))
-    assert ratio == pytest.approx((0.0281, 0.0717), rel=1e-3)
 
 
 @pytest.mark.parametrize(("changes", "place"), INPUTS.refused("states"))

@@ -1,4 +1,4 @@
-"""Elements and structures against scikit-fem, closed forms, CalculiX and each other; faults of files."""
+"""Elements and structures against closed forms, CalculiX and each other; faults of files."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,10 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from skfem import Basis, BilinearForm, ElementVector, MeshHex, MeshTet
-from skfem.element import ElementHex1, ElementHexS2, ElementTetP1, ElementTetP2
-from skfem.helpers import ddot, sym_grad
-from skfem.models.elasticity import lame_parameters, linear_stress
 
 from fe.elements import cells as assembly
 from fe.elements.kinds import KINDS
@@ -28,12 +24,6 @@ PRODUCTS = {  # of coordinates that a kind of element holds, by their powers
     "tetra": (1, 0, 0), "tetra10": (1, 0, 1), "wedge": (1, 0, 1), "wedge15": (1, 0, 2),
     "hexahedron": (1, 1, 1), "hexahedron20": (2, 1, 1),
 }  # fmt: skip
-SKFEM: dict[str, Any] = {
-    "tetra": ElementTetP1(),
-    "tetra10": ElementTetP2(),
-    "hexahedron": ElementHex1(),
-    "hexahedron20": ElementHexS2(),
-}
 
 
 @pytest.fixture(params=sorted(KINDS))
@@ -51,34 +41,6 @@ def distorted(
         moved[cells[:, len(kind.corners) + number]] = 0.5 * (moved[cells[:, a]] + moved[cells[:, b]])
     moved = moved * (1.0, 2.0, 0.5)
     return read_mesh(write(moved, request.param, cells, "").parent / "mesh.vtu", 1.0, "m")
-
-
-@pytest.mark.parametrize("name", SKFEM)
-def test_element_arrays_are_those_of_scikit_fems_forms(name, box):
-    (points, cells), kind = box(name, (1, 1, 1)), KINDS[name]
-    points = points + 0.1 * points[:, [1, 2, 0]]  # sheared: straight, and no two edges alike
-    corners = len(kind.corners)
-    mesh = MeshTet if corners == 4 else MeshHex
-    order = [int(np.flatnonzero((np.array(kind.corners) == p).all(axis=1))[0]) for p in mesh.elem.refdom.p.T]
-    used, vertices = np.unique(cells[:, order], return_inverse=True)
-    vertices = np.ascontiguousarray(vertices.reshape(len(cells), corners).T)
-    body = mesh(np.ascontiguousarray(points[used].T), vertices, sort_t=False)
-    basis = Basis(body, ElementVector(SKFEM[name]), intorder=6)
-    stress = linear_stress(*lame_parameters(2.0, 0.3))
-    stiffness = BilinearForm(lambda u, v, w: ddot(stress(sym_grad(u)), sym_grad(v))).assemble(basis)
-    mass = BilinearForm(lambda u, v, w: sum(u[i] * v[i] for i in range(3))).assemble(basis)
-    nodes = points[cells]
-    K = assembly.stiffness_blocks(kind, nodes, np.linalg.inv(assembly.isotropic_compliance(2.0, 0.3)))
-    M = assembly.mass_blocks(kind, nodes, 1.0, kind.mass_rule)
-    # Unknowns of both are told by the places of their nodes: compare the energies of one smooth field.
-    field = np.sin(points @ np.array([[1.0, 2.0, 0.5], [0.3, -1.0, 2.0], [0.7, 0.2, 1.0]]))
-    ours, theirs = field[cells].reshape(len(cells), -1), np.zeros(basis.N)
-    for row, unknowns in enumerate(basis.element_dofs):
-        apart = np.linalg.norm(points[:, :, None] - basis.doflocs[:, unknowns], axis=1)
-        theirs[unknowns] = field[apart.argmin(axis=0), row % 3]
-    assert np.einsum("ni,nij,nj->", ours, K, ours) == pytest.approx(theirs @ stiffness @ theirs, rel=1e-12)
-    scalar = np.einsum("nai,nab,nbi->", field[cells], M, field[cells])
-    assert scalar == pytest.approx(theirs @ mass @ theirs, rel=1e-12)
 
 
 def test_patch_test_and_gauges(distorted):

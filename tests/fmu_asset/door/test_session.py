@@ -45,39 +45,6 @@ def test_what_does_not_fit_the_fmu_is_one_sentence(fmu, binding) -> None:
             FmiAsset(fmu, binding, parameters=parameters)
 
 
-def test_units_are_converted_and_parameters_reach_the_fmu_at_the_next_start(model, fmu, isolated) -> None:
-    units, inputs = BINDINGS["units"], ({"load_factor": 3.0}, {"z1": 80.0, "z2": 20.0}, {"push": 0.005})
-    with FmiAsset(fmu, units, isolated=isolated, parameters={"e": 1.05}) as asset:
-        for factor in (1.05, 0.95):
-            seen = asset.step(*inputs)
-            with pytest.raises(errors.FmuInputError, match=r"0 to 0\.8"):
-                asset.step({}, {"z1": 80.1})
-            chosen = {"young_modulus_factor": factor, "z1": 0.8, "z2": 0.2}
-            expected = model.static_response({**chosen, "load_factor": 3.0, "tip_force": 5.0})
-            np.testing.assert_allclose(seen.values, 1e6 * expected.strain, rtol=1e-12)
-            assert seen.extra["tip"] == pytest.approx(1e3 * expected.displacement[0], rel=1e-12)
-            asset.reset({"e": 0.95})
-    slow, stiffness = units.with_header(step_size=60.0), model.tip_stiffness(1.0, (0.2, 0.0))
-    for response in (1.0, 2.0):  # the load point moves by its compliance
-        with FmiAsset(fmu, slow, isolated=False, parameters={"response": response}) as asset:
-            asset.step({"load_factor": 0.0}, {"z1": 20.0}, {"push": 0.01})
-            assert asset.step().extra["load_point"] == pytest.approx(1e3 * 10.0 / stiffness, rel=1e-9)
-
-
-def test_the_fmu_itself_refuses_and_says_why(fmu, binding, monkeypatch) -> None:
-    """With the door's own check out of the way, the FMU's is seen: Discard, a sentence, nothing changed."""
-    monkeypatch.setattr("fmu_asset.door.layout.Slot.numbers", lambda slot, value: np.array([value]))
-    with FmiAsset(fmu, binding) as asset:
-        before = asset.step({"load_factor": 3.0})
-        for value, sentence in ((99, "lies outside its range"), (float("nan"), "not finite")):
-            said = rf"(?s)step 1 from t = 1 s.*Discard.*load_factor.*{sentence}"
-            with pytest.raises(errors.FmuCallError, match=said):
-                asset.step({"load_factor": value})
-        after = asset.step()
-        np.testing.assert_array_equal(before.values, after.values)
-        assert after.time == 2.0
-
-
 # ---------------------------------------------------------------------- in the midst of a run
 
 NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD = 1, 2, 3, 4, 5
@@ -196,10 +163,9 @@ def flown(asset: FmiAsset) -> list[float]:
     return [asset.step({"push": push}).values[0] for push in (1.0, 3.0)]
 
 
-@pytest.mark.parametrize("what", [(), ("RESET_DOES_NOTHING",)], ids=["sound", "does nothing"])
-def test_every_start_is_the_same(foreign_fmu, isolated, what, caplog) -> None:
+def test_every_start_is_the_same_where_a_reset_does_nothing(foreign_fmu, isolated, caplog) -> None:
     # A file of its own for each case: what is wrong with a file is said once in a process.
-    fmu = foreign_fmu("spring2", *what, f"CASE={int(isolated)}")
+    fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING", f"CASE={int(isolated)}")
     with caplog.at_level(logging.WARNING), FmiAsset(fmu, BINDINGS["spring2"], isolated=isolated) as asset:
         process, first = asset.worker_process_id, flown(asset)
         asset.reset()
@@ -211,10 +177,9 @@ def test_every_start_is_the_same(foreign_fmu, isolated, what, caplog) -> None:
             other.reset()
             assert flown(other) == first
         assert asset.worker_process_id == process
-        assert asset.reset_trial.works is (not what)
-    assert len(caplog.messages) == len(what)
-    sentence = f"{fmu}: Its reset returns OK and does not bring it back to its start"
-    assert all(sentence in text for text in caplog.messages)
+        assert asset.reset_trial.works is False
+    (said,) = caplog.messages
+    assert f"{fmu}: Its reset returns OK and does not bring it back to its start" in said
 
 
 def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu) -> None:
@@ -338,14 +303,10 @@ def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, ex
     assert not extractions[0].exists()
 
 
-def test_siblings_have_parameters_of_their_own(foreign_fmu, extractions) -> None:
-    with FmiAsset(foreign_fmu("lag1"), BINDINGS["lag1"], parameters={"gain": 1.0}) as first:
-        others = [first.sibling({"gain": float(gain)}) for gain in (2, 3)]
-        values = [asset.step({"speed": 1.0}).values[0] for asset in (first, *others)]
-        np.testing.assert_allclose(values, (1.0 - np.exp(-0.3)) * np.array([1.0, 2.0, 3.0]), rtol=1e-12)
-        for other in others:
-            other.close()
-    assert len(extractions) == 1
+def test_siblings_have_parameters_of_their_own(foreign_fmu) -> None:
+    with FmiAsset(foreign_fmu("lag1"), BINDINGS["lag1"]) as first, first.sibling({"gain": 3.0}) as other:
+        seen = [asset.step({"speed": 1.0}).values for asset in (first, other)]
+    np.testing.assert_allclose(seen, (1.0 - np.exp(-0.3)) * np.array([[2.0], [3.0]]), rtol=1e-12)
 
 
 def test_after_a_crash_the_files_are_extracted_again(foreign_fmu, extractions) -> None:

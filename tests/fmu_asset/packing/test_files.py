@@ -30,8 +30,8 @@ from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts, binding_files
-from tests.command_line import command, refused, said
-from tests.fmu_asset.making import DESCRIPTION, archive_of, bound, edited, members, run_python, tables
+from tests.command_line import refused, said
+from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python, tables
 from tests.fmu_asset.ours import REGIONS, STRUCTURES
 
 REFUSED, DECLARED = tables(__file__), tables(__file__, "declared")
@@ -51,29 +51,23 @@ def installed(program: str, package: str = "") -> str:
     return path or pytest.skip(f"{package or program} is not installed")
 
 
-def opinion(fmu: Path, home: Path) -> str:
-    """Return what another tool says; it keeps its log and settings in the home of the user."""
-    words = [installed("fmutool", "fmu-manipulation-toolbox"), "-input", str(fmu), "-check"]
-    done = run(words, env={"HOME": str(home), "PATH": "/usr/bin:/bin"})
-    return f"{done.stdout}{done.stderr}\nexit code {done.returncode}"
-
-
 # ---------------------------------------------------------------------- what holds of all
 
 
 @pytest.mark.parametrize("name", SOUND)
 def test_a_packed_fmu_is_sound(ours, name) -> None:
     """`fmpy validate`, the standard's rules and ours, a flight in a worker; without a word."""
-    checks = {check: verdict for check, verdict, _ in check_file(inspect_fmu(ours(name))[0])}
-    assert checks["fmpy validate"] == "ok"
-    assert name not in STRUCTURES or checks["content"] == "ok"
     if "source" in name or name == "exchange" or name in asset_scripts():
-        return
-    binding = load_binding(binding_files()["uav_wing_fmi3"]) if name == "fmi3" else None
-    check = check_fmu(ours(name), binding, cycles=20 if name.endswith("3") else 0)
-    assert check.problems == ()
-    warned = [finding for finding in check.findings if finding.verdict == "warning"]
-    assert not warned or name == "exchange3"
+        found = [*check_file(inspect_fmu(ours(name))[0])]
+    else:
+        binding = load_binding(binding_files()["uav_wing_fmi3"]) if name == "fmi3" else None
+        check = check_fmu(ours(name), binding, cycles=20 if name in ("compiled", "fmi3", "exchange3") else 0)
+        found = [(finding.check, finding.verdict, finding.text) for finding in check.findings]
+        assert name == "exchange3" or {verdict for _, verdict, _ in found} == {"ok"}
+    assert "problem" not in {verdict for _, verdict, _ in found}
+    checks = {check for check, verdict, _ in found if verdict == "ok"}
+    assert "fmpy validate" in checks
+    assert name not in STRUCTURES or "content" in checks
 
 
 @pytest.mark.long
@@ -83,15 +77,13 @@ def test_more_instances_in_one_process_than_python_had_room_for(fmu) -> None:
 
 @pytest.mark.parametrize("name", TOLD)
 def test_another_tool_has_no_complaint(ours, name, tmp_path) -> None:
-    said = opinion(ours(name), tmp_path)
-    words = f"seems to be compliant with FMI-{3 if '3' in name else 2}.0", "No semantic error", "exit code 0"
+    words = [installed("fmutool", "fmu-manipulation-toolbox"), "-input", ours(name), "-check"]
+    done = run(words, env={"HOME": str(tmp_path), "PATH": "/usr/bin:/bin"})  # where it keeps its log
+    said = f"{done.stdout}{done.stderr}"
+    words = f"seems to be compliant with FMI-{3 if '3' in name else 2}.0", "No semantic error"
+    assert done.returncode == 0
     assert all(text in said for text in words), said
     assert not re.search("ERROR|WARNING", said)
-
-
-def test_another_tool_does_complain_where_there_is_reason(fmu, tmp_path) -> None:
-    said = opinion(edited(fmu, tmp_path / "bad.fmu", ('causality="input"', 'causality="inward"')), tmp_path)
-    assert not re.search("seems to be compliant|exit code 0", said)
 
 
 @pytest.mark.parametrize("name", EQUAL)
@@ -143,8 +135,9 @@ def test_a_changed_part_is_noticed(ours, kind, tmp_path) -> None:
     for entry, old, new in CHANGED[kind]:
         name = next(name for name in contents if name.endswith(entry))
         content = contents[name].replace(old, new) if old else contents[name] + new
-        problems = check_fmu(archive_of(tmp_path / "changed.fmu", contents | {name: content})).problems
-        assert any("GUID" in text or "was changed after its build" in text for text in problems), entry
+        changed = archive_of(tmp_path / "changed.fmu", contents | {name: content})
+        (said,) = (text for check, _, text in check_file(inspect_fmu(changed)[0]) if check == "content")
+        assert said.endswith("the file was changed after its build."), entry
 
 
 def test_what_cannot_be_packed_is_one_sentence(model, ours, tmp_path) -> None:
@@ -218,7 +211,7 @@ def test_a_structure_of_the_wings_name_is_no_wing(ours) -> None:
 def test_a_note_and_a_further_file(model, fmu, tmp_path) -> None:
     note, content = 'Calibrated for "Wing <7> & é".', b'{"asset": "Wing <7>"}\n'
     path = build_fmu(model, tmp_path / "a.fmu", note=note, resources={"calibration.json": content}).path
-    assert check_fmu(path).passed
+    assert {verdict for _, verdict, _ in check_file(inspect_fmu(path)[0])} == {"ok"}
     described, inside = read_model_description(str(path)), members(path)
     assert described.description.endswith(note)
     assert described.guid != read_model_description(str(fmu)).guid
@@ -251,20 +244,6 @@ def test_it_needs_numpy_alone(ours, tmp_path) -> None:
     environment = {"PYTHONPATH": str(tmp_path / "resources")}
     done = run([sys.executable, "-S", "-c", ALONE], cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stderr
-
-
-def test_units_of_a_list_are_converted_each_on_its_own(ours) -> None:
-    names, units = ["temperature", "filter_pressure", "flow"], ["K", "Pa", "L/min"]
-    listed = bound(1.0, {"all": (names, units)}, control={"speed": ("speed", "1/s")})
-    with FmiAsset(ours("gear_pump"), binding_files()["gear_pump"]) as asset:
-        flow, _, temperature, drop = asset.step({"speed": 1500.0}).values
-        with pytest.raises(Exception, match="cannot hold the oil below 120 C"):
-            asset.step({"speed": 2500.0, "pressure": 210.0}, {"wear": 1.0})
-    with FmiAsset(ours("gear_pump"), listed) as asset:
-        seen = asset.step({"speed": 25.0}).values
-        assert seen == pytest.approx([temperature + 273.15, 1e5 * drop, flow])
-    with pytest.raises(ValueError, match=r"one for each of the 3 variables, and 2 came"):
-        bound(1.0, {"all": (names, units[:2])})
 
 
 # ---------------------------------------------------------------------- the compiled kind
@@ -364,7 +343,6 @@ def test_the_command_line_builds_the_shipped_wing(compiler, binding, tmp_path, m
         words = "--kind", "compiled", "--out", tmp_path / "compiled.fmu"
         assert "no-such-compiler" in refused("fmu", "build", *words, code=None)
     assert not list(tmp_path.iterdir())
-    assert command("fmu", "build", "--kind", "fortran", "--out", tmp_path / "x.fmu").returncode != 0
     for kind, platforms in {"compiled": {"linux64"}, "python": {"linux64", "win64"}}.items():
         path = tmp_path / f"{kind}.fmu"
         said("fmu", "build", "--kind", kind, "--out", path)

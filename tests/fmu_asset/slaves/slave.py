@@ -123,15 +123,17 @@ class Slave:
             self.fmu.setupExperiment(startTime=start_time)
             self.fmu.enterInitializationMode()
 
-    def start(
-        self, *, response: int | None = 1, start_time: float = 0.0, anew: bool = True, **values: float
-    ) -> int:
+    def choose(self, response: int) -> None:
+        """Set the parameter `response`."""
+        getattr(self.fmu, f"set{self.whole}")([self.reference["response"]], [response])
+
+    def start(self, *, response: int | None = 1, anew: bool = True, **values: float) -> int:
         """Reset if `anew`, set values, dots in their names written as two underscores, and initialise."""
         if anew:
             self.fmu.reset()
-        self.initialising(start_time)
+        self.initialising()
         if response is not None:
-            getattr(self.fmu, f"set{self.whole}")([self.reference["response"]], [response])
+            self.choose(response)
         for name, value in values.items():
             self.set({name.replace("__", "."): value})
         return self.status_of(self.fmu.exitInitializationMode)

@@ -113,7 +113,7 @@ def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file):
     assert source.files()["asset/calibration.nc"] == file.read_bytes()
 
 
-def test_the_option_stands_over_the_scenario(file, tmp_path):
+def test_the_option_stands_over_the_scenario(file, tmp_path, library_file):
     loaded = load_scenario("level_turns")
     scenario = resolve_scenario(loaded, Overrides(calibration=file))
     assert (scenario.calibration.source, scenario.calibration.file) == ("file", str(file))
@@ -126,6 +126,11 @@ def test_the_option_stands_over_the_scenario(file, tmp_path):
     asset_source(tailored).check()
     mine = load_scenario(scenario_with(tmp_path, "other.nc"))
     assert resolve_scenario(mine, Overrides(calibration=file)).calibration.file == str(file)
+    flown = Overrides(strain_library=library_file, calibration=file)
+    believed = asset_source(resolve_scenario(load_scenario("model_mismatch"), flown))
+    believed.check()
+    assert believed.origin.differ
+    assert {*believed.files()} == {"asset/UAVconfig.json", "asset/calibration.nc"}
     pump = load_scenario("pump_wear")
     of_ssp = resolve_scenario(pump, Overrides(ssp=tmp_path / "pump.ssp")).asset
     assert (of_ssp.kind, of_ssp.parameters) == ("ssp", pump.scenario.asset.parameters)

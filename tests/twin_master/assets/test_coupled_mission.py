@@ -17,7 +17,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
 from twin_master.fleet.plan import ensemble
-from twin_master.mission.truth import Plant, Truth
+from twin_master.mission.turns import Plant, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.store.writing import open_run
@@ -231,18 +231,3 @@ def test_the_law_of_the_shipped_damage_is_what_the_twin_believes():
         for one in (resolve_scenario(load_scenario("three_fmus"), Overrides(seed=seed)) for seed in (7, 8))
     ]
     assert all(drawn[0][name] != drawn[1][name] for name in ("damage_seed", "gauge_seed"))
-
-
-@pytest.mark.long
-@pytest.mark.slow
-@pytest.mark.xdist_group("wing")
-def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path):
-    loaded = shipped("three_fmus", tmp_path, ("steps = 50", "steps = 24"))
-    whole = new_run(loaded, tmp_path / "whole").folder
-    inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
-    assert rows(inside) == rows(whole)
-    check_resumed(whole, loaded, tmp_path / "part", 9)
-    received = np.genfromtxt(whole / "csv" / "observed.csv", delimiter=",", skip_header=1)[:, 6]
-    assert np.flatnonzero(np.isnan(received)).tolist() == [20, 21, 22, 23]  # the sixth gauge is lost
-    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
-    assert rows(new_run(loaded, tmp_path / "ssp", Overrides(ssp=ssp)).folder) == rows(whole)

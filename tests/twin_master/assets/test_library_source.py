@@ -1,7 +1,6 @@
 """A twin that believes an observation library, and the pump's mission against its equations."""
 
 import copy
-import itertools
 import json
 import math
 import shutil
@@ -20,6 +19,7 @@ from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts
+from scenarios.assets.gear_pump import steady_temperature
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
     check_same,
@@ -30,7 +30,7 @@ from tests.twin_master.runs import (
     table_of,
     written,
 )
-from twin_master.assets.library_source import ObservationLibrary, load_observation_library
+from twin_master.assets.library_source import load_observation_library
 from twin_master.assets.resolution import Overrides, asset_source
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.library.grid import grid_of_scenario
@@ -73,20 +73,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sampled(tmp_path_factory.mktemp("library"), "viscosity_factor=0.9:1.1:21")
 
 
-@pytest.fixture
-def library(made: Path) -> ObservationLibrary:
-    return load_observation_library(made)
-
-
-def test_a_table_over_another_parameter_grid_is_interpolated(library):
-    nodes = library.at_draws("viscosity_factor", library.draws[[3, 7]])
-    np.testing.assert_array_equal(nodes, library.values[[3, 7]])
-    between = library.at_draws("viscosity_factor", np.array([0.955]))
-    np.testing.assert_allclose(between[0], 0.5 * (library.values[5] + library.values[6]), rtol=1e-14)
-    assert library.holds_draws(library.draws)
-    assert not library.holds_draws(np.array([0.955]))
-
-
 def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
     path = Path(shutil.copy(made, tmp_path / "pump.nc"))
     whole = fly(small_pump(), tmp_path / "whole", Overrides(library=path))
@@ -127,16 +113,6 @@ def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
         fly(changed(key, entry), tmp_path / "run", Overrides(library=made))
 
 
-def test_names_and_order_of_controls_and_states_do_not_matter(made, tmp_path):
-    table, figures = copy.deepcopy(PUMP), []
-    table["state"].reverse()
-    table["control"].reverse()
-    for name, loaded in (("a", small_pump()), ("b", loaded_from(table, "pump_wear"))):
-        figures.append(figures_of(fly(loaded, tmp_path / name, Overrides(library=made)).folder))
-    assert figures[0]["log_evidence"] == pytest.approx(figures[1]["log_evidence"], rel=1e-12)
-    assert figures[0]["filtered_rms_error_wear"] == pytest.approx(figures[1]["filtered_rms_error_wear"])
-
-
 def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
     """Also one with a number that is none; and a scenario without an FMU cannot be sampled."""
     (tmp_path / "noise.nc").write_bytes(b"no NetCDF at all")
@@ -170,8 +146,7 @@ def test_keys_and_lists_that_do_not_fit_are_refused(key, entry, words):
 
 # ---------------------------------------------------------------- physics and probabilities anew
 
-WEAR, CLOGGING = (0.0, 0.3, 0.6), (0.0, 0.6)
-STATES = list(itertools.product(WEAR, CLOGGING))
+LEVELS = {"wear": (0.0, 0.3, 0.6), "clogging": (0.0, 0.6)}
 CONTROLS = {"eco": (1000.0, 100.0), "normal": (1500.0, 140.0), "boost": (1800.0, 180.0)}
 WORSENING = {"eco": (0.02, 0.04), "normal": (0.04, 0.06), "boost": (0.08, 0.08)}
 NOISE = np.array([0.4, 0.5, 0.6, 0.15])
@@ -203,24 +178,31 @@ def show(control: str, wear: float, clogging: float, viscosity: float) -> Float:
     return np.array([6e4 * flow, torque, temperature, 1e-5 * drop])
 
 
-def move(control: str, before: int, after: int) -> float:
+def move(control: str, before: dict[str, float], after: dict[str, float]) -> float:
     """Probability that each factor stays or worsens by one level; the last level is kept."""
     result = 1.0
-    for axis, levels in enumerate((WEAR, CLOGGING)):
-        a, b = levels.index(STATES[before][axis]), levels.index(STATES[after][axis])
-        up = WORSENING[control][axis] if a < len(levels) - 1 else 0.0
+    for (name, levels), worse in zip(LEVELS.items(), WORSENING[control], strict=True):
+        a, b = levels.index(before[name]), levels.index(after[name])
+        up = worse if a < len(levels) - 1 else 0.0
         result *= {0: 1.0 - up, 1: up}.get(b - a, 0.0)
     return result
 
 
 @pytest.mark.parametrize("believed", ["asset", "library"])
 def test_what_the_twin_knows_is_what_the_equations_say(believed, tmp_path):
-    """What all sensors show by draw, state and control; moves; the worth of the sensors that have a limit."""
-    known = prepare_twin(
-        small_pump(), Overrides(library=sampled(tmp_path) if believed == "library" else None)
-    )
-    controls, draws, states = known.model.controls, known.draws.values, range(len(STATES))
-    shown = np.array([[[show(u, *state, e) for u in controls] for state in STATES] for e in draws])
+    """What all sensors show by draw, state and control; moves; the worth of the sensors that have a limit.
+
+    In a library names and order of states and controls do not matter.
+    """
+    table, given = copy.deepcopy(PUMP), Overrides()
+    if believed == "library":
+        given = Overrides(library=sampled(tmp_path))
+        table["state"].reverse()
+        table["control"].reverse()
+    known = prepare_twin(loaded_from(table, "pump_wear"), given)
+    controls, draws, names = known.model.controls, known.draws.values, known.model.states.names
+    states = [dict(zip(names, row, strict=True)) for row in known.model.states.coordinates.tolist()]
+    shown = np.array([[[show(u, **state, viscosity=e) for u in controls] for state in states] for e in draws])
     np.testing.assert_allclose(known.sensor_model.value_per_draw, shown, rtol=1e-7)
     np.testing.assert_array_equal(known.sensor_model.standard_deviation, NOISE)
     matrix = [[[move(u, a, b) for b in states] for a in states] for u in controls]
@@ -228,10 +210,12 @@ def test_what_the_twin_knows_is_what_the_equations_say(believed, tmp_path):
     health = 1.0 - np.maximum(shown[..., 2] / 50.0, shown[..., 3] / 5.0)
     np.testing.assert_allclose(known.rewards.health_per_draw, health, rtol=1e-7)
     seen = shown[0, 0, 1] + [np.nan, 0.2, 0.3, -0.1]  # a lost sensor says nothing
-    believes = known_control(np.eye(len(STATES))[4], 1, len(controls))
+    believes = known_control(np.eye(len(states))[4], 1, len(controls))
     error = np.nanmean(-np.abs(seen - shown[:, 4, 1]) / NOISE, axis=1).mean()
     found, _ = known.rewards.expectation(believes, seen)
     assert (found[0], found[2]) == pytest.approx((health[:, 4, 1].mean(), error), rel=1e-7)
+    # Where the cooler cannot hold the oil there is no steady operation.
+    assert math.isnan(steady_temperature(2500.0 * math.pi / 30.0, 210e5, 1.0, 0.0, 1.0))
 
 
 @pytest.mark.parametrize("way", ["asset", "library", "swept", "learnt"])
@@ -257,6 +241,7 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         )
         given = replace(given, learnt=written(tmp_path, learnt))
     known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
+    assert ("the observation library is interpolated" in known.draws.source) is (way == "swept")
     assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
     flown = known.scenario.asset.source(known.scenario).parameters()
     assert flown == {"conductance": 6100.0, "specific_heat": pytest.approx(samples[:, 1].mean())}

@@ -2,34 +2,25 @@
 
 import json
 import re
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.misfit import find_misfit
-from benchmarks.seeds import fly_seeds
-from calibration.result.file import load_calibration, save_calibration
 from fe.runtime.patch import ModelPatch, SensorGain
-from fe.runtime.reduced import ReducedModel
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from scenarios import binding_files
-from tests.conftest import synthetic_library
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
 from tests.twin_master.runs import edited, loaded_from, table_of, text_of, written
 from twin_master.assets.asset_source import AssetReading, PairedSource, StatelessAsset
-from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
-from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model
@@ -85,28 +76,18 @@ def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path,
         asset_source(scenario).check()
 
 
-def linear_case(seed: int, spread: float) -> tuple[np.ndarray, ...]:
-    """Strains that are linear in the state: base (G), slopes (F, G), draws' offsets (E, G)."""
-    random = np.random.default_rng(seed)
-    return (
-        random.uniform(500e-6, 3000e-6, 24),
-        random.uniform(0.0, 2000e-6, (2, 24)),
-        spread * random.standard_normal((4, 24)),
-    )
-
-
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), spread=st.sampled_from([0.0, 30e-6]))
 def test_the_bias_of_a_linear_model_is_that_of_least_squares(seed, spread):
     """Where everything is linear the bias is exact: whiten by the covariance, and solve by lstsq."""
-    scenario = load_scenario("level_turns").scenario
+    scenario, random = load_scenario("level_turns").scenario, np.random.default_rng(seed)
     model = build_graphical_model(scenario)
-    base, slopes, offsets = linear_case(seed, spread)
-    offsets = offsets - offsets.mean(axis=0)
+    base, slopes = random.uniform(500e-6, 3000e-6, 24), random.uniform(0.0, 2000e-6, (2, 24))
+    offsets, wrong = spread * random.standard_normal((4, 24)), 60e-6 * random.standard_normal(24)
+    offsets -= offsets.mean(axis=0)
     factor = np.array([control.values["load_factor"] for control in scenario.control]) / 3.0
     table = (base + model.states.coordinates @ slopes)[None, :, None, :] + offsets[:, None, None, :]
     sensors = GaussianSensorModel(table * factor[:, None], 125e-6)
-    wrong = 60e-6 * np.random.default_rng(seed + 1).standard_normal(24)
 
     def observe(control: Any, health: Any) -> AssetReading:
         scale = control["load_factor"] / 3.0
@@ -114,7 +95,6 @@ def test_the_bias_of_a_linear_model_is_that_of_least_squares(seed, spread):
 
     misfit = find_misfit(scenario, model, sensors, StatelessAsset(observe))
     np.testing.assert_allclose(misfit.difference, np.broadcast_to(wrong * factor[:, None], (25, 2, 24)))
-    np.testing.assert_allclose(misfit.bias, misfit.bias_per_sensor.sum(axis=-1))
     for control, scale in enumerate(factor):
         covariance = 125e-6**2 * np.eye(24) + scale**2 * offsets.T @ offsets / 4
         root = np.linalg.cholesky(covariance)
@@ -122,12 +102,10 @@ def test_the_bias_of_a_linear_model_is_that_of_least_squares(seed, spread):
             np.linalg.solve(root, scale * slopes.T), np.linalg.solve(root, -scale * wrong), rcond=None
         )
         np.testing.assert_allclose(misfit.bias[7, control], expected, rtol=1e-6, atol=1e-9)
-    relative = wrong / (base - wrong)
-    np.testing.assert_allclose(misfit.relative[0, 1], relative)
+    np.testing.assert_allclose(misfit.relative[0, 1], wrong / (base - wrong))
     largest, sensor = misfit.largest
     assert largest == pytest.approx(np.abs(misfit.relative).max())
     assert np.abs(misfit.relative[..., sensor]).max() == pytest.approx(largest)
-    assert misfit.rms == pytest.approx(np.sqrt(np.mean(misfit.per_sensor**2)))
 
 
 @settings(deadline=None)
@@ -154,181 +132,57 @@ def test_the_credible_set_by_enumeration(weights, truth):
     assert found.tolist() == [expected]
 
 
-def test_standard_errors_of_a_study():
-    random = np.random.default_rng(1)
-    error = random.standard_normal((50, 2))
-    study = Outcomes.of(
-        {
-            "status": np.ones(50),
-            "delay": np.r_[np.ones(40), np.full(5, np.inf), np.full(5, np.nan)],
-            "early": np.arange(50) < 10,
-            "mean": error[:, None] + 1.0,
-            "state": np.ones((50, 1, 2)),
-            "log_evidence": np.full((50, 1), 3.0),
-            "credible": np.r_[np.zeros(25), np.ones(25)],
-        }
-    )
-    assert study.within.value == pytest.approx(40 / 45)
-    assert study.within.error == pytest.approx(scipy.stats.beta(41, 6).std())
-    assert study.early.error == pytest.approx(scipy.stats.beta(11, 41).std())
-    assert study.evidence.value == 3.0
-    assert study.evidence.error == 0.0
-    assert study.credible.error == pytest.approx(0.5 / 7.0)
-    again = [np.sqrt(np.mean(random.choice(error[:, 0], 50) ** 2)) for _ in range(4000)]
-    assert study.rms[0].value == pytest.approx(np.sqrt(np.mean(error[:, 0] ** 2)))
-    assert study.rms[0].error == pytest.approx(np.std(again), rel=0.1)  # the bootstrap
-    assert study.bias[1].value == pytest.approx(error[:, 1].mean())
-
-
 def test_a_model_error_reaches_the_twin(library_file, tmp_path):
-    """A twin that doubts its model trusts an observation less, and its run says what it assumed."""
-    path = written(tmp_path, TEXT, (MODEL + DESIGN, ITSELF), ("# model_error_percent", "model_error_percent"))
-    doubting = resolved(library_file, path)
-    assert doubting.observation.model_error == pytest.approx(0.03)
-    certain = resolved(library_file, written(tmp_path, TEXT, (MODEL + DESIGN, ITSELF)))
-    spread = []
-    for scenario in (certain, doubting):
-        source = asset_source(scenario)
-        knowledge = prepare_knowledge(scenario, source, 1)
-        observation = source.open().step({"load_factor": 3.0}, {"z1": 0.0, "z2": 0.0}).values
-        model, belief = knowledge.model, knowledge.sensor_model.log_likelihood(observation, 1)
-        weights = np.exp(belief - belief.max())
-        spread.append(model.states.standard_deviation(weights / weights.sum()))
-    assert np.all(spread[1] > spread[0])
-    each = [float(value) for value in range(24)]
-    listed = written(tmp_path, TEXT, ("# model_error_percent = 3", f"model_error_percent = {each}"))
-    scenario = load_scenario(listed).scenario
-    np.testing.assert_allclose(scenario.observation.model_error, np.arange(24) / 100.0)
+    """A twin that doubts its model trusts each sensor less, by a share of what it predicts."""
+    percent = [float(value) for value in range(24)]
+    listed = ("# model_error_percent = 3", f"model_error_percent = {percent}\nbetween_levels = false")
+    scenario = resolved(library_file, written(tmp_path, TEXT, (MODEL + DESIGN, ITSELF), listed))
+    sensors = prepare_knowledge(scenario, asset_source(scenario), 1).sensor_model
+    expected = np.hypot(125e-6, np.arange(24) / 100.0 * sensors.mean)
+    np.testing.assert_allclose(sensors.total_standard_deviation, expected, rtol=1e-12)
     assert Scenario.model_validate(scenario.to_dict()) == scenario
-
-
-def library_of(wing: ReducedModel, scale: np.ndarray, path: Path) -> Path:
-    """Write a library of a wing whose gauges show `scale` times what its model says at e = 1.0073."""
-    content, draws = synthetic_library(), {"mean": 1.0073, "1.0": 1.0, "1.01": 1.01}
-    cells: Any = content["observations"]
-    for (z1, row), load in product(cells.items(), (2, 3)):
-        for z2, cell in row.items():
-            loss = (int(z1) / 100, int(z2) / 100)
-            strains = {
-                name: wing.static_response(
-                    young_modulus_factor=e, stiffness_loss=loss, load_factor=load
-                ).strain
-                for name, e in draws.items()
-            }
-            cell[f"{load}g"] = {name: (1e6 * scale * strain).tolist() for name, strain in strains.items()}
-    path.write_text(json.dumps(content), encoding="utf-8")
-    return path
-
-
-@pytest.fixture(scope="module")
-def scale() -> np.ndarray:
-    scale = 1.0 + 0.03 * np.random.default_rng(6).standard_normal(24)
-    scale[22] = 0.9
-    return scale
-
-
-@pytest.fixture(scope="module")
-def twisted(wing: ReducedModel, scale: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return library_of(wing, scale, tmp_path_factory.mktemp("library") / "UAVconfig.json")
+    one = load_scenario(written(tmp_path, TEXT, ("# model_error_percent", "model_error_percent"))).scenario
+    assert one.observation.model_error == pytest.approx(0.03)
 
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-class TestOnTheWing:
-    """The shipped wing's model believed, and libraries of wings that differ from it by a known share."""
-
-    def sources(self, wing: ReducedModel, library: Path) -> tuple[Scenario, ReducedModelSource, PairedSource]:
-        scenario = load_scenario("level_turns").scenario
-        own = ReducedModelSource(scenario, wing)
-        flown = StrainLibrarySource(scenario, load_strain_library(library))
-        return scenario, own, PairedSource(flown, own)
-
-    def test_a_library_of_the_same_wing_is_no_mismatch(self, wing, tmp_path):
-        library = library_of(wing, np.ones(24), tmp_path / "UAVconfig.json")
-        scenario, own, mixed = self.sources(wing, library)
-        knowledge = prepare_knowledge(scenario, mixed, 1)
-        np.testing.assert_array_equal(
-            knowledge.sensor_model.value_per_draw,
-            prepare_knowledge(scenario, own, 1).sensor_model.value_per_draw,
-        )
-        misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
-        # All that is left is the mean of e, which is not quite 1.0073: strains go with 1 / e at most.
-        mean = own.draws(1).mean
-        assert misfit.rms < 1.2 * abs(mean / 1.0073 - 1.0) + 1e-5
-        assert np.abs(misfit.bias).max() < 0.01
-
-    def test_the_misfit_is_what_was_put_in_and_the_estimate_goes_where_it_says(self, wing, twisted, scale):
-        scenario, own, mixed = self.sources(wing, twisted)
-        knowledge = prepare_knowledge(scenario, mixed, 0)
-        misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
-        np.testing.assert_allclose(
-            1.0 + misfit.relative, np.broadcast_to(1.0 / scale, (25, 2, 24)), rtol=1e-3
-        )
-        assert misfit.largest[1] == int(np.argmax(np.abs(1.0 / scale - 1.0)))
-        seeds = range(12)
-        right, wrong = (fly_seeds(scenario, source, seeds, calibration_seed=0) for source in (own, mixed))
-        assert wrong.evidence.value < right.evidence.value - 1.0
-        assert wrong.rms[1].value > right.rms[1].value + 0.02
-        expected = misfit.bias[knowledge.model.states.index((0.2, 0.4)), 1]
-        assert np.abs(expected[1]) > 0.05
-        assert np.sign(wrong.bias[1].value) == np.sign(expected[1])
-        assert wrong.credible.value < right.credible.value
-
-    def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(self, wing, tmp_path):
-        """A region that is not named is healthy, for the twin, the FMU that flies and the field."""
-        strains = '[observation.strain]\nvariables = "strain[{1..24}]"\nunit = "1"'
-        for role, variables, changes in (
-            ("strain", "", {}),
-            ("displacement", '["tip_displacement"]', {"count": 1, "unit": "m", "standard_deviation": 0.1}),
-            ("frequency", '"frequency[{1..3}]"', {"count": 3, "unit": "Hz", "standard_deviation": 0.1}),
-        ):
-            table = table_of("level_turns") | {"reference": []}
-            table["state"], table["calibration"]["draws"] = table["state"][:1], 3
-            table["truth"]["gains"] = table["truth"]["gains"][:3]
-            if changes:
-                table["observation"] = {"role": role, **changes}
-                table["rewards"] |= {"health_limit": 100.0, "error_scale": 1.0}
-                del table["rewards"]["health_limit_microstrain"], table["rewards"]["error_scale_microstrain"]
-                table["truth"]["noise"] = {"standard_deviation": 0.1}
-                own = f'[observation.{role}]\nvariables = {variables}\nunit = "{changes["unit"]}"'
-                bound = edited(binding_files()["uav_wing"].read_text(), (strains, own))
-                table["asset"] |= {"binding": str(written(tmp_path, bound, name=f"{role}.toml"))}
-            table["asset"]["isolated"] = False
-            scenario = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
-            source, model = asset_source(scenario), build_graphical_model(scenario)
-            source.check()
-            source.prepare(tmp_path / role, SilentProgress())
-            draws = source.draws(0)
-            found = source.observation_table(draws, model)
-            flown, health, control = source.open(), {"z1": 0.4}, {"load_factor": 3.0}
-            shown, state = flown.step(control, health).values, model.states.index((0.4,))
-            flown.close()
-            for e, row in zip((*draws.values, 1.0073), (*found[:, state, 1], shown), strict=True):
-                losses = {"young_modulus_factor": e, "stiffness_loss": (0.4, 0.0)}
-                static, modes = wing.static_response(load_factor=3.0, **losses), wing.modes(**losses)
-                full = {"strain": static.strain, "displacement": static.displacement}
-                np.testing.assert_allclose(row, full.get(role, modes.frequency[:3]), rtol=1e-9)
-            assert source.write_field(tmp_path / "wing.vtu", health, control)
-        table["belief"]["patch"] = str(written(tmp_path, PATCH, name="patch.json"))
-        patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
-        with pytest.raises(MissionInputError, match="predicts strains, and `frequency`"):
-            asset_source(patched).check()
-
-
-@pytest.mark.long
-def test_the_twin_may_believe_a_calibrated_wing(library_file, tmp_path, make_calibration):
-    file = save_calibration(make_calibration(), tmp_path / "wing.nc")
-    overrides = Overrides(strain_library=library_file, calibration=file)
-    scenario = resolve_scenario(load_scenario("model_mismatch"), overrides)
-    source = asset_source(scenario)
-    source.check()
-    assert source.origin.differ
-    assert sorted(source.files()) == ["asset/UAVconfig.json", "asset/calibration.nc"]
-    (tmp_path / "run" / "asset").mkdir(parents=True)
-    hashes = source.prepare(tmp_path / "run", SilentProgress())
-    assert {"strain_library", "calibration", "design"} <= {*hashes}
-    assert hashes["design"] == load_calibration(file).design_hash
-    found = source.draws(3)
-    assert found.mean == load_calibration(file).mean("young_modulus_factor")
-    with pytest.raises(MissionInputError, match="brings its own samples"):
-        resolve_scenario(load_scenario("level_turns"), overrides)
+def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(wing, tmp_path):
+    """A region that is not named is healthy, for the twin, the FMU that flies and the field."""
+    strains = '[observation.strain]\nvariables = "strain[{1..24}]"\nunit = "1"'
+    for role, variables, changes in (
+        ("strain", "", {}),
+        ("displacement", '["tip_displacement"]', {"count": 1, "unit": "m", "standard_deviation": 0.1}),
+        ("frequency", '"frequency[{1..3}]"', {"count": 3, "unit": "Hz", "standard_deviation": 0.1}),
+    ):
+        table = table_of("level_turns") | {"reference": []}
+        table["state"], table["calibration"]["draws"] = table["state"][:1], 3
+        table["truth"]["gains"] = table["truth"]["gains"][:3]
+        if changes:
+            table["observation"] = {"role": role, **changes}
+            table["rewards"] |= {"health_limit": 100.0, "error_scale": 1.0}
+            del table["rewards"]["health_limit_microstrain"], table["rewards"]["error_scale_microstrain"]
+            table["truth"]["noise"] = {"standard_deviation": 0.1}
+            own = f'[observation.{role}]\nvariables = {variables}\nunit = "{changes["unit"]}"'
+            bound = edited(binding_files()["uav_wing"].read_text(), (strains, own))
+            table["asset"] |= {"binding": str(written(tmp_path, bound, name=f"{role}.toml"))}
+        table["asset"]["isolated"] = False
+        scenario = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
+        source, model = asset_source(scenario), build_graphical_model(scenario)
+        source.check()
+        source.prepare(tmp_path / role, SilentProgress())
+        draws = source.draws(0)
+        found = source.observation_table(draws, model)
+        flown, health, control = source.open(), {"z1": 0.4}, {"load_factor": 3.0}
+        shown, state = flown.step(control, health).values, model.states.index((0.4,))
+        flown.close()
+        for e, row in zip((*draws.values, 1.0073), (*found[:, state, 1], shown), strict=True):
+            losses = {"young_modulus_factor": e, "stiffness_loss": (0.4, 0.0)}
+            static, modes = wing.static_response(load_factor=3.0, **losses), wing.modes(**losses)
+            full = {"strain": static.strain, "displacement": static.displacement}
+            np.testing.assert_allclose(row, full.get(role, modes.frequency[:3]), rtol=1e-9)
+        assert source.write_field(tmp_path / "wing.vtu", health, control)
+    table["belief"]["patch"] = str(written(tmp_path, PATCH, name="patch.json"))
+    patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
+    with pytest.raises(MissionInputError, match="predicts strains, and `frequency`"):
+        asset_source(patched).check()

@@ -60,11 +60,6 @@ def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str
     )
 
 
-def test_a_patch_is_not_dropped_where_another_fmu_is_flown(tmp_path):
-    with pytest.raises(MissionInputError, match=r"`asset\.patch` goes into the FMU"):
-        resolve_scenario(load_scenario(scenario_of(tmp_path, PATCH)), Overrides(fmu=tmp_path / "other.fmu"))
-
-
 @pytest.mark.parametrize(
     ("primitive", "words"),
     [(LocalStiffnessLoss(0.3, end, 0.3), "m from the root, and the wing is 1.828 m long") for end in (5, -1)]
@@ -92,6 +87,8 @@ def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):
         scenario = scenario_of(tmp_path, lines, parameters, belief)
         assert words in refused("run", scenario, "--out", tmp_path / "run")
         assert not (tmp_path / "run").exists()
+    with pytest.raises(MissionInputError, match=r"`asset\.patch` goes into the FMU"):
+        resolve_scenario(load_scenario(scenario_of(tmp_path, PATCH)), Overrides(fmu=tmp_path / "other.fmu"))
 
 
 def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path):

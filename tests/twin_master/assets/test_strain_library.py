@@ -40,6 +40,8 @@ def loaded(folder: Path, content: object) -> StrainLibrary:
 
 
 def test_published_format(tmp_path):
+    with pytest.raises(MissionInputError, match="cannot be read"):
+        load_strain_library(tmp_path)
     library = loaded(tmp_path, small_content())
     assert library.controls == ("2g", "3g")
     assert library.states.shape == (3, 2)
@@ -77,25 +79,19 @@ def test_between_the_levels_strain_is_multilinear(tmp_path):
         (lambda content: cell(content, "0.99").pop(), r"\[20\]\[0\]\[3g\]\[0.99\] must hold 3 finite"),
         (lambda content: cell(content, "mean").__setitem__(1, float("nan")), "NaN is no number in JSON"),
         (lambda content: content.update(states=LEVELS[:1]), "levels of 2 regions"),
+        (lambda _: '{"states": [[0', "not valid JSON"),
+        (lambda _: "[1, 2]", "not in the published format"),
     ],
 )
-def test_an_incomplete_library_is_refused(tmp_path, change, sentence):
+def test_an_incomplete_or_damaged_library_is_refused(tmp_path, change, sentence):
     content = small_content()
-    change(content)
+    damaged = change(content)
     with pytest.raises(MissionInputError, match=sentence):
-        loaded(tmp_path, content)
+        loaded(tmp_path, damaged if isinstance(damaged, str) else content)
 
 
 def cell(content: dict[str, Any], draw: str) -> list[float]:
     return content["observations"]["20"]["0"]["3g"][draw]
-
-
-def test_a_missing_or_damaged_file_is_refused(tmp_path):
-    with pytest.raises(MissionInputError, match="cannot be read"):
-        load_strain_library(tmp_path)
-    for text, words in (('{"states": [[0', "not valid JSON"), ("[1, 2]", "not in the published format")):
-        with pytest.raises(MissionInputError, match=words):
-            loaded(tmp_path, text)
 
 
 def test_what_is_known_of_the_published_library(published_library):

@@ -1,12 +1,9 @@
 """The wing FMU on the test bench against the reduced model on the same bench."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
-from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.structure_fmu import build_fmu
@@ -24,12 +21,8 @@ TRUTH = DigitalState(
 )
 
 
-@pytest.fixture(scope="module")
-def fmu(wing: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_fmu(wing, tmp_path_factory.mktemp("bench") / "wing.fmu").path
-
-
-def test_the_fmu_is_measured_as_the_model_is(wing, fmu):
+def test_the_fmu_is_measured_as_the_model_is(wing, tmp_path):
+    fmu = build_fmu(wing, tmp_path / "wing.fmu").path
     model = VirtualWing(wing, TRUTH)
     with FmuTestBench(fmu, TRUTH) as bench:
         ours, theirs = measure_load_test(model, 7), measure_load_test(bench, 7)
@@ -42,9 +35,6 @@ def test_the_fmu_is_measured_as_the_model_is(wing, fmu):
             np.testing.assert_array_equal(seen.time, expected.time)
             scale = np.abs(expected.signal).max()
             np.testing.assert_allclose(seen.signal, expected.signal, atol=1e-10 * scale)
-
-
-def test_bad_input(fmu):
     heavy = DigitalState(servo_mass=2.0)
     with pytest.raises(FmuError, match="servo_mass"), FmuTestBench(fmu, heavy) as bench:
         bench.tip_displacement(1.0)

@@ -18,11 +18,13 @@ from tests.twin_master.runs import check_same, edited, text_of, written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderError
 from twin_master.fleet import flight
-from twin_master.fleet.command import engine_of
+from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.reading import Estimated, group_figures
+from twin_master.fleet.reading import Outcomes, group_figures
+from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.shard import Engine, unflown
 from twin_master.fleet.store import _fallbacks
+from twin_master.fleet_command import engine_of
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.side_by_side import Flights
 from twin_master.store.writing import open_run
@@ -40,11 +42,10 @@ def whole(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fly_fleet(growing(library_file), tmp_path_factory.mktemp("whole") / "fleet").folder
 
 
-def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
-    given = Overrides(strain_library=library_file)
-    outcome = fly_fleet(ensemble("level_turns", range(2020, 2023), given), tmp_path / "many")
-    group = open_fleet(str(outcome.folder))["level_turns"]
-    tree = open_run(new_run("level_turns", tmp_path / "one", given, report=False).folder)
+def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_path):
+    given = Overrides(strain_library=library_file, seed=7)
+    group = open_fleet(str(whole))["growing_damage"]
+    tree = open_run(new_run("growing_damage", tmp_path / "one", given, report=False).folder)
     row = group["seed"].values.tolist().index(int(tree.attrs["seed"]))
     for ours, (part, name) in {
         "observed": ("observed", "strain"),
@@ -54,6 +55,9 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
     }.items():
         single = tree[part].to_dataset()[name].values
         assert np.array_equal(group[ours].values[row], single.astype(group[ours].dtype)), ours
+    figures, study = group_figures(group), Outcomes.of(group)
+    names = "log evidence of a step", "filtered rms error of z2", "bias of z2"
+    assert [figures[name] for name in names] == [study.evidence, study.rms[1], study.bias[1]]
 
 
 def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
@@ -109,8 +113,9 @@ def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
     (tmp_path / "other" / "thesis.txt").touch()
     with pytest.raises(RunFolderError, match="there is no folder"):
         open_fleet(tmp_path / "nowhere")
-    with pytest.raises(RunFolderError, match="not the folder of a fleet"):
-        open_fleet(tmp_path / "other")
+    for opened in (open_fleet, learn_fleet, write_fleet_report):
+        with pytest.raises(RunFolderError, match="not the folder of a fleet"):
+            opened(tmp_path / "other")
     with pytest.raises(RunFolderError, match="not touched"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(other, folder, replace_old=True).twins == 3
@@ -141,6 +146,11 @@ def test_a_twin_has_a_seed_of_its_own_whatever_else_flies(fleet_file):
     assert changed(fleet_file, seed=6).groups[0].members[0].seed != seeds[0]
     assert fleet.groups[1].scenarios[0].mission.steps == 9
     assert fleet.groups[0].scenarios[0].mission.seed == 5
+    slow = ("steps = 9", 'true_probability = { "2g" = 0.0, "3g" = 0.0 }')
+    scenario = changed(fleet_file, slow).groups[1].scenarios[0]  # true rates may differ from those believed
+    assert scenario.truth.probability == {"2g": 0.0, "3g": 0.0}
+    assert scenario.transition.probability == {"2g": 0.05, "3g": 0.1}
+    assert fleet.groups[1].scenarios[0].truth.probability == {}
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("fleet"))
@@ -194,19 +204,6 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
     assert outcome.failures == failures
     (outcome.folder / "journal.jsonl").unlink()
     assert flight.told_of(outcome.folder) == {"failures": failures, "ended": {}}
-
-
-def test_figures_are_those_of_the_flights(whole):
-    group = open_fleet(whole)["growing_damage"]
-    figures, error = group_figures(group), (group["mean"] - group["state"]).values[..., 1]
-    for name, expected in (
-        ("log evidence of a step", group["log_evidence"].values.mean()),
-        ("filtered rms error of z2", np.sqrt(np.mean(error**2))),
-        ("bias of z2", error.mean()),
-    ):
-        found = figures[name]
-        assert isinstance(found, Estimated)
-        assert found.value == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():

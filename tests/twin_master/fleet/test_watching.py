@@ -1,10 +1,9 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
 import json
-import re
 import shutil
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from http.client import HTTPConnection
 from pathlib import Path
@@ -23,18 +22,19 @@ from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import ensemble, load_fleet
-from twin_master.fleet.reading import attention, group_figures, leaving
+from twin_master.fleet.reading import group_figures, leaving
 from twin_master.fleet.report import WORST, fleet_page, serve_fleet, write_fleet_report
 from twin_master.fleet.shard import Engine
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.preparation import kept_knowledge
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begun_watch
 from uav_twin import fly_fleet, learn_from_fleet, load_scenario, open_fleet
 
 TURNS = 6
+FLOWN = [1, 1, 1, 1, 1, 0]
+"""Control of each turn: what the last one does to the wing nobody sees."""
 LOGS = 'observations = "logs/*.csv"'
 Decision = Mapping[str, Any]
 
@@ -49,7 +49,7 @@ def fleet_file(library_file: Path, tmp_path: Path) -> Path:
     (tmp_path / "logs").mkdir()
     noise = np.random.default_rng(3).normal(1e-3, 1e-4, (3, TURNS, 24))
     for number, rows in enumerate(noise):
-        write_csv(log_of(tmp_path, number), rows, np.ones(TURNS, dtype=int), number == 1)
+        write_csv(log_of(tmp_path, number), rows, np.array(FLOWN), number == 1)
     lines = log_of(tmp_path, 2).read_text().splitlines()
     lines[3], lines[4] = lines[4], lines[3]
     log_of(tmp_path, 2).write_text("\n".join(lines) + "\n")
@@ -133,19 +133,6 @@ def test_files_that_grow(fleet_file, alone, tmp_path, monkeypatch):
     fleet = FleetWatch(growing, tmp_path / "out", lambda *_: None, print, follow=True)
     fleet.run(grow)
     assert journals(tmp_path / "out") == alone
-
-
-def test_an_asset_is_lost_alone(fleet_file, alone, tmp_path):
-    for name, text in (("wing-0", "turn,colour\n0,red\n"), ("not a name!", "turn\n"), ("void", "")):
-        (tmp_path / "logs" / f"{name}.csv").write_text(text)
-    failures = watched(fleet_file, tmp_path / "out").failures
-    assert set(failures) == {"north/wing-0", "north/not a name!", "north/void"}
-    assert "colour" in failures["north/wing-0"]
-    assert "void.csv is empty" in failures["north/void"]
-    assert journals(tmp_path / "out") == alone[1:]
-    for line, words in ((LOGS.replace("logs", "none"), "no recording fits"), ("count = 2", "north has none")):
-        with pytest.raises(FleetError, match=words):
-            FleetWatch(load_fleet(fleet_of(tmp_path, line)), tmp_path / "none", print, print)
 
 
 @pytest.fixture
@@ -357,7 +344,7 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     group = open_fleet(outcome.folder)["north"]
     for row, turns in enumerate((3, TURNS, TURNS)):
         last = {record["turn"]: record for record in journal(tmp_path / "alone" / f"wing-{row}")}
-        assert group["control_index"].values[row].tolist() == [1] * turns + [-1] * (TURNS - turns)
+        assert group["control_index"].values[row].tolist() == FLOWN[:turns] + [-1] * (TURNS - turns)
         assert np.isnan(group["log_evidence"].values[row, turns:]).all()
         assert np.array_equal(group["belief"].values[row], np.array(last[turns - 1]["filtered"], np.float32))
         for turn in range(turns):
@@ -427,68 +414,54 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     assert [again.assets[asset.name].record()["leaving"] for asset in assets] == pytest.approx(found)
 
 
-def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
-    flown = ensemble(str(tmp_path / "wing.toml"), range(60))
-    fly_fleet(flown, tmp_path / "flown", Engine(0))
-    group = open_fleet(tmp_path / "flown")["growing_damage"]
-    kept = tmp_path / "flown" / "groups" / "growing_damage" / "0"
-    knowledge = kept_knowledge(kept, flown.groups[0].scenarios[0])
-    belief, control = group["belief"].values.astype(float), group["control_index"].values[:, -1]
-    soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(belief, control, strict=True)]
-    # Who leaves with the same percentage comes by its state.
-    printed = np.rint(100.0 * np.maximum(soon, 0.0))
-    worst = np.lexsort((-group["mean"].values[:, -1].astype(float).sum(axis=1), -printed))
-    assert max(soon) > min(soon) + 0.1
-    assert len(set(printed)) < len(set(soon))
-    table = fleet_page(tmp_path / "flown", WORST).partition("Who needs attention next")[2]
-    assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]
-    with pytest.raises(RunFolderError, match="not the folder of a fleet"):
-        fleet_page(tmp_path, WORST)
+def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, alone, tmp_path):
+    for name, text in {
+        "wing-0": "turn,colour\n0,red\n", "not a name!": "turn\n", "void": "", "wing-9": "turn,control\n"
+    }.items():  # fmt: skip
+        (tmp_path / "logs" / f"{name}.csv").write_text(text)
+    failures = watched(fleet_file, tmp_path / "out").failures
+    assert set(failures) == {"north/wing-0", "north/not a name!", "north/void"}
+    assert "colour" in failures["north/wing-0"]
+    assert "void.csv is empty" in failures["north/void"]
+    assert journals(tmp_path / "out")[:2] == alone[1:]
+    for line, words in ((LOGS.replace("logs", "none"), "no recording fits"), ("count = 2", "north has none")):
+        with pytest.raises(FleetError, match=words):
+            FleetWatch(load_fleet(fleet_of(tmp_path, line)), tmp_path / "none", print, print)
 
-
-@pytest.fixture
-def served(fleet_file: Path, tmp_path: Path) -> Iterator[Callable[..., tuple[int, str]]]:
-    """What asks for a page of a watched fleet, of which an asset is lost and another silent."""
-    log_of(tmp_path, 0).write_text("turn,colour\n0,red\n")
-    log_of(tmp_path, 9).write_text("turn,control\n")
-    watched(fleet_file, tmp_path / "out")
-    address, ended = Queue[str](), Event()
+    address, ended, file = Queue[str](), Event(), tmp_path / "out" / "watched.json"
     given = (tmp_path / "out", 0, address.put, lambda: not ended.is_set())
     serving = Thread(target=serve_fleet, args=given)
     serving.start()
     port = int(address.get(timeout=20).rstrip("/").rpartition(":")[2])
 
-    def asked(path: str, host: str = "localhost") -> tuple[int, str]:
+    def served(path: str, host: str = "localhost") -> tuple[int, str]:
         connection = HTTPConnection("127.0.0.1", port, timeout=20)
         connection.request("GET", path, headers={"Host": host})
         with closing(connection), connection.getresponse() as answer:
             return answer.status, answer.read().decode()
 
-    yield asked
-    ended.set()
-    serving.join()
-
-
-def test_the_page_of_a_fleet(served, tmp_path):
-    status, page = served("/")
-    assert status == 200
-    for words in (
-        "wing-1",
-        "colour",  # why the other one is not watched
-        "1 of 4 assets are not watched",
-        "Without a turn yet: 1 asset (north/wing-9)",
-        "<strong>1</strong><span>messages refused",
-    ):
-        assert words in page
-    assert served("/version") == (200, "0")
-    assert served("/", "evil.example")[0] == 404
-    file = tmp_path / "out" / "watched.json"
-    state = json.loads(file.read_text())
-    asset = state["assets"]["north/wing-1"]
-    asset["alarms"] = 1234
-    file.write_text(json.dumps(state))
-    wait_until(lambda: served("/version") == (200, "1"))
-    assert "1234" in served("/")[1]
+    try:
+        status, page = served("/")
+        assert status == 200
+        for words in (
+            "wing-1",
+            "colour",  # why that one is not watched
+            "3 of 6 assets are not watched",
+            "Without a turn yet: 1 asset (north/wing-9)",
+            "<strong>1</strong><span>messages refused",
+        ):
+            assert words in page
+        assert served("/version") == (200, "0")
+        assert served("/", "evil.example")[0] == 404
+        state = json.loads(file.read_text())
+        asset = state["assets"]["north/wing-1"]
+        asset["alarms"] = 1234
+        file.write_text(json.dumps(state))
+        wait_until(lambda: served("/version") == (200, "1"))
+        assert "1234" in served("/")[1]
+    finally:
+        ended.set()
+        serving.join()
     del asset["last"]["health"]
     file.write_text(json.dumps(state))
     with pytest.raises(FleetError, match="out is damaged or of another version"):

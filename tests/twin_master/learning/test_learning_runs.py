@@ -3,7 +3,6 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,10 +26,15 @@ from twin_master.scenario.tables import Noticing
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
-from uav_twin import ExactFilter, load_scenario, prepare_twin
+from uav_twin import load_scenario, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
+SHORT = (
+    ("steps = 50", f"steps = {TURNS}"),
+    ("draws = 60", "draws = 8"),
+    ("count = 24\n", "count = 24\nbetween_levels = false\n"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +42,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     offsets = [50.0] * 23 + [0.0]
     learnt = f"gauge_gain_percent = 2\ngauge_offset_microstrain = {offsets}\n"
     learnt += "transition_factors = [0.5, 1, 2]\n"
-    changes = ("steps = 50", f"steps = {TURNS}"), ("draws = 60", "draws = 8")
-    levels = ("count = 24\n", "count = 24\nbetween_levels = false\n")
-    text = text_of("level_turns_learning", *changes, levels, ("[learning]\n", "[learning]\n" + learnt))
+    text = text_of("level_turns_learning", *SHORT, ("[learning]\n", "[learning]\n" + learnt))
     return written(tmp_path_factory.mktemp("learnt"), text)
 
 
@@ -61,26 +63,16 @@ def learnt(run: xr.DataTree) -> xr.Dataset:
     return run["learnt"].to_dataset()
 
 
-@pytest.fixture(scope="module")
-def summary(folder: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return record
-
-
-def value_of(learnt: xr.Dataset, name: str, moment: str) -> np.ndarray[Any, Any]:
-    base, _, sensor = name.rstrip("]").partition("[")
-    values = learnt[f"{base}_{moment}"]
-    return (values.sel(sensor=int(sensor)) if sensor else values).values
-
-
 def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
     lines = [line["learnt"] for line in journal(folder)]
     assert len(lines) == TURNS
     assert len(lines[0]) == 1 + 1 + 24 + 24 + 23  # parameter, transitions, noise, gain, offset
     for name in lines[0]:
+        base, _, sensor = name.rstrip("]").partition("[")
         for moment in MOMENTS:
+            kept = learnt[f"{base}_{moment}"]
             told = [line[name][moment] for line in lines]
-            np.testing.assert_array_equal(value_of(learnt, name, moment), told)
+            np.testing.assert_array_equal(kept.sel(sensor=int(sensor)) if sensor else kept, told)
     assert np.isnan(learnt["gauge_offset_mean"].sel(sensor=24)).all()
     assert learnt["gauge_offset_prior_upper"].sel(sensor=1) > 0
     for variable in learnt.data_vars.values():
@@ -88,7 +80,7 @@ def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
         assert variable.attrs["long_name"]
 
 
-def test_the_prior_is_that_of_the_scenario(learnt, run):
+def test_prior_and_truth_are_those_of_the_scenario(learnt, run):
     draws = run["calibration"]["draw_value"].values
     mean, wide = (learnt[f"young_modulus_factor_prior_{name}"].item() for name in MOMENTS[:2])
     assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())  # between the draws as well
@@ -102,9 +94,6 @@ def test_the_prior_is_that_of_the_scenario(learnt, run):
     np.testing.assert_allclose(noise, [mean, wide, *np.sqrt(squared.ppf([0.05, 0.95]))], rtol=1e-10)
     gain = float(learnt["gauge_gain_prior_standard_deviation"].sel(sensor=7))
     assert gain == pytest.approx(0.02 * np.sqrt(squared.mean()))
-
-
-def test_the_truth_stands_where_the_scenario_tells_it(run):
     truth = run["truth"].to_dataset()
     assert float(truth["young_modulus_factor"]) == 0.95
     np.testing.assert_allclose(truth["noise_scale"], 150 / 125)
@@ -121,7 +110,8 @@ def test_the_true_factor_is_that_of_the_true_probabilities(faster, truth):
     assert (factor.name, factor.truth) == ("transition_factor", truth)
 
 
-def test_the_summary_says_what_was_learnt_and_what_was_believed_before(scenario, folder, learnt, summary):
+def test_the_summary_says_what_was_learnt_and_what_was_believed_before(scenario, folder, learnt):
+    summary = json.loads((folder / "summary.json").read_text())
     figures = {figure["key"]: figure for figure in summary["figures"]}
     assert tuple(figures) == load_scenario(scenario).scenario.figure_names
     assert figures["young_modulus_factor_mean"]["value"] == learnt["young_modulus_factor_mean"].values[-1]
@@ -229,12 +219,6 @@ def test_a_watch_keeps_the_last_turns_of_what_it_learnt(scenario, folder, learnt
 TEXT, INPUTS = text_of("level_turns_learning"), Inputs(__file__)
 
 
-def test_without_the_table_the_filter_is_the_exact_one():
-    loaded = load_scenario("level_turns")
-    assert loaded.scenario.to_dict()["learning"] is None
-    assert isinstance(prepare_twin("paper_level_turns").twin().estimator, ExactFilter)
-
-
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("learning"))
 def test_what_cannot_be_learnt_or_noticed_is_refused_in_a_sentence(tmp_path, old, new, sentence):
     with pytest.raises(TwinMasterError, match=sentence):
@@ -256,47 +240,25 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
         off = name in ("paper_level_turns", "model_mismatch", "inspected_wing")
         assert loaded.scenario.notice == (None if off else Noticing()), name
         assert not loaded.remark
-        written = loaded.scenario.to_dict()
-        assert (written["notice"] is None) is off
-        assert parse_scenario(written, name).notice == loaded.scenario.notice  # as a run folder says it
-    text = scenario_files()["level_turns"].read_text()
-    file = tmp_path / "mine.toml"
-    for old, new, remark in (
-        ("[transition]", 'average_over_draws = "inside"\n[transition]', "each sensor has a parameter of"),
-        ("[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]", f"{[*range(90)]}\nprior = {[1] + [0] * 89}",
-         "they take 11,664,000 numbers a turn, more than 1,000,000"),
-    ):  # fmt: skip
-        file.write_text(text.replace(old, new))
-        assert load_scenario(file).scenario.notice is None
-        assert remark in load_scenario(file).remark
-        file.write_text(text.replace(old, new).replace("format = 2", "format = 2\nnotice = false"))
-        assert not load_scenario(file).remark
-
-
-def test_sensors_with_parameters_of_their_own_are_refused(tmp_path):
-    learning = TEXT[TEXT.index("[learning]") : TEXT.index("[notice]")]
-    inside = ("[transition]", 'average_over_draws = "inside"\n[transition]')
-    file = written(tmp_path, TEXT, (learning, ""), inside)
+        kept = loaded.scenario.to_dict()
+        assert (kept["notice"] is None) is off
+        assert parse_scenario(kept, name) == loaded.scenario  # as a run folder says it
+        assert loaded.scenario.mission.name == name
+    of_its_own = ("[transition]", 'average_over_draws = "inside"\n[transition]')
+    levels = "[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]"
+    many = [(levels, f"{[*range(90)]}\nprior = {[1] + [0] * 89}")] * 2
+    for changes, remark in (
+        ([of_its_own], "each sensor has a parameter of"),
+        (many, "they take 11,664,000 numbers a turn, more than 1,000,000"),
+    ):
+        text = text_of("level_turns", *changes)
+        loaded = load_scenario(written(tmp_path, text))
+        assert loaded.scenario.notice is None
+        assert remark in loaded.remark
+        assert not load_scenario(written(tmp_path, text, ("format = 2", "format = 2\nnotice = false"))).remark
+    asked = text_of("level_turns", of_its_own) + "[notice]\n"
     with pytest.raises(TwinMasterError, match=r"`notice` needs `observation.average_over_draws` `outside`"):
-        load_scenario(file)
-
-
-@pytest.fixture(scope="module")
-def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    changes = (
-        ("# What the figures", INPUTS.text("faults.toml") + "# What the figures"),
-        ("steps = 50", "steps = 9"),
-        ("draws = 60", "draws = 8"),
-    )
-    levels = ("count = 24\n", "count = 24\nbetween_levels = false\n")
-    return written(tmp_path_factory.mktemp("notice"), TEXT, *changes, levels)
-
-
-@pytest.fixture(scope="module")
-def noticed(spoilt: Path) -> Path:
-    run = spoilt.parent / "run"
-    (spoilt.parent / "said.txt").write_text(said("run", spoilt, "--out", run, "--no-report"))
-    return run
+        load_scenario(written(tmp_path, asked))
 
 
 def test_the_search_for_causes_is_named_for_a_wing_alone():
@@ -304,14 +266,14 @@ def test_the_search_for_causes_is_named_for_a_wing_alone():
         assert load_scenario(name).scenario.searchable is searched
 
 
-def test_the_console_names_turn_gauge_and_the_command(noticed):
-    text = (noticed.parent / "said.txt").read_text()
-    alarm = next(line for line in text.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
+def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_report(tmp_path):
+    faults = ("# What the figures", INPUTS.text("faults.toml") + "# What the figures")
+    spoilt, noticed = written(tmp_path, TEXT, *SHORT, faults), tmp_path / "run"
+    console = said("run", spoilt, "--out", noticed, "--no-report")
+    alarm = next(line for line in console.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
     assert f"to find the cause: uav-twin discrepancy run --from-run {noticed}" in alarm
-    assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in text
+    assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in console
 
-
-def test_journal_store_and_summary_agree(noticed):
     notices = json.loads((noticed / "summary.json").read_text())["notices"]
     assert {n["kind"] for n in notices} == {"gauge_left_out", "alarm", "hypothesis"}
     assert {(n["kind"], *n["sensors"]) for n in notices} >= {("gauge_left_out", 12), ("alarm", 5)}
@@ -321,9 +283,8 @@ def test_journal_store_and_summary_agree(noticed):
     for name, values in kept.data_vars.items():
         assert [line["suspicion"][name] for line in lines] == values.values.tolist()
     np.testing.assert_array_equal(kept["left_out"].sel(sensor=12), [0, 0, 0, 1, 1, 1, 1, 1, 1])
-    alarm = next(n["turn"] for n in notices if n["kind"] == "alarm")
     figures = figures_of(noticed)
-    assert figures["alarm_step"] == alarm
+    assert figures["alarm_step"] == next(n["turn"] for n in notices if n["kind"] == "alarm")
     assert figures["gauge_off"] == kept["gauge_off"].values[-1]
     decided = [line["suspicion"]["decided_by"] for line in lines]
     assert figures["decided_by"] == decided[-1]
@@ -333,11 +294,7 @@ def test_journal_store_and_summary_agree(noticed):
     assert told["none of these"] == pytest.approx(kept["none_of_these"].values[-1], rel=1e-12)
     assert sum(told.values()) == pytest.approx(1.0, abs=0.03)
 
-
-def test_the_report_has_the_alarm(noticed):
-    text = render_page(read_run(noticed), {}, {})
-    assert "gauge 5 shows too much" in text
-    decided = read_run(noticed).summary["figures"][-1]
-    assert decided["key"] == "decided_by"
-    assert f"what decides its control is: {decided['value']}" in text
-    assert "gauge 12 shows 1e+14 microstrain" in text
+    report = render_page(read_run(noticed), {}, {})
+    assert "gauge 5 shows too much" in report
+    assert f"what decides its control is: {figures['decided_by']}" in report
+    assert "gauge 12 shows 1e+14 microstrain" in report

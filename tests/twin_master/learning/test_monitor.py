@@ -13,9 +13,9 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.learning import switching
+from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.switching import at_first, one_turn_later
+from twin_master.learning.rivals import at_first, one_turn_later
 from twin_master.learning.words import Words
 from twin_master.mission.journal import line_of, turn_record
 from twin_master.mission.preparation import Knowledge
@@ -115,7 +115,7 @@ def test_shares_of_hypotheses_switch_as_their_chain_says():
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
     share = at_first(0.01, begins)
     np.testing.assert_allclose(np.exp(share), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
-    hazard, ends, chain = 0.03, switching.ENDS, np.zeros((7, 7))
+    hazard, ends, chain = 0.03, rivals.ENDS, np.zeros((7, 7))
     chain[0] = hazard * np.array([0.0, 0.0, 0.5, *[0.125] * 4])
     chain[0, 0] = 1.0 - hazard
     chain[1, [0, 2]], chain[1, 1] = (ends, 0.5 * hazard), 1.0 - ends - 0.5 * hazard
@@ -326,36 +326,31 @@ def fly(
     return estimates
 
 
+PLACES = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
+SEARCH = "; to find the cause: uav-twin discrepancy run --from-run DIR"
+
+
 @pytest.mark.parametrize(
-    ("gauge", "gain", "begin", "word"), [(5, 0.2, 0, "much"), (17, -0.2, 0, "little"), (3, 0.2, 15, "much")]
+    ("gauge", "gain", "begin", "words", "shows", "search"),
+    [
+        (5, 0.2, 0, None, "gauge 5 shows too much", SEARCH),
+        (17, -0.2, 0, PLACES, "gauge 17 (place 17) shows too little", ""),  # where none looks for causes
+        (3, 0.2, 15, None, "gauge 3 shows too much", SEARCH),
+    ],
 )
-def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, word):
+def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, words, shows, search):
     def spoil(turn: int, shown: Float) -> None:
         shown[gauge - 1] *= 1.0 + gain * (turn >= begin)
 
-    estimates = fly(wing, begin + 25, spoil)
-    alarms = [notice for estimate in estimates for notice in estimate.notices if notice.kind == "alarm"]
-    assert [alarm.sensors for alarm in alarms] == [(gauge,)]
-    assert alarms[0].kind == "alarm"
-    assert f"gauge {gauge} shows too {word}, " in alarms[0].sentence
-    command = alarms[0].sentence.split("to find the cause: ")[1]
-    turn = f" --from-turn {alarms[0].since}" if alarms[0].since else ""
-    assert command == f"uav-twin discrepancy run --from-run DIR{turn}"
-    assert abs(alarms[0].since - begin) <= 6
+    estimates = fly(wing, begin + 25, spoil, words)
+    (alarm,) = (notice for one in estimates for notice in one.notices if notice.kind == "alarm")
+    assert alarm.sensors == (gauge,)
+    assert f"{shows}, " in alarm.sentence
+    turn = f" --from-turn {alarm.since}" if alarm.since and search else ""
+    assert alarm.sentence.endswith(f"alarm from 100){search}{turn}")
+    assert abs(alarm.since - begin) <= 6
     assert not any(estimate.notices for estimate in estimates[:begin])
-    last = estimates[-1].suspicion
-    assert last.gauge_off > 0.5
-
-
-def test_an_alarm_names_no_command_where_none_looks_for_causes(wing):
-    def spoil(_turn: int, shown: Float) -> None:
-        shown[4] *= 1.3
-
-    words = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
-    told = (notice for estimate in fly(wing, 12, spoil, words) for notice in estimate.notices)
-    alarm = next(notice.sentence for notice in told if notice.kind == "alarm")
-    assert "gauge 5 (place 5) shows too much" in alarm
-    assert alarm.endswith("against the model, alarm from 100)")
+    assert estimates[-1].suspicion.gauge_off > 0.5
 
 
 def test_an_absurd_gauge_is_left_out_with_a_word(wing):

@@ -1,6 +1,5 @@
-"""Independent answers for tests of inference: enumeration, arbitrary precision, variable elimination."""
+"""Independent answers for tests of inference: arbitrary precision, variable elimination."""
 
-import itertools
 import logging
 import warnings
 from decimal import Decimal, localcontext
@@ -27,51 +26,8 @@ def random_model(rng, shape=(2, 2), zeros=0.4, product=False):
     return GraphicalModel(space, ("u0", "u1"), prior / prior.sum(), TransitionModel(tuple(tables)))
 
 
-def enumerate_trajectories(model, control, log_likelihood):
-    """Filtered, smoothed and log evidence by summing over every joint trajectory."""
-    steps, size = log_likelihood.shape
-    matrix = model.transition.matrix
-    likelihood = np.exp(log_likelihood)
-    filtered, evidence = np.zeros((steps, size)), np.zeros(steps)
-    forecast, smoothed = np.zeros((steps, size)), np.zeros((steps, size))
-    for length in range(1, steps + 1):
-        for path in itertools.product(range(size), repeat=length):
-            joint = model.prior[path[0]]
-            for t in range(1, length):
-                joint *= matrix[control[t - 1], path[t - 1], path[t]]
-            for t in range(length - 1):
-                joint *= likelihood[t, path[t]]
-            forecast[length - 1, path[-1]] += joint
-            joint *= likelihood[length - 1, path[-1]]
-            filtered[length - 1, path[-1]] += joint
-            evidence[length - 1] += joint
-            if length == steps:
-                for t in range(steps):
-                    smoothed[t, path[t]] += joint
-    forecast /= forecast.sum(axis=1, keepdims=True)
-    log_evidence = np.diff(np.log(evidence), prepend=0.0)
-    return forecast, filtered / evidence[:, None], smoothed / evidence[-1], log_evidence
-
-
-def enumerate_prediction(model, belief, control, policy, horizon):
-    """p(D_{t+h}, U_{t+h}) by summing over every trajectory of states and controls."""
-    size, controls = policy.shape
-    matrix = model.transition.matrix
-    joint = np.zeros((horizon, size, controls))
-    for h in range(1, horizon + 1):
-        for states in itertools.product(range(size), repeat=h + 1):
-            for chosen in itertools.product(range(controls), repeat=h):
-                probability = belief[states[0]] * matrix[control, states[0], states[1]]
-                for k in range(h):
-                    probability *= policy[states[k + 1], chosen[k]]
-                    if k < h - 1:
-                        probability *= matrix[chosen[k], states[k + 1], states[k + 2]]
-                joint[h - 1, states[-1], chosen[-1]] += probability
-    return joint
-
-
 def precise_forward_backward(model, control, log_likelihood, digits=40):
-    """Filtered, smoothed, log filtered and log evidence with `digits` digits and an unbounded exponent."""
+    """Forecast, filtered and smoothed beliefs, log filtered and log evidence, with an unbounded exponent."""
 
     def decimals(values, of=lambda x: Decimal(float(x))):
         return np.vectorize(of, otypes=[object])(values)
@@ -82,9 +38,10 @@ def precise_forward_backward(model, control, log_likelihood, digits=40):
         likelihood = decimals(
             log_likelihood, lambda x: Decimal(float(x)).exp() if np.isfinite(x) else Decimal(0)
         )
-        filtered, evidence = [], []
+        forecast, filtered, evidence = [], [], []
         for t, row in enumerate(likelihood):
-            belief = (belief @ matrix[control[t - 1]] if t else belief) * row
+            forecast.append(belief @ matrix[control[t - 1]] if t else belief)
+            belief = forecast[-1] * row
             evidence.append(belief.sum())
             belief = belief / evidence[-1]
             filtered.append(belief)
@@ -96,52 +53,46 @@ def precise_forward_backward(model, control, log_likelihood, digits=40):
             smoothed.insert(0, joint / joint.sum())
         log_filtered = [[float(x.ln()) if x else -np.inf for x in row] for row in filtered]
         log_evidence = [float(x.ln()) for x in evidence]
-    return (
-        np.array(filtered, float),
-        np.array(smoothed, float),
-        np.array(log_filtered),
-        np.array(log_evidence),
-    )
+    beliefs = (np.array(values, float) for values in (forecast, filtered, smoothed))
+    return *beliefs, np.array(log_filtered), np.array(log_evidence)
 
 
 def eliminate_variables(model, control, log_likelihood, policy, horizon):
-    """Smoothed beliefs, and joint-free predictions of state and control, by pgmpy, one variable a query."""
+    """Smoothed beliefs (T, S), and joint predictions of state and control (H, S, U), by pgmpy.
+
+    An observation is a child of the state that is seen with the likelihood's odds.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         logging.getLogger("pgmpy").setLevel(logging.ERROR)
-        inference, evidence = elimination_problem(model, control, log_likelihood, policy, horizon)
-        steps = len(control)
+        from pgmpy.factors.discrete import TabularCPD
+        from pgmpy.inference import VariableElimination
+        from pgmpy.models import DiscreteBayesianNetwork
 
-        def query(name):
-            return inference.query([name], evidence=evidence, show_progress=False).values
+        steps, size = log_likelihood.shape
+        matrix, controls = model.transition.matrix, len(model.controls)
+        tables = [TabularCPD("D0", size, model.prior[:, None])]
+        for t in range(1, steps + 1):
+            tables.append(TabularCPD(f"D{t}", size, matrix[control[t - 1]].T, [f"D{t - 1}"], [size]))
+        for t in range(steps, steps + horizon):
+            tables.append(TabularCPD(f"U{t}", controls, policy.T, [f"D{t}"], [size]))
+            if t > steps:
+                flat = matrix.transpose(2, 1, 0).reshape(size, size * controls)
+                tables.append(TabularCPD(f"D{t}", size, flat, [f"D{t - 1}", f"U{t - 1}"], [size, controls]))
+        for t in range(steps):
+            odds = np.exp(log_likelihood[t] - log_likelihood[t].max())
+            tables.append(TabularCPD(f"O{t}", 2, np.stack([1 - odds, odds]), [f"D{t}"], [size]))
+        network = DiscreteBayesianNetwork(
+            [(parent, table.variable) for table in tables for parent in table.variables[1:]]
+        )
+        network.add_cpds(*tables)
+        inference, evidence = VariableElimination(network), {f"O{t}": 1 for t in range(steps)}
+
+        def query(*names):
+            found = inference.query([*names], evidence=evidence, show_progress=False)
+            return np.moveaxis(
+                found.values, [found.variables.index(name) for name in names], range(len(names))
+            )
 
         smoothed = np.array([query(f"D{t}") for t in range(steps)])
-        states = np.array([query(f"D{t}") for t in range(steps, steps + horizon)])
-        controls = np.array([query(f"U{t}") for t in range(steps, steps + horizon)])
-    return smoothed, states, controls
-
-
-def elimination_problem(model, control, log_likelihood, policy, horizon):
-    """The unrolled network in pgmpy; an observation is a child that is seen with the likelihood's odds."""
-    from pgmpy.factors.discrete import TabularCPD
-    from pgmpy.inference import VariableElimination
-    from pgmpy.models import DiscreteBayesianNetwork
-
-    steps, size = log_likelihood.shape
-    matrix, controls = model.transition.matrix, len(model.controls)
-    tables = [TabularCPD("D0", size, model.prior[:, None])]
-    for t in range(1, steps + 1):
-        tables.append(TabularCPD(f"D{t}", size, matrix[control[t - 1]].T, [f"D{t - 1}"], [size]))
-    for t in range(steps, steps + horizon):
-        tables.append(TabularCPD(f"U{t}", controls, policy.T, [f"D{t}"], [size]))
-        if t > steps:
-            flat = matrix.transpose(2, 1, 0).reshape(size, size * controls)
-            tables.append(TabularCPD(f"D{t}", size, flat, [f"D{t - 1}", f"U{t - 1}"], [size, controls]))
-    for t in range(steps):
-        odds = np.exp(log_likelihood[t] - log_likelihood[t].max())
-        tables.append(TabularCPD(f"O{t}", 2, np.stack([1 - odds, odds]), [f"D{t}"], [size]))
-    network = DiscreteBayesianNetwork(
-        [(parent, table.variable) for table in tables for parent in table.variables[1:]]
-    )
-    network.add_cpds(*tables)
-    return VariableElimination(network), {f"O{t}": 1 for t in range(steps)}
+        return smoothed, np.array([query(f"D{t}", f"U{t}") for t in range(steps, steps + horizon)])

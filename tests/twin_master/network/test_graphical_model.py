@@ -14,11 +14,10 @@ from twin_master.errors import InvalidModelError, TwinMasterError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network import memory
 from twin_master.network import transition as transition_file
-from twin_master.network.distributions import distribution, stochastic_matrix
 from twin_master.network.graphical_model import Factor, StateSpace, worsening_table
 from twin_master.network.memory import check_scenario_fits
 from twin_master.network.sensor_model import check_noise
-from twin_master.network.transition import TransitionModel
+from twin_master.network.transition import TransitionModel, distribution, stochastic_matrix
 from twin_master.scenario.reading import parse_scenario
 from uav_twin import GraphicalModel, load_scenario
 

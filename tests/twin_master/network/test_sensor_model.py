@@ -21,25 +21,14 @@ def random_case(seed, spread=1.0):
     return rng, values, weight, deviation, observation
 
 
-def test_a_sequence_is_its_steps():
-    rng, values, weight, deviation, _ = random_case(2)
-    observations = rng.normal(size=(9, SENSORS))
-    observations[3] = np.nan
-    observations[5, 2] = np.nan
-    control = rng.integers(0, CONTROLS, 9)
-    model = GaussianSensorModel(values, deviation, weight)
-    rows = model.log_likelihood_sequence(observations, control)
-    for t in range(9):  # nor does it depend on what the model was asked before
-        for asked in (model, GaussianSensorModel(values, deviation, weight)):
-            np.testing.assert_array_equal(rows[t], asked.log_likelihood(observations[t], int(control[t])))
-
-
 def test_far_observations_stay_comparable_and_beyond_double_precision_they_are_impossible():
     model = GaussianSensorModel(np.arange(2.0).reshape(1, 2, 1, 1), 1e-3)
     low, high = model.log_likelihood([500.0], 0)
     assert high - low == pytest.approx((500.0**2 - 499.0**2) / 2e-6, rel=1e-12)
     assert low < -1e11
-    assert np.all(np.isneginf(model.log_likelihood([1e200], 0)))
+    interval = np.ones((2, 1, 1, 1))
+    for absurd in (model, GaussianSensorModel(np.arange(2.0).reshape(1, 2, 1, 1), 1e-3, interval=interval)):
+        assert np.all(np.isneginf(absurd.log_likelihood([1e200], 0)))
 
 
 @settings(deadline=None)
@@ -71,6 +60,10 @@ def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, re
         wanted = wanted if seen.any() else np.zeros(STATES)
         likelihood = model.log_likelihood(observation, control)
         np.testing.assert_allclose(likelihood, wanted, rtol=1e-12, atol=rounding)
+        # Nor does it depend on what the model was asked before.
+        turns = [(np.nan * observation, 0), (-observation, 1), (observation, control)]
+        rows = model.log_likelihood_sequence(*zip(*turns, strict=True))
+        np.testing.assert_array_equal(rows, [model.log_likelihood(*turn) for turn in turns])
     joint = rng.dirichlet(np.ones(STATES * CONTROLS), 3).reshape(3, STATES, CONTROLS)
     noise = np.sqrt(np.einsum("bsu,sug->bg", joint, total**2))
     np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
@@ -128,14 +121,6 @@ def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
         np.testing.assert_allclose(deviation[sensor] ** 2 / near.left[s, sensor], variance, rtol=1e-5)
 
 
-def test_an_absurd_observation_is_impossible_within_an_interval_too():
-    interval = np.ones((2, 1, 1, 1))
-    model = GaussianSensorModel(np.arange(2.0).reshape(1, 2, 1, 1), 1e-3, interval=interval)
-    assert np.all(np.isneginf(model.log_likelihood([1e200], 0)))
-    with pytest.raises(InvalidModelError, match=r"intervals of shape \(2, 1, 1, factors\), got \(2, 1, 1\)"):
-        GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=interval[..., 0])
-
-
 _, VALUES, WEIGHT, DEVIATION, OBSERVATION = random_case(7)
 HOLDING = GaussianSensorModel(VALUES, DEVIATION, WEIGHT)
 REFUSED = [
@@ -144,6 +129,8 @@ REFUSED = [
     *((lambda bad=bad: GaussianSensorModel(VALUES, 1.0, WEIGHT, model_error=bad), "relative model error")
       for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1))),
     (lambda: GaussianSensorModel(VALUES, DEVIATION, WEIGHT, average="both"), "'outside' or 'inside'"),
+    (lambda: GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=np.ones((2, 1, 1))),
+     r"intervals of shape \(2, 1, 1, factors\), got \(2, 1, 1\)"),
     (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), rf"sensor values of shape \({SENSORS},\)"),
     (lambda: HOLDING.log_likelihood(np.r_[OBSERVATION[:3], -np.inf, 0.0, 0.0], 0), r"\(3,\) is infinite"),
     (lambda: HOLDING.log_likelihood(OBSERVATION, 2), "control indices between 0 and 1"),

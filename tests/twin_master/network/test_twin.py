@@ -10,21 +10,19 @@ import pytest
 from scipy.stats import binom
 
 from fe.runtime.arrays import arrays_to_bytes
-from tests.twin_master.runs import table_of
-from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
+from tests.twin_master.runs import of_library, table_of
 from twin_master.errors import ImpossibleObservation, InvalidModelError
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge
 from twin_master.network.estimator import Learnt
 from twin_master.network.inference import smooth
 from twin_master.network.twin import TwinTurn, build_graphical_model
 from twin_master.scenario.reading import parse_scenario
-from uav_twin import Carried, Estimate, ExactFilter, Twin, filter_sequence, load_scenario
+from uav_twin import Carried, Estimate, ExactFilter, Twin, filter_sequence
 
 
 @pytest.fixture
 def knowledge(library_file: Path) -> Knowledge:
-    scenario = load_scenario("paper_level_turns").scenario
-    return prepare_knowledge(scenario, StrainLibrarySource(scenario, load_strain_library(library_file)), 0)
+    return of_library("paper_level_turns", library_file)[0]
 
 
 def test_the_transitions_of_a_scenario():
@@ -49,28 +47,6 @@ def test_the_transitions_of_a_scenario():
     table["transition"] = {"kind": "independent_tables", "tables": tables}
     matrix = build_graphical_model(parse_scenario(table, "x")).transition.matrix
     assert matrix[0, at((0.8, 0.0)), at((0.0, 0.2))] == pytest.approx(0.125)
-
-
-def test_turn_by_turn_equals_the_whole_sequence(knowledge):
-    generator = np.random.default_rng(0)
-    controls = np.array([1, 1, 0, 1, 0, 0])
-    observed = knowledge.sensor_model.mean[[0, 0, 5, 6, 6, 12], controls]
-    observed = observed + 150e-6 * generator.standard_normal(observed.shape)
-    observed[3] = np.nan
-    twin = knowledge.twin()
-    turns = [twin.turn(row, int(control)) for row, control in zip(observed, controls, strict=True)]
-    likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, controls)
-    whole = filter_sequence(knowledge.model, controls, likelihood)
-    np.testing.assert_allclose([turn.filtered for turn in turns], whole.filtered, atol=1e-14)
-    np.testing.assert_allclose([turn.log_evidence for turn in turns], whole.log_evidence, atol=1e-12)
-    np.testing.assert_allclose(
-        twin.smoothed(), smooth(knowledge.model, controls, whole.log_filtered), atol=1e-14
-    )
-    # A step without any observation follows the dynamics and says nothing.
-    np.testing.assert_allclose(
-        turns[3].filtered, turns[2].filtered @ knowledge.model.transition.matrix[0], atol=1e-15
-    )
-    assert turns[3].log_evidence == pytest.approx(0.0, abs=1e-13)
 
 
 def decided(knowledge: Knowledge, rule: Literal["filtered", "predicted"], turns: int) -> TwinTurn:
@@ -131,26 +107,30 @@ def seen(knowledge: Knowledge) -> np.ndarray:
     return knowledge.sensor_model.mean[np.arange(40) // 9 * 6, 1] + 150e-6 * noise
 
 
-def same_turn(first: TwinTurn, second: TwinTurn) -> bool:
-    """Return whether two turns are the same to the last bit."""
-    return (first.turn, first.next_control, first.log_evidence) == (
-        second.turn,
-        second.next_control,
-        second.log_evidence,
-    ) and all(
-        np.array_equal(getattr(first, name), getattr(second, name))
-        for name in ("filtered", "decision_probability")
-    )
+def told(turn: TwinTurn) -> tuple[object, ...]:
+    """Return what two turns that are the same to the last bit have in common."""
+    arrays = turn.filtered.tobytes(), turn.decision_probability.tobytes()
+    return turn.turn, turn.next_control, turn.log_evidence, *arrays
 
 
 def test_a_twin_has_no_last_turn_and_smooths_over_its_lag(knowledge, seen):
-    """The smoother of a lag is that of the whole history: it needs no likelihood from before."""
-    bounded, whole = knowledge.twin(lag=5), knowledge.twin()
-    for count, row in enumerate(seen, start=1):
-        assert same_turn(bounded.turn(row, "3g"), whole.turn(row, 1))
+    """Turn by turn it concludes what filter and smoother find in the whole sequence.
+
+    The smoother of a lag is that of the whole history: it needs no likelihood from before.
+    """
+    model, controls = knowledge.model, np.arange(40) % 3 % 2
+    seen[17] = np.nan
+    bounded, whole, turns = knowledge.twin(lag=5), knowledge.twin(), []
+    for count, (row, control) in enumerate(zip(seen, controls.tolist(), strict=True), start=1):
+        turns.append(whole.turn(row, control))
+        assert told(bounded.turn(row, model.controls[control])) == told(turns[-1])
         first = max(0, count - 6)
         assert bounded.first_kept == first
         np.testing.assert_array_equal(bounded.smoothed(), whole.smoothed()[first:])
+    found = filter_sequence(model, controls, knowledge.sensor_model.log_likelihood_sequence(seen, controls))
+    np.testing.assert_allclose([turn.filtered for turn in turns], found.filtered, atol=1e-14)
+    np.testing.assert_allclose([turn.log_evidence for turn in turns], found.log_evidence, atol=1e-12)
+    np.testing.assert_allclose(whole.smoothed(), smooth(model, controls, found.log_filtered), atol=1e-14)
     assert knowledge.twin(lag=0).turn(seen[0]).control_index == 1  # the first control of the scenario
 
 
@@ -161,36 +141,30 @@ def test_what_comes_late_is_put_in_its_place(knowledge, seen, late):
     for turn, row in enumerate(seen):
         last = clean.turn(row, 1)
         twin.turn(np.full(24, np.nan) if turn == late else row, 1)
-    assert same_turn(twin.revise(late, seen[late]), last)
+    assert told(twin.revise(late, seen[late])) == told(last)
     np.testing.assert_array_equal(twin.smoothed(), clean.smoothed())
     np.testing.assert_array_equal(twin.observed(late), seen[late])
     np.testing.assert_array_equal(twin.turn(seen[0], 0).filtered, clean.turn(seen[0], 0).filtered)
 
 
-def test_a_turn_that_is_not_kept_cannot_be_revised(knowledge, seen):
-    twin = knowledge.twin(lag=4)
+def test_a_twin_is_kept_and_goes_on_to_the_last_bit(knowledge, seen):
+    """Of turns from before its lag nothing can be revised; what is refused or damaged leaves it as it was."""
+    twin, other = knowledge.twin(lag=4), knowledge.twin(lag=4)
     for row in seen[:10]:
         twin.turn(row)
+    state = twin.save_state()
     for turn in (4, 10, -1):
         with pytest.raises(IndexError, match=rf"turn {turn} .*from 5 on.*seen 10"):
             twin.revise(turn, seen[0])
-    state = twin.save_state()
     with pytest.raises(ImpossibleObservation):
         twin.revise(7, np.full(24, 1e300))
     assert twin.save_state() == state
-
-
-def test_a_stored_twin_goes_on_to_the_last_bit(knowledge, seen):
-    twin = knowledge.twin(lag=6)
-    for row in seen[:20]:
-        twin.turn(row)
-    other = knowledge.twin(lag=6)
-    other.restore_state(twin.save_state())
+    other.restore_state(state)
     assert other.proposed_control == twin.proposed_control
-    for row in seen[20:]:
-        assert same_turn(twin.turn(row), other.turn(row))
+    for row in seen[10:]:
+        assert told(twin.turn(row)) == told(other.turn(row))
     assert other.save_state() == twin.save_state()
-    for damaged in (b"", twin.save_state()[:-7], arrays_to_bytes({"a": np.zeros(2)})):
+    for damaged in (b"", state[:-7], arrays_to_bytes({"a": np.zeros(2)})):
         with pytest.raises(InvalidModelError):
             other.restore_state(damaged)
 
@@ -214,14 +188,8 @@ def test_own_policy_planner_sensor_model_and_estimator(knowledge, seen):
             return replace(estimate, carried=carried, learnt={"count": Learnt(count, 0.0, count, count)})
 
     model = knowledge.model
-    own = Twin(
-        "own",
-        model,
-        Tenfold(),
-        lambda given: np.eye(2)[np.zeros(given.states.size, dtype=int)],
-        estimator=Counting(model, Tenfold()),
-        lag=3,
-    )
+    gentle = np.eye(2)[np.zeros(25, dtype=int)]
+    own = Twin("own", model, Tenfold(), lambda _: gentle, estimator=Counting(model, Tenfold()), lag=3)
     plain = knowledge.twin()
     for number, row in enumerate(seen[:8], start=1):
         mine, theirs = own.turn(row, 1), plain.turn(row, 1)

@@ -1,6 +1,5 @@
 """The view of a flight: its numbers against those of the run, its protocol, its page in a real browser."""
 
-import io
 import json
 import os
 import re
@@ -22,9 +21,9 @@ import pytest
 from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN
 from reporting.figures import new_figure, to_svg
-from reporting.files import atomic_write_bytes
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
+from tests.twin_master.watch.watches import viewed
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
@@ -66,13 +65,6 @@ def add(folder: Path, *content: bytes) -> None:
         file.writelines(content)
 
 
-def whole(folder: Path) -> Flight:
-    flight = Flight(folder)
-    while flight.update():
-        pass
-    return flight
-
-
 def wide(belief: Belief) -> np.ndarray:
     """Return the standard deviation of what each sensor shows, its noise included."""
     return np.hypot(belief.expected.standard_deviation, belief.expected.noise)
@@ -89,7 +81,7 @@ def asked(first: int = 0, end: int = 0, turn: int = LATEST, **changed: int) -> R
 
 
 def test_every_number_is_that_of_the_run(run):
-    flight, stored = whole(run), open_run(run)
+    flight, stored = viewed(run), open_run(run)
     assert flight.turns == TURNS
     believed, expected = of_turns(flight, 0, TURNS), flight.predicted(flight.seen(28, 29)[0])
     for belief, group, part in ((believed, "filtered", slice(None)), (expected, "predicted", 28)):
@@ -138,7 +130,7 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines):
     missed = turns[6] | {"observed": [None] * 24}
     late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
     add(begun, lines[0], *map(line_of, [*turns[:6], missed, *turns[7:10]]))
-    flight = whole(begun)
+    flight = viewed(begun)
     number = flight.number
     add(begun, line_of(late | {"filtered": turns[20]["filtered"]}))
     assert flight.update()
@@ -148,7 +140,7 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines):
     last = [turn["filtered"] for turn in flight.seen(8, 10)]
     assert last == [turns[8]["filtered"], turns[20]["filtered"]]
     add(begun, *map(line_of, [{"model": {}}, *turns[10:20]]))
-    assert whole(begun).turns == 20
+    assert viewed(begun).turns == 20
     flight.update()
     add(begun, line_of(turns[30]))
     with pytest.raises(RunFolderError, match="tells turn 30 where 20 was expected"):
@@ -159,21 +151,6 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines):
     assert Teller(flight).answer(asked()) is None  # until it is seen
     assert flight.update()
     assert flight.turns == 3
-
-
-def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(begun, lines):
-    add(begun, *lines)
-    flight = whole(begun)
-    before, number = of_turns(flight, 0, 5).expected.mean, flight.number
-    with np.load(begun / KNOWLEDGE_NAME) as kept:
-        arrays = dict(kept)
-    content = io.BytesIO()
-    np.savez(content, **(arrays | {"predicted": 1.1 * arrays["predicted"]}))
-    atomic_write_bytes(begun / KNOWLEDGE_NAME, content.getvalue())
-    add(begun, line_of({"turn": 49, "model": {}}))
-    assert flight.update()
-    assert flight.number > number
-    np.testing.assert_allclose(of_turns(flight, 0, 5).expected.mean, 1.1 * before)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
@@ -191,7 +168,7 @@ def told(teller: Teller, *words: int, **changed: int) -> dict[str, Any]:
 
 
 def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
-    flight = whole(run)
+    flight = viewed(run)
     teller = Teller(flight)
     everything = told(teller)
     assert (everything["turn"], everything["first"], everything["count"]) == (TURNS - 1, 0, TURNS)
@@ -306,7 +283,7 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         assert first.value("state.shown") == 10
         tabs[2].value("connect()")
         tabs[2].wait("window.painted.at(-1)[0] === 49 && held.rows.length === 50")
-        flown = whole(begun)
+        flown = viewed(begun)
         expected = 100.0 * flown.knowledge.model.states.mean(of_turns(flown, 0, TURNS).probability)
         for tab in tabs[1:]:
             np.testing.assert_allclose(tab.value("held.rows.map((row) => row.state)"), expected)

@@ -46,6 +46,13 @@ def recorded(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.fixture(scope="session")
+def plain(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The mission as a CSV file without it."""
+    path = tmp_path_factory.mktemp("plain") / "m.csv"
+    return write_csv(path, mission.observed, mission.control_index)
+
+
+@pytest.fixture(scope="session")
 def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
     """A watch that has seen nothing."""
     folder = tmp_path_factory.mktemp("base") / "watch"

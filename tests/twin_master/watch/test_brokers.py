@@ -1,10 +1,7 @@
 """A watch over a real broker."""
 
 import json
-import os
-import random
 import shutil
-import signal
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -128,37 +125,6 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
 
-@pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
-def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(watch, broker, kills):
-    turns, chance, where = 60 * kills, random.Random(kills), where_of(broker)
-    listener, heard = heard_at(broker, "listener")
-
-    def run(turns: int, note: Any = str) -> None:
-        feed = MqttFeed(where, watch, note)
-        watch.run(feed, str, turns=turns)
-        feed.close()
-
-    run(1, lambda _note: publish(listener, *range(turns)))  # all but the first wait at the broker
-    listener.disconnect()
-    listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
-    met = 0
-
-    def next_end() -> int:
-        lines = chance.randrange(40) if met < kills else 2 * turns
-        return (watch.folder / JOURNAL_NAME).stat().st_size + 2000 * lines
-
-    while killed_at(watch, next_end(), lambda: run(turns)):
-        met += 1
-    assert met == kills
-    listener = broker.client("listener", heard)
-    wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
-    listener.disconnect()
-    assert [line["turn"] for line in journal(watch.folder)] == list(range(turns))
-    assert {decision["turn"] for decision in heard} == set(range(turns))
-    assert len([decision for decision in heard if decision.get("told_again")]) >= kills
-    assert len(heard) < turns + 100 * kills
-
-
 def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     scenario, base, watch, broker, tmp_path, monkeypatch
 ):
@@ -263,47 +229,35 @@ def test_a_subscription_that_is_refused(watch, broker, tmp_path):
         watch.run(feed, str)
 
 
-def test_a_watch_that_hears_nothing_says_so(hasty, broker, monkeypatch):
+def test_a_watch_says_that_it_hears_nothing_that_it_ends_and_that_it_was_killed(hasty, broker, monkeypatch):
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.1)
     client, heard = heard_at(broker, "client", f"{TOPIC}/+")
-
-    def begin() -> int:
-        if not (child := os.fork()):
-            try:
-                feed = MqttFeed(where_of(broker), hasty, str)
-                hasty.run(feed, str)
-                feed.close()
-            finally:
-                os._exit(1)
-        return child
-
-    def end(child: int, by: signal.Signals, state: str) -> None:
-        os.kill(child, by)
-        os.waitpid(child, 0)
-        wait_until(lambda: states() == [state])
 
     def has(turn: int, kind: str) -> bool:
         told = [one for one in heard if one.get("turn") == turn]
         return any(notice["kind"] == kind for one in told for notice in one.get("notices", ()))
 
-    def states() -> list[str]:
-        return [one["state"] for one in heard if "state" in one][-1:]
+    def is_said(state: str) -> None:
+        wait_until(lambda: [one["state"] for one in heard if "state" in one][-1:] == [state])
 
-    child = begin()
-    wait_until(lambda: has(-1, "quiet"))
-    wait_until(lambda: states() == ["quiet"])
-    client.publish(TOPIC, b"garbage", qos=1)
-    client.publish(TOPIC, message(0), qos=1)
-    wait_until(lambda: has(0, "heard") and has(0, "quiet"))
-    end(child, signal.SIGKILL, "lost")
-    child = begin()
-    wait_until(lambda: states() == ["quiet"])
-    end(child, signal.SIGTERM, "ended")
+    def run() -> None:
+        hasty.run(MqttFeed(where_of(broker), hasty, str), str)
+
+    with watching(where_of(broker), hasty, 2):
+        wait_until(lambda: has(-1, "quiet"))
+        is_said("quiet")
+        client.publish(TOPIC, b"garbage", qos=1)
+        publish(client, 0)
+        wait_until(lambda: has(0, "heard") and has(0, "quiet"))
+        is_said("quiet")
+        beat = [one for one in heard if "state" in one][-1]
+        assert [beat[key] for key in ("turn", "lag", "received", "refused")] == [0, 0, 2, 1]
+        publish(client, 1)
+    is_said("ended")
+    assert killed_at(hasty, (hasty.folder / JOURNAL_NAME).stat().st_size + 1, run)
+    is_said("lost")
     client.disconnect()
-    beat = [one for one in heard if one.get("state") == "quiet"][-1]
-    assert [beat[key] for key in ("turn", "lag", "received", "refused")] == [0, 0, 2, 1]
-    assert (has(-1, "quiet"), has(0, "heard"), has(0, "quiet"), states()) == (True, True, True, ["ended"])
-    assert [notice.kind for _, notice in hasty.told(-1)][:3] == ["quiet", "heard", "quiet"]
+    assert [notice.kind for _, notice in hasty.told(-1)] == ["quiet", "heard", "quiet", "heard", "quiet"]
     with flown(hasty.folder, None, None, SilentProgress()) as copy:
         assert "see whether logger and broker are there" in (copy / "summary.json").read_text()
 
