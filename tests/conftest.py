@@ -12,8 +12,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import gc
 import json
 import shutil
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -24,7 +22,7 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
-from tests.kept import FE, ROOT, kept, packed, remove_old
+from tests.kept import FE, ROOT, exported, kept, remove_old
 from tests.refusals import Inputs
 
 if TYPE_CHECKING:
@@ -330,16 +328,8 @@ def heat_exchanger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with an FMU of a heat exchanger, its binding and its scenario."""
     source = ROOT / "tests" / "twin_master" / "assets" / "heat_exchanger"
     folder = tmp_path_factory.mktemp("heat_exchanger")
-    for path in source.iterdir():
-        if path.is_file():
-            shutil.copy(path, folder)
-    words = [sys.executable, "-m", "pythonfmu", "build", "-f", "HeatExchanger.py"]
-    packed(
-        folder / "HeatExchanger.fmu",
-        lambda: subprocess.run(words, cwd=folder, check=True, capture_output=True),
-        (source / "HeatExchanger.py",),
-        None,
-    )
+    shutil.copytree(source, folder, dirs_exist_ok=True)
+    exported(folder / "HeatExchanger.py")
     return folder
 
 
