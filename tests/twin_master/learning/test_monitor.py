@@ -17,10 +17,10 @@ from twin_master.errors import ImpossibleObservation, InvalidModelError, Invalid
 from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.rivals import at_first, one_turn_later
-from twin_master.learning.words import Words
 from twin_master.mission.journal import line_of, turn_record
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import Reading, Turn
+from twin_master.network.estimator import Words
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.twin import TwinTurn
 from twin_master.scenario.tables import Learning, Noticing
