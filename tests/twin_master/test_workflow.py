@@ -19,12 +19,7 @@ from reporting.progress import SilentProgress
 from tests.twin_master.runs import check_same, cut_off_after, text_of, written
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import (
-    MissionInputError,
-    NotResumableError,
-    RunFolderError,
-    ScenarioError,
-)
+from twin_master.errors import MissionInputError, NotResumableError, RunFolderError, ScenarioError
 from twin_master.run_folder import (
     FIELD_NAME,
     KIND,
