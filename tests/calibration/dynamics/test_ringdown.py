@@ -21,6 +21,7 @@ from calibration.dynamics.trials import (
     spectrum,
 )
 from calibration.errors import CalibrationError, ExperimentDataError
+from tests.calibration.decays import free_decay
 
 TRUE = ((5.65, 29.97), (0.0281, 0.0717), (0.0115, 0.0137), (0.3, -0.8))
 
@@ -29,11 +30,8 @@ TRUE = ((5.65, 29.97), (0.0281, 0.0717), (0.0115, 0.0137), (0.3, -0.8))
 
 def ring_down(time, frequency=TRUE[0], ratio=TRUE[1], amplitude=TRUE[2], phase=TRUE[3], drift=0.0):
     """Return the signal [V] of two modes."""
-    signal = 1e-4 + drift * time
-    for f, z, a, p in zip(frequency, ratio, amplitude, phase, strict=True):
-        natural = 2.0 * math.pi * f
-        signal = signal + a * np.exp(-z * natural * time) * np.cos(natural * math.sqrt(1.0 - z**2) * time + p)
-    return signal
+    modes = zip(frequency, ratio, amplitude, phase, strict=True)
+    return 1e-4 + drift * time + sum(free_decay(time, *mode) for mode in modes)
 
 
 def fitted(time, signal, free=True, width=0.0):
@@ -260,11 +258,7 @@ WIDTH = 0.00811
 def drawn():
     """A signal of two modes drawn with a line 0.4 mV wide in columns of pixels."""
     fine = np.arange(0.0, 6.4, WIDTH / 64.0)
-    signal = np.zeros(fine.size)
-    for frequency, ratio, amplitude, phase in ((5.65, 0.0281, 0.0115, 0.2), (29.97, 0.0717, 0.018, 2.0)):
-        omega = 2.0 * math.pi * frequency
-        wave = np.cos(omega * math.sqrt(1.0 - ratio**2) * fine + phase)
-        signal += amplitude * np.exp(-ratio * omega * fine) * wave
+    signal = ring_down(fine, amplitude=(0.0115, 0.018), phase=(0.2, 2.0))
     columns = fine.size // 64
     table = signal[: 64 * columns].reshape(columns, 64)
     lowest, highest = table.min(axis=1) - 2e-4, table.max(axis=1) + 2e-4

@@ -325,13 +325,20 @@ def test_wedges_cannot_be_compared(made):
 # ---------------------------------------------------------------- its file
 
 
-def test_the_file_without_a_fault_is_taken(made):
+def test_the_file_without_a_fault_is_taken_with_its_rosette(made):
     structure = made("plate")
     assert set(static_responses(structure)) == {"weight", "push"}
     assert structure.unknowns == 24
     assert len(structure.design_hash) == 64
     for old, new, same in (("[[support]]", "# a comment\n[[support]]", True), ("2700", "2701", False)):
         assert (made("plate", (old, new)).design_hash == structure.design_hash) is same
+    # A rosette's strains are those of one plane strain state; beside gauges of their own they come last.
+    assert structure.gauges == ("a", "r_a", "r_b", "r_c", "r_d")
+    own, first, middle, last, fourth = structure.gauge_output.toarray()
+    np.testing.assert_array_equal(own, first)
+    half = 0.5 * (2.0 * middle - first - last)
+    wanted = 0.25 * first + 0.75 * last + half * np.sin(np.radians(120.0))
+    np.testing.assert_allclose(fourth, wanted, atol=1e-12 * np.abs(first).max())
 
 
 @pytest.mark.parametrize(
@@ -351,14 +358,3 @@ def test_parts_that_turn_on_a_hinge_cannot_be_solved(box, write):
     file = write(corners, "hexahedron", numbers.reshape(2, 8), INPUTS.text("hinge.toml"))
     with pytest.raises(errors.SolutionError, match=r"some part of the structure is not held|hardly held"):
         static_responses(load_and_assemble(file))
-
-
-def test_a_rosette_is_gauges_at_one_point(made):
-    """Its strains are those of one plane strain state; beside gauges of their own they come last."""
-    structure = made("plate")
-    assert structure.gauges == ("a", "r_a", "r_b", "r_c", "r_d")
-    own, first, middle, last, fourth = structure.gauge_output.toarray()
-    np.testing.assert_array_equal(own, first)
-    half = 0.5 * (2.0 * middle - first - last)
-    wanted = 0.25 * first + 0.75 * last + half * np.sin(np.radians(120.0))
-    np.testing.assert_allclose(fourth, wanted, atol=1e-12 * np.abs(first).max())

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from tests.refusals import refused
 from tests.twin_master.runs import loaded_from, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import InvalidModelError, TwinMasterError
@@ -148,17 +149,13 @@ def test_too_many_states_or_draws_are_refused_before_anything_is_built(monkeypat
     table["calibration"]["draws"] = 800
     loaded = loaded_from(table, "level_turns")
     tracemalloc.start()
-    try:
-        with pytest.raises(InvalidModelError) as caught:
-            asset_source(resolve_scenario(loaded, Overrides()))
-        assert tracemalloc.get_traced_memory()[1] < 5e7
-    finally:
-        tracemalloc.stop()
-    sentence = str(caught.value)
+    with refused(InvalidModelError, "15625 states") as caught:
+        asset_source(resolve_scenario(loaded, Overrides()))
+    assert tracemalloc.get_traced_memory()[1] < 5e7
+    tracemalloc.stop()
     small = "7.2e-06 GB for the transitions of 6 state factors"
-    for word in ("15625 states", "2 controls", "38.4 GB", small, "8 GB", "800 draws", "fewer levels"):
-        assert word in sentence, sentence
-    assert "\n" not in sentence
+    for word in ("2 controls", "38.4 GB", small, "8 GB", "800 draws", "fewer levels"):
+        assert word in str(caught.value)
     table = table_of("level_turns")
     table["calibration"]["draws"] = 1000000
     with pytest.raises(InvalidModelError, match=r"76.8 GB for 1000000 draws of 24 sensors"):
