@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from benchmarks.cantilever import LENGTH, Cantilever
 from benchmarks.effect_pictures import FLOWS
 from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.catalogue.effect_file import loss_integral
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.catalogue.needs import mains_lines
-from discrepancy.catalogue.scales import loss_integral
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.sensing import observe

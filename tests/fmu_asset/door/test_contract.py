@@ -15,7 +15,7 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
 from tests.fmu_asset.coupling.reference import coupled, of_ours
 from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind
-from tests.fmu_asset.ours import NAMES, OurFmus
+from tests.fmu_asset.ours import NAMES, STRUCTURES, OurFmus
 
 Open = Callable[..., FmiAsset]
 Bits = list[tuple[bytes, bytes, float]]
@@ -99,19 +99,19 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
 
 
 def ways() -> Iterator[Any]:
-    """Yield each kind here, and in a worker one of each version, interface and way of keeping states.
+    """Yield each kind here, and in a worker one of each sort: how packed, version, interface, way of states.
 
-    Of what flies still and in motion one is here, one in a worker.
+    Of what flies still and in motion that is the one in motion, which is not here then.
     """
     seen = set()
     for name, kind in KINDS.items():
-        moving = name.endswith(" in motion")
-        twice = moving or f"{name} in motion" in KINDS
-        sort = kind.file.split()[0][-1], kind.binding.binding.interface, kind.state
-        for isolated in (moving,) if twice else (False, True)[: 2 - (sort in seen)]:
-            yield pytest.param(kind, isolated, id=f"{'worker' if isolated else 'in process'}-{name}")
-        if not twice:
+        how = kind.file in NAMES, STRUCTURES.get(kind.file, {}).get("kind"), *filter(str.isdigit, kind.file)
+        sort = *how, kind.binding.binding.interface, kind.state
+        first = sort not in seen and f"{name} in motion" not in KINDS
+        if first:
             seen.add(sort)
+        for isolated in (first,) if name.endswith(" in motion") else (False, True)[: 1 + first]:
+            yield pytest.param(kind, isolated, id=f"{'worker' if isolated else 'in process'}-{name}")
 
 
 @pytest.mark.parametrize(("kind", "isolated"), [*ways()])
