@@ -15,6 +15,8 @@ from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
 from discrepancy.checks.quality import check_data, clipped_run
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import ExamplePlan, example_campaign
 from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 from tests.discrepancy.core import kit
@@ -259,6 +261,30 @@ def test_outputs_and_lengths(cantilever, campaign):
     (said,) = (item.sentence for item in cut(401, unit=1e3) if item.kind is FaultKind.UNDERSAMPLED)
     assert "looks like milliseconds" in said
     assert "sample faster" not in said
+
+
+@pytest.mark.parametrize(
+    ("output", "quantity", "kinds"),
+    [
+        ("angle", Quantity.ANGULAR_VELOCITY, set()),
+        ("angle", Quantity.ANGULAR_ACCELERATION, set()),
+        ("speed", Quantity.ANGLE, {(FaultKind.WRONG_QUANTITY, "w")}),
+    ],
+)
+def test_a_rate_of_an_angle_is_measured_and_no_integral(output, quantity, kinds):
+    outputs = [("angle", "angle"), ("speed", "angular_velocity")]
+    wheel = LumpedDescription.parse(
+        {
+            "format": 1, "name": "wheel", "mass": 1.0, "stiffness": 100.0, "damping": {"ratios": 0.02},
+            "input": [{"name": "torque", "vector": 1.0, "quantity": "torque"}],
+            "output": [{"name": name, "vector": 1.0, "quantity": kind} for name, kind in outputs],
+        }
+    )  # fmt: skip
+    time = 0.02 * np.arange(400)
+    trial = Trial.plain("t", TrialKind.FORCED, ("w",), time, load_place="torque", force=np.sin(time))
+    channels = {"w": Channel("w", quantity, output, NoiseRecord(1e-4))}
+    campaign = Campaign("wheel", channels, (trial,), None, {}, "")
+    assert kinds_of(check_against_model(campaign, LumpedModel(wheel))) == kinds
 
 
 def test_clipped_and_dead_channels(campaign, cantilever):

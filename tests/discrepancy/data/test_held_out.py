@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from discrepancy.campaign.held_out import choose_held_out, level
+from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import (
@@ -109,8 +109,8 @@ def test_what_is_left_covers_what_is_held_out(rows):
     for item in chosen.held_out:
         left = [other for other in chosen.fitted if other.kind is item.kind]
         assert left
-        lowest = 0.0 if "levels held out" in item.name else min(map(level, left))
-        assert lowest <= level(item) <= max(map(level, left))
+        lowest = 0.0 if "levels held out" in item.name else min(item.level for item in left)
+        assert lowest <= item.level <= max(item.level for item in left)
         assert any(other.run == item.run for other in chosen.fitted)
 
 
