@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,27 +15,28 @@ from reporting.progress import SilentProgress
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, wait_until
+from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, broker_of
+from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.mqtt import MqttFeed
+from twin_master.watch.mqtt import MqttFeed, Topic
 from twin_master.watch.opening import flown
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
-needs_mosquitto = pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
 TOPIC, DECISION = "wing/7", "wing/7/decision"
 Told = dict[str, Any]
 
 
 @pytest.fixture
-def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+def broker(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Mosquitto]:
     if shutil.which("mosquitto") is None:
         pytest.skip("no mosquitto")
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    broker = Mosquitto(tmp_path)
+    broker = Mosquitto(tmp_path, tls=getattr(request, "param", False))
     yield broker
     broker.stop()
 
@@ -80,12 +82,10 @@ def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, 
     return client, heard
 
 
-@needs_mosquitto
-@pytest.mark.parametrize("tls", [False, True])
-def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, tmp_path, tls, monkeypatch):
-    broker, turns = Mosquitto(tmp_path, tls=tls), len(mission.observed)
-    secure = f"mqtts://wing@localhost:{broker.port}/{TOPIC}"
-    where = broker_of(secure, broker.authority) if tls else where_of(broker)
+@pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
+def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, broker, monkeypatch):
+    secure, turns = f"mqtts://wing@localhost:{broker.port}/{TOPIC}", len(mission.observed)
+    where = broker_of(secure, broker.authority) if broker.tls else where_of(broker)
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")
     with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
         watch.run(MqttFeed(where, watch, str), str)
@@ -107,14 +107,13 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
         publisher.publish(TOPIC, b"x" * 3_000_000, qos=0)
         publisher.publish(TOPIC, json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which turn?
         send(15, 19)
-        if not tls:
+        if not broker.tls:
             broker.again()
             wait_until(publisher.is_connected)
         send(20, turns)
     wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
     publisher.disconnect()
     listener.disconnect()
-    broker.stop()
     last, expected = (journal(folder)[-1] for folder in (watch.folder, whole))
     assert last["filtered"] == expected["filtered"]
     counts = last["intake"]["counts"]
@@ -123,6 +122,26 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
     assert 1 <= counts["rejected"] < 1010  # a broker may lose or repeat some
     assert {decision["turn"] for decision in heard} == set(range(turns))
     assert all(decision["probability"] >= 0.5 for decision in heard)
+
+
+def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watch, plain):
+    ran(watch, CsvFeed(plain, watch.scenario), 3)
+    published, sent = watch.folder / "published", list[Told]()
+    published.write_text("0" * 20)
+
+    def send(_topic: str, decision: Told, _by: Topic) -> int:
+        sent.append(decision)
+        return len(sent)
+
+    topic = Topic(SimpleNamespace(behind={}, room=True, send=send), TOPIC, watch.scenario, str)
+    topic.begun(watch)
+    topic.publish()
+    topic.answered(1, None)
+    first, *_ = records(watch.folder / JOURNAL_NAME)
+    assert int(published.read_text()) == first[2]
+    topic.go_back()  # as where the broker is lost
+    topic.publish()
+    assert [decision["turn"] for decision in sent] == [0, 1, 2, 1, 2]
 
 
 def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
@@ -148,7 +167,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     (watch.folder / "published").write_text("0" * 20)
     watched(watch, 4)  # nothing more is wanted, and what was not published is
     wait_until(lambda: len([one for one in heard if "control" in one]) >= 4)
-    assert {one["turn"] for one in heard if "control" in one} == {0, 1, 2, 3}
+    assert {one["turn"] for one in heard if one.get("told_again")} == {0, 1, 2, 3}
     feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 4))
     with pytest.raises(ZeroDivisionError), closing(feed):
         watch.run(feed, lambda decision: decision["turn"] // 0)
