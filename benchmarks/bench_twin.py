@@ -27,7 +27,7 @@ from twin_master.network.inference import (
     smooth_many,
 )
 from twin_master.network.planner import value_iteration
-from twin_master.network.rewards import RewardModel
+from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
 

@@ -1,10 +1,8 @@
 """Errors of the calibration, named by cause, and the sentences that say why."""
 
-from pathlib import Path
-
 from reporting.sentences import Sentences
 
-said = Sentences(str(Path(__file__).with_name("sentences.toml"))).said
+said = Sentences(__file__).said
 """A sentence by "table.name" with its values."""
 
 

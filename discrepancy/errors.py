@@ -1,15 +1,14 @@
 """Errors of the discrepancy workflow, named by cause, and the sentences that it says."""
 
-from pathlib import Path
-
+from reporting.errors import StandsForOthersError
 from reporting.sentences import Sentences
 
-SENTENCES = Sentences(str(Path(__file__).with_name("sentences.toml")))
+SENTENCES = Sentences(__file__)
 said = SENTENCES.said
 """A sentence by "table.name" with its values."""
 
 
-class DiscrepancyError(Exception):
+class DiscrepancyError(StandsForOthersError):
     """Any error that the discrepancy workflow raises on purpose."""
 
 

@@ -209,10 +209,8 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
 
 
 def _structure(path: Path, progress: Progress | None) -> ModelChoice:
-    try:
+    with ModelError.instead_of(FiniteElementError):
         reduced = reduced_structure(path, progress=progress)
-    except FiniteElementError as cause:
-        raise ModelError(str(cause)) from cause
     source = reduced.design_hash
     model = StructureModel(reduced)
     return ModelChoice(model, ModelKind.STRUCTURE, path.name, source, path=path, design_hash=source)

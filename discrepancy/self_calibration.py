@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from discrepancy.campaign.records import Campaign
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import Campaign, IntArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.document import Origin, plain
 from discrepancy.errors import ModelError

@@ -156,9 +156,7 @@ def investigate(
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
     with stage("Fitting what is known, and searching the catalogue", "name") as tell:
-        problem = without_wrong_ends(
-            Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-        )
+        problem = without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
         verdict, search, fit = name(problem, catalogue, tell=tell)
@@ -250,11 +248,12 @@ def checked(
     return choose_held_out(campaign) if hold_out else campaign, faults
 
 
-def without_wrong_ends(problem: Problem) -> Problem:
-    """Return a problem without single wrong readings at the ends of its campaign's records in time.
+def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
+    """Return the problem of campaign and model, single wrong readings at the ends of records left out.
 
     The model as it is need not fit: see `outliers.wrong_ends`.
     """
+    problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     none = fit_to(problem, Candidate(), problem.start(Candidate()))
     fits = [(problem, none)]
     if problem.campaign.held_out:

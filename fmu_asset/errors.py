@@ -1,11 +1,10 @@
 """Errors of the FMUs and of their one door, named by cause, and the sentences that say why."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from reporting.sentences import Sentences
 
-said = Sentences(str(Path(__file__).with_name("sentences.toml"))).said
+said = Sentences(__file__).said
 """A sentence by "table.name" with its values."""
 
 

@@ -1,4 +1,4 @@
-"""Sentences in a TOML file beside a module, filled in where they are said."""
+"""Sentences in a TOML file of a package, filled in where they are said."""
 
 import tomllib
 from collections.abc import Mapping, Set
@@ -32,11 +32,11 @@ class Sentences:
     Parameters
     ----------
     module : str
-        File of the module; the sentences stand beside it, ``sentences.py`` -> ``sentences.toml``.
+        A file of the package; the sentences stand beside it, in ``sentences.toml``.
     """
 
     def __init__(self, module: str) -> None:
-        self._file = Path(module).with_suffix(".toml")
+        self._file = Path(module).with_name("sentences.toml")
 
     @cached_property
     def tables(self) -> dict[str, Any]:

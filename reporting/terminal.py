@@ -104,12 +104,15 @@ def say(text: str, **look: Any) -> None:
         typer.secho(text, **look)
 
 
-def show(command: str, words: "Words", **values: Any) -> None:
-    """Print what a command found as `[printed]` of a file of words says.
+def show(command: str, words: "Words | str", **values: Any) -> None:
+    """Print what a command found as `[printed]` of a file of words says, or of that of a package by its name.
 
     It lists blocks as `Words.told` takes them. A row of a table with `colours` has that of its first cell of
     which they hold one.
     """
+    from reporting.page import Words
+
+    words = Words(words) if isinstance(words, str) else words
     for kind, what in words.told(words.content["printed"][command], **values):
         if kind == "table":
             name, table = what
@@ -120,7 +123,9 @@ def show(command: str, words: "Words", **values: Any) -> None:
             say(what, fg="yellow" if kind == "notice" else None)
 
 
-def answer(command: str, words: "Words", record: Mapping[str, Any], *, json: bool, **values: Any) -> None:
+def answer(
+    command: str, words: "Words | str", record: Mapping[str, Any], *, json: bool, **values: Any
+) -> None:
     """Print a record as JSON, or as `show` does."""
     if json:
         print_json(record)

@@ -12,8 +12,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import gc
 import json
 import shutil
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -24,7 +22,7 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
-from tests.kept import FE, ROOT, kept, packed, remove_old
+from tests.kept import FE, ROOT, exported, kept, remove_old
 from tests.refusals import Inputs
 
 if TYPE_CHECKING:
@@ -330,16 +328,8 @@ def heat_exchanger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with an FMU of a heat exchanger, its binding and its scenario."""
     source = ROOT / "tests" / "twin_master" / "assets" / "heat_exchanger"
     folder = tmp_path_factory.mktemp("heat_exchanger")
-    for path in source.iterdir():
-        if path.is_file():
-            shutil.copy(path, folder)
-    words = [sys.executable, "-m", "pythonfmu", "build", "-f", "HeatExchanger.py"]
-    packed(
-        folder / "HeatExchanger.fmu",
-        lambda: subprocess.run(words, cwd=folder, check=True, capture_output=True),
-        (source / "HeatExchanger.py",),
-        None,
-    )
+    shutil.copytree(source, folder, dirs_exist_ok=True)
+    exported(folder / "HeatExchanger.py")
     return folder
 
 
@@ -363,20 +353,12 @@ def write_beam() -> Callable[..., Path]:
     """
     import meshio
 
-    from fe.elements.kinds import KINDS
-
-    kind = KINDS["hexahedron20"]
-    corners = np.array(
-        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-    )
+    from tests.meshes import box
 
     def write(folder: Path, changes: Mapping[str, str] | None = None, cells: int = 4) -> Path:
-        nodes = np.array([corners + np.array([number, 0, 0]) for number in range(cells)], dtype=float)
-        middles = [0.5 * (nodes[:, a] + nodes[:, b]) for a, b in kind.edges]
-        whole = np.concatenate([nodes, *(middle[:, None] for middle in middles)], axis=1).reshape(-1, 3)
-        points, numbers = np.unique(whole, axis=0, return_inverse=True)
-        points *= [100.0 / cells, 20.0, 10.0]
-        meshio.write(folder / "beam.vtu", meshio.Mesh(points, [("hexahedron20", numbers.reshape(cells, 20))]))
+        points, numbers = box("hexahedron20", (cells, 1, 1))
+        mesh = meshio.Mesh(points * [100.0, 20.0, 10.0], [("hexahedron20", numbers)])
+        meshio.write(folder / "beam.vtu", mesh)
         text = BEAM
         for old, new in (changes or {}).items():
             assert old in text

@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, TypeVar
@@ -95,6 +95,14 @@ def packed(path: Path, pack: Callable[[], object], places: tuple[Path, ...], inp
 
     path.write_bytes(kept(path.stem, content, places, inputs))
     return path
+
+
+def exported(script: Path) -> Path:
+    """Return the FMU that pythonfmu packs of a script, beside it, as its users do."""
+    path = script.with_suffix(".fmu")
+    words = [sys.executable, "-m", "pythonfmu", "build", "-f", script.name]
+    pack = partial(subprocess.run, words, cwd=script.parent, check=True, capture_output=True)
+    return packed(path, pack, (script,), None)
 
 
 def kept_folder(

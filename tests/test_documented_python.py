@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import meshio
+import numpy as np
 import pytest
 
 from calibration.result.file import save_calibration
@@ -94,23 +96,16 @@ def bracket(folder: Path) -> None:
     """Write the structure of the page, and a mesh with its sets."""
     text, *_ = blocks(ROOT / "docs" / "structures.md", "toml")  # the others are of scenarios
     (folder / "bracket.toml").write_text(text, encoding="utf-8")
-    nodes = {
-        (x, y, z): number
-        for number, (x, y, z) in enumerate(itertools.product(range(13), range(3), range(3)), start=1)
-    }
-    deck = ["*NODE", *(f"{n}, {10 * x}, {10 * y - 10}, {10 * z}" for (x, y, z), n in nodes.items())]
-    deck.append("*ELEMENT, TYPE=C3D8, ELSET=BODY")
-    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
-    for element, (x, y, z) in enumerate(itertools.product(range(12), range(2), range(2)), start=1):
-        own = [nodes[x + a, y + b, z + c] for c in (0, 1) for a, b in corners]
-        deck.append(f"{element}, {', '.join(map(str, own))}")
-    for kind, name, members in (
-        ("NSET", "ROOT", [n for (x, _, _), n in nodes.items() if x == 0]),
-        ("NSET", "TOP", [n for (_, _, z), n in nodes.items() if z == 2]),
-        ("ELSET", "LUG", range(1, 9)),
-    ):
-        deck += [f"*{kind}, {kind}={name}", *map(str, members)]
-    (folder / "bracket.inp").write_text("\n".join(deck) + "\n", encoding="ascii")
+    places = np.array([*itertools.product(range(13), range(3), range(3))])
+    number = {tuple(place): node for node, place in enumerate(places)}
+    corners = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    cells = itertools.product(range(12), range(2), range(2))
+    hexahedra = [[number[tuple(np.add(cell, corner))] for corner in corners] for cell in cells]
+    ends = {"ROOT": places[:, 0] == 0, "TOP": places[:, 2] == 2}
+    sets = {"BODY": [np.arange(48)], "LUG": [np.arange(8)]}
+    mesh = meshio.Mesh(10.0 * places - [0, 10, 0], [("hexahedron", hexahedra)], cell_sets=sets)
+    mesh.point_sets = {name: np.flatnonzero(there) for name, there in ends.items()}
+    mesh.write(folder / "bracket.inp")
 
 
 WING_FMU = "fmu build --out wing.fmu"

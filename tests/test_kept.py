@@ -1,4 +1,3 @@
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -52,8 +51,3 @@ def test_what_was_kept_is_met_until_something_changes(source, monkeypatch, chang
     assert once(source, inputs=1.5) == ("one", True)
     change(source, monkeypatch)
     assert once(source) == (source.read_text(encoding="utf-8"), True)
-
-
-def test_of_several_processes_one_makes_it(source):
-    with get_context("fork").Pool(4) as pool:
-        assert sorted(pool.map(once, [source] * 8)) == [("one", False)] * 7 + [("one", True)]

@@ -11,19 +11,16 @@ import webbrowser
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from reporting import terminal
-from twin_master.fleet.command import engine_of, fly_and_show
-from twin_master.sentences import said
-from twin_master.viewer.command import shown
-
-if TYPE_CHECKING:
-    from twin_master.scenario.schema import Scenario
-    from twin_master.store.writing import RunOutcome
-    from twin_master.watch.folder import Watch
+from reporting.errors import ReportingError
+from reporting.words import counted
+from twin_master import parts
+from twin_master.errors import TwinMasterError, said
+from twin_master.fleet_command import engine_of, fly_and_show, shown
 
 
 def run(
@@ -50,46 +47,38 @@ def run(
     policy: Path | None = None,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
-    from twin_master import workflow
-    from twin_master.assets.resolution import Overrides
-    from twin_master.scenario.reading import load_scenario
-
     scenario, ssp = _flown(scenario, with_scenario)
-    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt)
+    overrides = parts.Overrides(
+        seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt
+    )
     told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report}
     if seeds is not None:
-        from twin_master.fleet.plan import ensemble, seed_range
-
-        chosen = _alone(scenario, resume is not None or seed is not None or view or policy is not None)
-        fleet, engine = ensemble(chosen, seed_range(seeds), overrides), engine_of(workers, cluster)
-        fly_and_show(fleet, out, engine, replace=replace, report=not no_report, json=json)
+        if scenario is None or resume is not None or seed is not None or view or policy is not None:
+            raise typer.BadParameter(said("fleet.seeds"), param_hint="--seeds")
+        fleet = parts.ensemble(scenario, parts.seed_range(seeds), overrides)
+        fly_and_show(
+            fleet, out, engine_of(workers, cluster), replace=replace, report=not no_report, json=json
+        )
         return
     if workers is not None or cluster is not None:
         given = "--workers" if cluster is None else "--cluster"
         raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint=given)
-    loaded = None if scenario is None else load_scenario(scenario)
+    loaded = None if scenario is None else parts.load_scenario(scenario)
     if resume is not None:
-        if out is not None or replace or policy is not None or overrides != Overrides():
+        if out is not None or replace or policy is not None or overrides != parts.Overrides():
             raise typer.BadParameter(said("run_folder.resume"), param_hint="--resume")
-        folder, fly = resume, partial(workflow.resume, resume, loaded)
+        folder, fly = resume, partial(parts.resume, resume, loaded)
     else:
         if loaded is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-        fly = partial(workflow.fly, loaded, folder, overrides, policy=policy, replace=replace)
+        fly = partial(parts.fly, loaded, folder, overrides, policy=policy, replace=replace)
     with shown(view) as begun:
         outcome = _interruptible(lambda: fly(begun=begun, **told), folder)
         if json:
             terminal.print_json(_record(outcome))
         else:
             show_outcome(outcome)
-
-
-def _alone(scenario: str | None, beside: bool) -> str:
-    """Return the scenario of an ensemble; refuse what is for one mission."""
-    if scenario is None or beside:
-        raise typer.BadParameter(said("fleet.seeds"), param_hint="--seeds")
-    return scenario
 
 
 def _flown(scenario: str | None, with_scenario: str | None) -> tuple[str | None, Path | None]:
@@ -103,18 +92,14 @@ def _flown(scenario: str | None, with_scenario: str | None) -> tuple[str | None,
     return scenario, None
 
 
-def _record(outcome: "RunOutcome") -> dict[str, Any]:
+def _record(outcome: "parts.RunOutcome") -> dict[str, Any]:
     """Return the content of `summary.json` with the places of run and report."""
-    import json
-
-    from twin_master.store.writing import SUMMARY_NAME
-
-    record: dict[str, Any] = json.loads((outcome.folder / SUMMARY_NAME).read_text(encoding="utf-8"))
+    record: dict[str, Any] = json.loads((outcome.folder / parts.SUMMARY_NAME).read_text(encoding="utf-8"))
     report = None if outcome.report is None else str(outcome.report)
     return {"folder": str(outcome.folder), "report": report} | record
 
 
-def _interruptible(fly: "Callable[[], RunOutcome]", folder: Path) -> "RunOutcome":
+def _interruptible(fly: "Callable[[], parts.RunOutcome]", folder: Path) -> "parts.RunOutcome":
     try:
         return fly()
     except KeyboardInterrupt:
@@ -124,10 +109,8 @@ def _interruptible(fly: "Callable[[], RunOutcome]", folder: Path) -> "RunOutcome
         raise typer.Exit(terminal.INTERRUPTED) from None
 
 
-def show_outcome(outcome: "RunOutcome") -> None:
+def show_outcome(outcome: "parts.RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
-    from reporting.page import Words
-
     rows: list[list[str]] = []
     sources: dict[str, int] = {}
     for figure in outcome.figures:
@@ -140,7 +123,7 @@ def show_outcome(outcome: "RunOutcome") -> None:
             taken = f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)"
             rows.append([f"{part}, per {outcome.step_name}", taken, ""])
     rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s", ""])
-    terminal.show("run", Words("twin_master"), outcome=outcome, rows=rows, sources=sources)
+    terminal.show("run", "twin_master", outcome=outcome, rows=rows, sources=sources)
 
 
 def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str:
@@ -172,15 +155,10 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
 
 
 def _is_ours(error: Exception) -> bool:
-    from calibration.errors import CalibrationError
-    from fe.runtime.errors import FiniteElementError
-    from fmu_asset.errors import FmuError
-    from reporting.errors import ReportingError
-    from twin_master.errors import TwinMasterError
 
     # The system's own refusals (a folder without permission, a full disk) are no defect of the program.
-    ours = (OSError, TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError)
-    return isinstance(error, ours)
+    ours = parts.FmuError, parts.FiniteElementError, parts.CalibrationError, ReportingError
+    return isinstance(error, (OSError, TwinMasterError, *ours))
 
 
 def main() -> None:
@@ -218,29 +196,23 @@ def watch(
 
     Everything is kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up.
     """
-    from reporting.words import counted
-    from twin_master.store.writing import REPORT_NAME
-    from twin_master.watch import opening as from_python
-    from twin_master.watch.feeds import is_broker
-    from twin_master.watch.folder import Watch
-
-    watches: list[Watch] = []
-    live = follow or observations is None or observations == "-" or is_broker(observations)
+    watches: list[parts.Watch] = []
+    live = follow or observations is None or observations == "-" or parts.is_broker(observations)
 
     def decide(decision: Mapping[str, Any]) -> None:
         heard = _say(watches[0], decision, flush=live)
         time.sleep(pace)
-        if not heard and not is_broker(observations or ""):
+        if not heard and not parts.is_broker(observations or ""):
             signal.raise_signal(signal.SIGINT)  # which ends a watch in order
 
     with shown(view) as begun:
 
-        def opened(watched: Watch) -> None:
+        def opened(watched: parts.Watch) -> None:
             watches.append(watched)
             if begun is not None:
                 begun(watched.folder)
 
-        folder = from_python.watch(
+        folder = parts.watch(
             scenario, observations, out, {"seed": seed, "calibration": calibration, "library": library},
             decide=decide, resume=resume, follow=follow, turns=turns, model_patch=model_patch,
             from_turn=from_turn, teach=teach, allow_unknown=allow_unknown, ca_file=ca_file, replace=replace,
@@ -251,11 +223,11 @@ def watch(
         refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
         refused *= counts.rejected > 0
         typer.echo(f"Watch: {folder}, {counted(counts.received, 'message')}{refused}.", err=True)
-        if not no_report and (folder / REPORT_NAME).is_file():
-            typer.echo(f"Report: {folder / REPORT_NAME}", err=True)
+        if not no_report and (folder / parts.REPORT_NAME).is_file():
+            typer.echo(f"Report: {folder / parts.REPORT_NAME}", err=True)
 
 
-def _say(watched: "Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:
+def _say(watched: "parts.Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:
     """Print a decision; return whether anybody reads it."""
     for notice in decision["notices"]:  # also where the decisions go to a program
         sentence = notice["sentence"].replace(" DIR", f" {shlex.quote(str(watched.folder))}")
@@ -281,11 +253,9 @@ def _write(text: str, *, flush: bool) -> bool:
     return True
 
 
-def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:
+def _line(scenario: "parts.Scenario", decision: Mapping[str, Any]) -> str:
     """Return a decision for people: a line of a terminal."""
-    from twin_master.mission.loop import health_in_words
-
-    health = ", ".join(f"{name} {said}" for name, said in health_in_words(decision).items())
+    health = ", ".join(f"{name} {said}" for name, said in parts.health_in_words(decision).items())
     line = (
         f"{scenario.mission.step_name} {decision['turn']}: {decision['control']}, {health}; "
         f"next {decision['next_control']} with probability {decision['probability']:.3f}"
@@ -296,12 +266,10 @@ def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:
 
 def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
     """Show a flight in the browser, turn by turn or while it goes on, or a whole fleet."""
-    from twin_master.fleet.report import is_fleet, serve_fleet
-    from twin_master.viewer.server import serve
 
     def ready(address: str) -> None:
         typer.echo(f"{folder}: {address} (Ctrl-C ends it)")
         if browser:
             webbrowser.open(address)
 
-    (serve_fleet if is_fleet(folder) else serve)(folder, port, ready)
+    (parts.serve_fleet if parts.is_fleet(folder) else parts.serve)(folder, port, ready)

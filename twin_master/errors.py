@@ -1,6 +1,10 @@
-"""What can go wrong in the twin, by cause."""
+"""What can go wrong in the twin, by cause, and why it refuses what it is given: a file of sentences."""
 
 from collections.abc import Collection, Iterable, Mapping
+
+from reporting.sentences import Sentences
+
+said = Sentences(__file__).said
 
 
 class TwinMasterError(Exception):

@@ -4,23 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from reporting import terminal
-from twin_master.errors import MissionInputError
-from twin_master.sentences import said
-
-if TYPE_CHECKING:
-    import numpy as np
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
-
-    from twin_master.mission.planning import ComparedPolicy
-    from twin_master.mission.preparation import Knowledge
-    from twin_master.network.belief_planning import BeliefPlan, DecisionProblem
-    from twin_master.scenario.schema import Scenario
-
-    Float = NDArray[np.float64]
+from reporting.files import atomic_write_bytes
+from twin_master import parts
+from twin_master.errors import MissionInputError, said
 
 
 def plan(
@@ -34,63 +23,54 @@ def plan(
     json: bool = False,
 ) -> None:
     """Plan on the belief: expected return with its bounds, beside simpler rules."""
-    from reporting.files import atomic_write_bytes
-    from reporting.page import Words
-    from twin_master.mission.planning import compared, policy_file, risk_of
-    from twin_master.report.structure import plan_figure
-
     knowledge, _ = _knowledge(scenario, seed, calibration)
     blind = _without(knowledge, [value_of]) if value_of is not None else None
     problem, plan, promised = _planned(knowledge)
     if out is not None:
-        atomic_write_bytes(out, policy_file(plan.policy, knowledge.model))
+        atomic_write_bytes(out, parts.policy_file(plan.policy, knowledge.model))
     if picture is not None:
-        _draw(picture, plan_figure(plan.policy, knowledge.model))
+        _draw(picture, parts.plan_figure(plan.policy, knowledge.model))
     record: dict[str, Any] = {
         "lower": plan.lower,
         "upper": plan.upper,
         "simulated": promised.mean,
         "half_width": promised.half_width,
-        "beyond_limit": risk_of(knowledge.scenario, problem, knowledge.rewards, plan.policy),
+        "beyond_limit": parts.risk_of(knowledge.scenario, problem, knowledge.rewards, plan.policy),
     }
-    rows = [promised, *([] if blind else compared(knowledge.scenario, problem))]
+    rows = [promised, *([] if blind else parts.compared(knowledge.scenario, problem))]
     if blind is not None:
         without = _planned(blind)[2]
         worth = promised.beyond(without)
         rows.append(replace(without, name=f"planned without {value_of}"))
         record["value"] = {"of": value_of, "mean": worth.mean, "half_width": worth.half_width}
     record["rules"] = {row.name: [row.mean, row.half_width] for row in rows}
-    terminal.answer("plan", Words("twin_master"), record, json=json)
+    terminal.answer("plan", "twin_master", record, json=json)
 
 
 def _knowledge(
     scenario: str, seed: int | None, calibration: Path | None, candidates: str | None = None
-) -> "tuple[Knowledge, tuple[Float | None, list[Float]]]":
+) -> "tuple[parts.Knowledge, tuple[parts.Float | None, list[parts.Float]]]":
     """Return what the twin knows before any plan on the belief, and where its gauges are, see `_places`."""
-    from twin_master.assets.candidates import with_candidates
-    from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
-    from twin_master.mission.preparation import prepared_alone
-    from twin_master.scenario.reading import load_scenario
-
-    resolved = resolve_scenario(load_scenario(scenario), Overrides(seed=seed, calibration=calibration))
-    believed_source(resolved).check()
+    given = {"seed": seed, "calibration": calibration}
+    resolved = parts.resolve_scenario(parts.load_scenario(scenario), given)
+    parts.believed_source(resolved).check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:
-            resolved = with_candidates(resolved, candidates, Path(folder, "candidates"))
-        found = prepared_alone(resolved, believed_source(resolved), terminal.progress())
+            resolved = parts.with_candidates(resolved, candidates, Path(folder, "candidates"))
+        found = parts.prepared_alone(resolved, parts.believed_source(resolved), terminal.progress())
         return found, _places(resolved)
 
 
-def _planned(knowledge: "Knowledge") -> "tuple[DecisionProblem, BeliefPlan, ComparedPolicy]":
+def _planned(
+    knowledge: "parts.Knowledge",
+) -> "tuple[parts.DecisionProblem, parts.BeliefPlan, parts.ComparedPolicy]":
     """Return what is decided on, the plan, and what it promises."""
-    from twin_master.mission.planning import expected_plan, promised
-
     scenario, problem = knowledge.scenario, knowledge.problem
-    plan = expected_plan(scenario, problem, knowledge.rewards)[0]
-    return problem, plan, promised(scenario, problem, plan.policy)
+    plan = parts.expected_plan(scenario, problem, knowledge.rewards)[0]
+    return problem, plan, parts.promised(scenario, problem, plan.policy)
 
 
-def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
+def _without(knowledge: "parts.Knowledge", names: Sequence[str]) -> "parts.Knowledge":
     """Return what is known where actions that inspect show nothing, or gauges are not there."""
     import numpy as np
 
@@ -116,7 +96,7 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     return replace(knowledge, scenario=bare)
 
 
-def _titles(scenario: "Scenario") -> tuple[str, ...]:
+def _titles(scenario: "parts.Scenario") -> tuple[str, ...]:
     """Return what the sensors are called: their titles, or numbers from 1."""
     section = scenario.observation
     return section.titles or tuple(str(number + 1) for number in range(section.count))
@@ -126,11 +106,9 @@ _BLIND = 1e6
 """Standard deviation of a sensor that shows nothing, over the largest that it could show."""
 
 
-def _draw(path: Path, figure: "Figure") -> None:
-    from reporting.figures import to_png, to_svg
-    from reporting.files import atomic_write_bytes
+def _draw(path: Path, figure: "parts.Figure") -> None:
 
-    atomic_write_bytes(path, to_png(figure) if path.suffix.lower() == ".png" else to_svg(figure))
+    atomic_write_bytes(path, parts.to_png(figure) if path.suffix.lower() == ".png" else parts.to_svg(figure))
 
 
 def design(
@@ -146,18 +124,15 @@ def design(
     json: bool = False,
 ) -> None:
     """Choose the sensors that tell most of the state, and name what none of them separates."""
-    from reporting.page import Words
-    from twin_master.mission.sensor_design import chosen_sensors, drawn_readings, separations
-
     knowledge, places = _knowledge(scenario, None, calibration, candidates)
     titles = _titles(knowledge.scenario)
     wanted = titles if among is None else tuple(among.split(","))
     if not {*wanted} <= {*titles} or len({*wanted}) < len(wanted):
         raise MissionInputError(said("plan_command.among", first=titles[0], last=titles[-1], among=among))
-    pool, readings = [titles.index(name) for name in wanted], drawn_readings(knowledge)
-    found = chosen_sensors(readings, pool, sensors)
+    pool, readings = [titles.index(name) for name in wanted], parts.drawn_readings(knowledge)
+    found = parts.chosen_sensors(readings, pool, sensors)
     names = [titles[sensor] for sensor in found.sensors]
-    apart = separations(knowledge, readings, pool)
+    apart = parts.separations(knowledge, readings, pool)
     record: dict[str, Any] = {
         "sensors": names,
         "information": list(found.information),
@@ -171,28 +146,23 @@ def design(
         compared = {"chosen": few, "all": every, "all beyond chosen": every.beyond(few)}
         record["worth"] = {what: [one.mean, one.half_width] for what, one in compared.items()}
     _draw_design(picture, vtu, places, record, found.sensors)
-    terminal.answer("design", Words("twin_master"), record, json=json, candidates=len(pool))
+    terminal.answer("design", "twin_master", record, json=json, candidates=len(pool))
 
 
-def _between(knowledge: "Knowledge", name: str, level: int) -> str:
+def _between(knowledge: "parts.Knowledge", name: str, level: int) -> str:
     """Return two neighbouring levels of a state in words."""
-    from twin_master.scenario.section import printed_state
-
     place = knowledge.scenario.state_names.index(name)
     factor = knowledge.scenario.state[place]
-    scale, unit = printed_state(factor.unit)
+    scale, unit = parts.printed_state(factor.unit)
     low, high = (scale * value for value in factor.levels[level : level + 2])
     return f"{name} of {low:g} {unit} from {high:g} {unit}"
 
 
 def _draw_design(
-    picture: Path | None, vtu: Path | None, where: "tuple[Float | None, list[Float]]",
+    picture: Path | None, vtu: Path | None, where: "tuple[parts.Float | None, list[parts.Float]]",
     record: Mapping[str, Any], chosen: Sequence[int],
 ) -> None:  # fmt: skip
     import numpy as np
-
-    from fe.structure.operators import write_vtu
-    from twin_master.report.structure import design_figure
 
     places, outlines = where
     if vtu is not None:
@@ -200,32 +170,26 @@ def _draw_design(
             raise MissionInputError("--vtu needs a wing or a structure whose file says where its gauges are.")
         rank = np.zeros(len(places))
         rank[list(chosen)] = np.arange(1, len(chosen) + 1)
-        write_vtu(vtu, places, ("vertex", np.arange(len(rank))[:, None]), {"rank": rank}, {})
+        parts.write_vtu(vtu, places, ("vertex", np.arange(len(rank))[:, None]), {"rank": rank}, {})
     if picture is not None:
         if places is not None:  # the two axes along which they are spread most
             places = places[:, np.sort(np.argsort(-np.ptp(places, axis=0), kind="stable")[:2])]
-        figure = design_figure(
+        figure = parts.design_figure(
             record["information"], record["of_all"], record["sensors"], places, chosen, outlines
         )
         _draw(picture, figure)
 
 
-def _places(scenario: "Scenario") -> "tuple[Float | None, list[Float]]":
+def _places(scenario: "parts.Scenario") -> "tuple[parts.Float | None, list[parts.Float]]":
     """Return where the gauges are (G, 3) [m], None where no file says it, and outlines (N, 2) of a wing."""
     import numpy as np
 
-    from fe.structure.design import MeshDesign, load_structure
-    from fe.wing.design import load_design
-    from twin_master.assets.design_source import DESIGN_COPY
-    from twin_master.assets.structure_source import MODEL_COPY
-    from twin_master.report.structure import planform_of
-
     files = scenario.belief.all_files()
-    structure = load_structure(files[MODEL_COPY]) if MODEL_COPY in files else None
-    if isinstance(structure, MeshDesign) and scenario.observation.role == "strain":
-        return structure.unit * np.array([part.point for part in structure.gauge]), []
-    file = files.get(DESIGN_COPY)
-    wing = planform_of(None if file is None else load_design(file), scenario)
+    places = parts.gauge_places(files.get(parts.MODEL_COPY))
+    if places is not None and scenario.observation.role == "strain":
+        return places, []
+    file = files.get(parts.DESIGN_COPY)
+    wing = parts.planform_of(None if file is None else parts.load_design(file), scenario)
     if wing is None:
         return None, []
     return np.insert(wing.gauges, 2, 0.0, axis=1), [wing.outline, *wing.regions]

@@ -16,10 +16,9 @@ from reporting.folders import lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance
-from twin_master.errors import NotResumableError, RunFolderError
+from twin_master.errors import NotResumableError, RunFolderError, said
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 
 CONFIG_NAME = "config.json"
 FIELD_NAME = "wing.vtu"

@@ -22,16 +22,15 @@ from twin_master.assets.resolution import (
     Overrides,
     asset_source,
     believed_source,
-    given_overrides,
     resolve_scenario,
+    scenario_bytes,
 )
-from twin_master.errors import NotResumableError
+from twin_master.errors import NotResumableError, said
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.planning import policy_file, read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
-from twin_master.network.memory import scenario_bytes
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import (
@@ -45,7 +44,6 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import WATCHED_KIND, Scenario
-from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
@@ -98,8 +96,8 @@ def fly(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError
         With one clear sentence; the run folder stays resumable.
     """
-    loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
-    resolved = resolve_scenario(loaded, given_overrides(overrides))
+    loaded = load_scenario(scenario)
+    resolved = resolve_scenario(loaded, overrides)
     folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
     progress = progress or SilentProgress()
     files = {}
@@ -213,9 +211,14 @@ def _known(
 ) -> Knowledge:
     """Return what the twin knows before its flight, and keep it."""
     knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
-    _tell_of_another_truth(knowledge, progress)
-    record, origin = knowledge.draws.record or {}, source.origin
-    told = calibrated_with(record, origin.asset, origin.model, config["inputs"])
+    draws, origin = knowledge.draws, source.origin
+    truth = scenario.asset.true_parameters.get(draws.name)
+    # The true asset of the scenario may not be the one that the calibration file describes.
+    if scenario.calibration.source == "file" and truth is not None:
+        sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
+        if sentence is not None:
+            progress.note(said("mission.truth", sentence=sentence, name=draws.name))
+    told = calibrated_with(draws.record or {}, origin.asset, origin.model, config["inputs"])
     if told is not None:
         progress.note(told)
     keep_knowledge(folder, knowledge)
@@ -225,17 +228,6 @@ def _known(
         compiling.turn(np.full(scenario.observation.count, np.nan), 0)
     compiling.smoothed()
     return knowledge
-
-
-def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
-    """Say so where the true asset of the scenario is not the one that the calibration file describes."""
-    draws, scenario = knowledge.draws, knowledge.scenario
-    truth = scenario.asset.true_parameters.get(draws.name)
-    if scenario.calibration.source != "file" or truth is None:
-        return
-    sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
-    if sentence is not None:
-        progress.note(said("mission.truth", sentence=sentence, name=draws.name))
 
 
 @contextmanager
@@ -311,7 +303,9 @@ def _report(folder: Path) -> None:
     write_report(folder)
 
 
-def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -> dict[str, Any]:
+def check_scenario(
+    loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Return what a scenario is with the overrides, once everything that it names was looked at.
 
     Beside what it flies and believes, in words, these are the sizes of the twin: `levels` of each factor,
@@ -326,7 +320,7 @@ def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -
     BindingError, InvalidDesignError, DesignFileError
         The binding or the design is wrong.
     """
-    scenario = resolve_scenario(loaded, overrides or Overrides())
+    scenario = resolve_scenario(loaded, overrides)
     watched = scenario.asset.kind == WATCHED_KIND
     source = believed_source(scenario) if watched else asset_source(scenario)
     source.check()

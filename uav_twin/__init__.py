@@ -4,13 +4,21 @@ Each name comes from the package that holds it, and is imported when it is used.
 beside this file lists them; `docs/python.md` shows all of them at work; the command line is `uav-twin`.
 """
 
-from uav_twin.lazy import handed_on
+from typing import Any
 
-_HOMES, __getattr__ = handed_on(__file__)
-"""Module of each name, and what imports it."""
+from uav_twin.shadowing import refuse_shadowing
 
-__all__ = sorted(_HOMES)  # noqa: PLE0605 - the names stand in `__init__.pyi` alone
+
+def __getattr__(name: str) -> Any:
+    if name.startswith("__") and name != "__all__":  # asked for by Python itself
+        raise AttributeError(name)
+    refuse_shadowing()
+    from reporting.lazy import handed_on, homes_of
+
+    homes = homes_of(__file__)
+    known: dict[str, Any] = {"_HOMES": homes, "__all__": sorted(homes)}
+    return known[name] if name in known else handed_on(__name__, __file__)(name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__getattr__("__all__")})

@@ -12,7 +12,7 @@ from fe.runtime.state import DigitalState
 from reporting import terminal
 from reporting.files import atomic_write_text, refuse_filled
 from uav_twin import parts
-from uav_twin.discrepancy_run import one_thread
+from uav_twin.discrepancy_commands import one_thread
 from uav_twin.options import show
 
 

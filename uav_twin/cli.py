@@ -10,7 +10,7 @@ import typer
 from discrepancy.errors import DiscrepancyError
 from reporting import terminal
 from twin_master.command import guarded
-from uav_twin.sentences import said
+from uav_twin.options import said
 
 
 def _version(asked: bool) -> None:

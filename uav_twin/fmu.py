@@ -1,20 +1,22 @@
-"""`uav-twin fmu build`, `info`, `bind` and `check`."""
+"""`uav-twin fmu build`, `info`, `bind`, `check` and `simulate`, and `uav-twin ssp simulate`."""
 
 import gc
 import re
+import tempfile
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
 import typer
 
+from fmu_asset.errors import FmuInputError
 from reporting import terminal
-from reporting.files import atomic_write_text, refuse_existing
+from reporting.files import atomic_write_bytes, atomic_write_text, refuse_existing
 from reporting.words import counted
 from scenarios import asset_scripts
 from uav_twin import parts
-from uav_twin.options import answer, refused, show
-from uav_twin.sentences import said
+from uav_twin.options import answer, refused, said, show
 from uav_twin.structure import fmu as build_structure
 from uav_twin.structure import names_structure
 
@@ -129,3 +131,165 @@ def info(file: Path, *, variables: bool = True, json: bool = False) -> None:
     rows = [["" if row.get(key) is None else str(row[key]) for key in keys] for row in described["variables"]]
     record = {"file": str(file)} | described | {"obstacle": obstacle}
     answer("fmu info", record, json=json, facts=facts, rows=rows if variables else ())
+
+
+_MOST_PANELS, _MOST_LINES = 8, 10
+
+
+def simulate(
+    file: Path,
+    *,
+    binding: Path | None = None,
+    inputs: Path | None = None,
+    out: Path | None = None,
+    stop_time: float | None = None,
+    step_size: float | None = None,
+    values: list[str] | None = None,
+    plot: Path | None = None,
+    interpolation: str | None = None,
+    in_process: bool = False,
+    step_timeout: float | None = None,
+    replace: bool = False,
+) -> None:
+    """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
+    _refuse_files(out, plot, replace=replace)
+    if (binding is None) != (inputs is None):
+        raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
+    if binding is not None and (stop_time is not None or step_size is not None or values):
+        raise FmuInputError(said("fmu.without_binding"))
+    if interpolation is not None and inputs is None:
+        raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")
+    if binding is None:
+        planned = parts.default_experiment(
+            parts.read_fmu(file), stop_time=stop_time, step_size=step_size, values=_values_of(values)
+        )
+        bound = planned.binding
+    else:
+        bound = _interpolated(parts.load_binding(binding), interpolation)
+    with closing(parts.FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)) as asset:
+        if inputs is None:
+            history = parts.fly(asset, planned)
+        else:
+            history = parts.fly_histories(asset, parts.read_histories(inputs, asset.binding))
+        _finish(asset, history, file, out, plot)
+
+
+def simulate_system(
+    file: Path,
+    *,
+    out: Path | None = None,
+    stop_time: float | None = None,
+    step_size: float | None = None,
+    values: list[str] | None = None,
+    plot: Path | None = None,
+    algorithm: str = "gauss_seidel",
+    iterations: int = 1,
+    delay: list[str] | None = None,
+    interpolation: str | None = None,
+    in_process: bool = False,
+    replace: bool = False,
+) -> None:
+    """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
+    _refuse_files(out, plot, replace=replace)
+    given = _values_of(values)
+    for name, value in given.items():
+        if isinstance(value, list):
+            raise FmuInputError(f"--set {name} has {len(value)} values; ends of a system take one number.")
+    with tempfile.TemporaryDirectory() as folder:
+        wiring = parts.join_ssp(parts.read_ssp(file, folder), delay or ())
+        if left_out := parts.left_out_sentence(wiring, file):
+            terminal.say(f"warning: {left_out}")
+        described = parts.system_description(wiring)
+        planned = parts.default_experiment(described, stop_time=stop_time, step_size=step_size, values=given)
+        with parts.CoupledAsset(
+            wiring,
+            _interpolated(planned.binding, interpolation),
+            algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
+            iterations=iterations,
+            isolated=not in_process,
+            parameters=planned.parameters,
+        ) as asset:
+            _finish(asset, parts.fly(asset, planned), file, out, plot)
+
+
+def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
+    """Refuse files that cannot be written, before anything is simulated."""
+    for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
+        if path is not None and path.suffix not in suffixes:
+            raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
+        refuse_existing(path, replace=replace, option=option)
+
+
+def _values_of(texts: list[str] | None) -> dict[str, float | list[float]]:
+    """Return values by name: numbers, true and false, or for an array several with commas between."""
+    found: dict[str, float | list[float]] = {}
+    for text in texts or ():
+        name, _, value = text.rpartition("=")
+        words = [{"true": "1", "false": "0"}.get(word.strip(), word) for word in value.split(",")]
+        try:
+            numbers = [float(word) for word in words if name]
+        except ValueError:
+            numbers = []
+        if not numbers:
+            raise FmuInputError(said("fmu.set", text=text))
+        found[name] = numbers[0] if len(numbers) == 1 else numbers
+    return found
+
+
+def _interpolated(binding: "parts.Binding", kind: str | None) -> "parts.Binding":
+    """Return a binding with inputs that go on between communication points as `--interpolation` says."""
+    if kind is None:
+        return binding
+    if kind not in ("zero-order", "linear"):
+        raise FmuInputError(f"--interpolation must be zero-order or linear, and {kind!r} came.")
+    return binding.with_header(interpolation=kind)
+
+
+def _finish(
+    asset: "parts.FmiAsset",
+    history: "parts.ObservationHistory",
+    file: Path,
+    out: Path | None,
+    plot: Path | None,
+) -> None:
+    """Write and draw what was simulated, and say so; where nothing was written, what stands at the end."""
+    if out is not None:
+        parts.write_history(out, asset, (file.name, parts.hash_file(file)), history)
+    binding, units = asset.binding, asset.recorded_units
+    observed = [unit for vector in binding.observation.values() for unit in vector.units]
+    columns = [*zip(binding.observation_variables, observed, history.values.T, strict=True)]
+    columns += [(name, units[name], values) for name, values in history.extra.items()]
+    if plot is not None:
+        _draw(plot, history, columns)
+    show(
+        "simulated",
+        asset=asset,
+        history=history,
+        written=[path for path in (out, plot) if path is not None],
+        file=file,
+        end=history.time[-1] if len(history.time) else asset.time,
+        # The start may be a row of its own.
+        steps=int((history.time > binding.binding.start_time).sum()),
+        columns=columns,
+    )
+
+
+def _draw(path: Path, history: "parts.ObservationHistory", columns: list[tuple[str, str, Any]]) -> None:
+    """Draw the outputs over time, those of one unit in one panel, and write the picture."""
+    panels: dict[str, list[tuple[str, Any]]] = {}
+    for name, unit, values in columns:
+        panels.setdefault(unit, []).append((name, values))
+    shown = dict(list(panels.items())[:_MOST_PANELS])
+    with parts.publication_style():
+        figure = parts.new_figure(0.5 + 1.5 * len(shown), parts.FULL_WIDTH)
+        axes = figure.subplots(len(shown), squeeze=False, sharex=True)[:, 0]
+        for panel, (unit, lines) in zip(axes, shown.items(), strict=True):
+            for name, values in lines[:_MOST_LINES]:
+                panel.plot(history.time, values, label=name)
+            more = f" and {len(lines) - _MOST_LINES} more" if len(lines) > _MOST_LINES else ""
+            panel.set_ylabel(lines[0][0] + f" [{unit}]" if len(lines) == 1 else f"[{unit}]")
+            if len(lines) > 1:
+                panel.legend(title=more or None, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        axes[-1].set_xlabel("time [s]")
+        figure.tight_layout()
+        atomic_write_bytes(path, (parts.to_svg if path.suffix == ".svg" else parts.to_png)(figure))

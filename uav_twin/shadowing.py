@@ -1,5 +1,6 @@
-"""Files of the user that hide a package of this project, because Python finds them first."""
+"""Files of the user that hide a package of this project, because Python finds them first, are refused."""
 
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,8 +20,9 @@ class ShadowedPackageError(ImportError):
     """Another file or folder has the name of a package of this project, and is found first."""
 
 
+@cache
 def refuse_shadowing() -> None:
-    """Make sure that each package of this project is the one that will be imported.
+    """Make sure, once, that each package of this project is the one that will be imported.
 
     Raises
     ------

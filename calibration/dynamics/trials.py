@@ -185,14 +185,17 @@ def fit_ring_down(record: RingDownRecord, *, free: bool = False, start: float = 
         If the record does not decay, or shows fewer than two modes.
     """
     record = prepare(record, start)
-    _refuse_steady(record)
+    signal, third = detrend(record.signal), record.count // 3
+    first, last = (math.sqrt(float(np.mean(part**2))) for part in (signal[:third], signal[-third:]))
+    if last > _STEADY_SHARE * first:
+        raise ExperimentDataError(said("ringdown.steady", record=record, share=last / first))
     omega = 2.0 * math.pi * np.array(spectral_peaks(record))
     model = DampedCosines(record.time, record.signal, record.averaging_width)
     searches = [model.fit((1j - ratio) * omega, frequencies_fitted=free) for ratio in _STARTING_RATIOS]
     found = min(searches, key=lambda search: float(search.deviation[0]))
-    first, second = sorted(found.modes, key=lambda mode: mode.pole.imag)
-    refuse_growing((first, second), record.source)
-    return RingDownFit((first, second), record, found.fitted[:, 0], float(found.deviation[0]), free)
+    low, high = sorted(found.modes, key=lambda mode: mode.pole.imag)
+    refuse_growing((low, high), record.source)
+    return RingDownFit((low, high), record, found.fitted[:, 0], float(found.deviation[0]), free)
 
 
 def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
@@ -201,14 +204,6 @@ def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
         if not 0.0 < -mode.pole.real < mode.pole.imag:
             where, fitted = (source, number), (mode.damped_frequency, -mode.pole.real)
             raise ExperimentDataError(said("ringdown.no_decay", where=where, fitted=fitted))
-
-
-def _refuse_steady(record: RingDownRecord) -> None:
-    signal = detrend(record.signal)
-    third = record.count // 3
-    first, last = (math.sqrt(float(np.mean(part**2))) for part in (signal[:third], signal[-third:]))
-    if last > _STEADY_SHARE * first:
-        raise ExperimentDataError(said("ringdown.steady", record=record, share=last / first))
 
 
 PUBLISHED_FREQUENCIES = (5.6492, 29.9699)

@@ -56,19 +56,11 @@ def choose_held_out(campaign: Campaign) -> Campaign:
     return replace(campaign, trials=tuple(kept), remarks=(*campaign.remarks, remark))
 
 
-def level(trial: Trial) -> float:
-    """Return the level of a trial: release displacement, or the largest force or load factor."""
-    if trial.release is not None:
-        return abs(trial.release.displacement)
-    inputs = trial.load_factor if trial.kind is TrialKind.FLIGHT else trial.force
-    return float(np.max(np.abs(inputs)))
-
-
 def _spared(trials: list[Trial], campaign: Campaign, taken: set[str]) -> set[str]:
     if len(trials) < LEAST_TRIALS:
         return set()
     wanted = max(1, round(SHARE * len(trials)))
-    levels = np.array([level(trial) for trial in trials])
+    levels = np.array([trial.level for trial in trials])
     middle = 0.5 * (levels.min() + levels.max())
     inside = (levels > levels.min()) & (levels < levels.max())
     # Stable: inside first, then by distance from the middle, then the later trial.
@@ -91,21 +83,20 @@ def _spared(trials: list[Trial], campaign: Campaign, taken: set[str]) -> set[str
 def _stays_covered(trial: Trial, left: list[Trial], others: list[Trial]) -> bool:
     """Return whether channels, run, place and level of a trial are still there without it."""
     channels = Counter(name for item in left for name in item.channels)
-    levels = [level(item) for item in left]
+    levels = [item.level for item in left]
     return (
         all(channels[name] for name in trial.channels)
         and any(item.run == trial.run for item in left + others)
         and any(item.load_place == trial.load_place for item in left)
         # Without the extreme level the model would be proved beyond what it has seen.
-        and min(levels) <= level(trial) * (1.0 + 1e-9)
-        and max(levels) >= level(trial) * (1.0 - 1e-9)
+        and min(levels) <= trial.level * (1.0 + 1e-9)
+        and max(levels) >= trial.level * (1.0 - 1e-9)
     )
 
 
 def _split(trial: Trial, names: set[str]) -> tuple[Trial, Trial] | None:
     """Return a trial without every third interior level, and those levels as a trial that is held out."""
-    load = trial.load_factor if trial.kind is TrialKind.FLIGHT else trial.force
-    steps = np.diff(load)
+    load, steps = trial.load, np.diff(trial.load)
     levels = np.unique(load)
     if len(levels) < LEAST_LEVELS or not (np.all(steps >= 0.0) or np.all(steps <= 0.0)):
         return None

@@ -60,14 +60,14 @@ class NoiseModel:
     interval: float | None = None
     lines: tuple[float, ...] = ()
 
-    def whiten(self, columns: FloatArray, interval: float) -> FloatArray:
+    def whiten(self, columns: FloatArray, interval: float | None) -> FloatArray:
         """Return the columns (..., N) of a dynamic record filtered so that this noise becomes white.
 
         Parameters
         ----------
         columns : (..., N) ndarray
             Residuals or derivatives, along the last axis.
-        interval : float
+        interval : float or None
             Their sampling interval [s]; the filter applies only at the record's own interval.
         """
         if not self.applies(interval):
@@ -92,18 +92,18 @@ class NoiseModel:
             weights.append(np.sqrt(share) * np.r_[-coefficients[::-1], 1.0])
         return tuple(reversed(weights))
 
-    def applies(self, interval: float) -> bool:
-        """Whether the autoregression belongs to this sampling interval."""
+    def applies(self, interval: float | None) -> bool:
+        """Whether the autoregression belongs to this sampling interval; to None, of uneven samples, not."""
         return bool(
             self.autoregression.size
             and self.interval is not None
+            and interval is not None
             and abs(interval - self.interval) <= 1e-3 * self.interval
         )
 
     def stays_coloured(self, trial: Trial) -> bool:
         """Whether coloured noise cannot be whitened in a trial: its samples are no independent ones there."""
-        pace = trial.whitened_at
-        return trial.is_dynamic and self.autoregression.size > 0 and not (pace and self.applies(pace))
+        return trial.is_dynamic and self.autoregression.size > 0 and not self.applies(trial.whitened_at)
 
 
 def aliased(frequency: float, interval: float) -> float:

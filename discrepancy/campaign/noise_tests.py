@@ -46,13 +46,11 @@ def pooled_variance_p_value(p_values: FloatArray, freedom: FloatArray, noise_fre
     return float(stats.norm.sf(weights @ scores / np.sqrt(weights @ weights)))
 
 
-def ljung_box(
-    series: FloatArray, lags: int | None = None, used: BoolArray | None = None
-) -> tuple[float, float]:
+def ljung_box(series: FloatArray, used: BoolArray | None = None) -> tuple[float, float]:
     """Return Q and its p-value for a series that is white with mean zero under the null.
 
-    Ljung and Box 1978, Biometrika 65, eq. (1.3): Q = n (n + 2) sum_k rho_k^2 / (n - k) over `lags` lags
-    (default min(20, n / 5)). Beyond its 99 % point chi^2 is exceeded up to four times too often at n = 64:
+    Ljung and Box 1978, Biometrika 65, eq. (1.3): Q = n (n + 2) sum_k rho_k^2 / (n - k) over
+    min(20, n / 5) lags. Beyond its 99 % point chi^2 is exceeded up to four times too often at n = 64:
     the p-value is that of a gamma distribution with the mean, variance and skewness of Q at this n. What a
     model that was fitted to the series has absorbed makes the test stricter on itself, never laxer.
 
@@ -60,14 +58,12 @@ def ljung_box(
     ----------
     series : (N,) ndarray
         Residuals.
-    lags : int, optional
-        Number of autocorrelations.
     used : (N,) ndarray of bool, optional
         Samples that count: n is their number, and the pairs k apart that are left stand for n - k, so that
         the mean of Q stays exact.
     """
     count = series.size if used is None else int(used.sum())
-    lags = min(LAGS, count // 5) if lags is None else lags
+    lags = min(LAGS, count // 5)
     kept = series if used is None else np.where(used, series, 0.0)
     if lags < 1 or not np.any(kept):
         return 0.0, 1.0

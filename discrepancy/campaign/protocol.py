@@ -2,10 +2,12 @@
 
 from dataclasses import field
 from keyword import iskeyword
+from math import inf, isinf
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, WrapValidator
 from pydantic.dataclasses import dataclass
+from pydantic_core import PydanticKnownError
 
 from discrepancy.errors import CampaignFileError, said
 from fe.runtime.expression import RESERVED
@@ -16,6 +18,28 @@ IN_FILES = ConfigDict(extra="forbid", strict=False)
 """How a table of a file becomes a record: unknown keys are refused; fields say how strict they are."""
 LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 """What a list of the file becomes before it is checked."""
+
+
+def _refused(value: object) -> object:
+    raise PydanticKnownError("unexpected_keyword_argument")
+
+
+def _needed(value: str) -> str:
+    if not value:
+        raise PydanticKnownError("missing")
+    return value
+
+
+NOT_IN_FILES = BeforeValidator(_refused)
+"""Of a key that the tables of samples at rest say, and a file cannot."""
+InFiles = Annotated[str, AfterValidator(_needed), Field(max_length=200, validate_default=True)]
+"""What all have that are in files."""
+Deviation = Annotated[
+    NotNegative,
+    WrapValidator(lambda value, check: inf if value == "free" else check(value)),
+    PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
+]
+"""In files an infinite one is "free"."""
 
 
 @dataclass(frozen=True)

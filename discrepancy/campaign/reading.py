@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from discrepancy.campaign import schema
-from discrepancy.campaign.noise import pre_trigger_record, repeat_record
+from discrepancy.campaign.noise import noise_model, pre_trigger_record, repeat_record
 from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
@@ -24,8 +24,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.remarks import remarks_on
-from discrepancy.campaign.sampling import check_sampling, nearly_even
+from discrepancy.campaign.sampling import check_sampling, nearly_even, spacing_sentence
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.provenance import hash_file, hash_record
@@ -65,13 +64,17 @@ def read_campaign(folder: str | Path) -> Campaign:
     folder = Path(folder)
     if folder.name == CAMPAIGN_FILE:
         folder = folder.parent
-    section = _read_section(folder)
+    path = folder / CAMPAIGN_FILE
+    if not path.exists():
+        missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
+        raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
+    section = schema.parse_campaign(read_toml(path, CampaignFileError, what="campaign"), str(path))
     names = {CAMPAIGN_FILE, *(trial.file for trial in section.trial)}
     if section.noise is not None:
         names.add(section.noise.file)
     for name in sorted(names):
-        path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
+        own = PurePosixPath(name)
+        if own.is_absolute() or ".." in own.parts or "\\" in name or "\0" in name:
             raise CampaignFileError(said("campaign.outside", name=name))
     tables = {name: _read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
     data_hash = hash_record({name: hash_file(folder / name) for name in sorted(names)})
@@ -169,14 +172,6 @@ def _read_table(folder: Path, name: str) -> TextTable:
         there = ", ".join(sorted(item.name for item in folder.glob("*.csv"))) or "none"
         raise CampaignFileError(said("campaign.no_file", name=name, folder=folder, there=there))
     return read_table(folder / name, TABLE_ERRORS, name=name)
-
-
-def _read_section(folder: Path) -> schema.CampaignSection:
-    path = folder / CAMPAIGN_FILE
-    if not path.exists():
-        missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
-        raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
-    return schema.parse_campaign(read_toml(path, CampaignFileError, what="campaign"), str(path))
 
 
 # ---------------------------------------------------------------- trials
@@ -377,3 +372,47 @@ def _recorded_noise(
     if not records:
         raise CampaignFileError(said("campaign.noise_of_none", table=table))
     return records
+
+
+# ---------------------------------------------------------------- remarks on records in time
+def remarks_on(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) -> list[str]:
+    """Return the sentences on the trials of a campaign, in one order."""
+    uneven = spacing_sentence({trial.name: trial.time for trial in trials if trial.is_dynamic})
+    found = [] if uneven is None else [uneven]
+    return [*found, *_begins(trials), *_not_whitened(channels, trials)]
+
+
+_BEGINS = {
+    Start.SETTLED: "taken to begin at rest under what acts at the first sample",
+    Start.STILL: "taken to begin at rest under nothing",
+    Start.UNKNOWN: "begun in a state that is fitted",
+}
+_ASSUMED = ' (assumed: say `begins`, "settled", "still" or "unknown")'
+
+
+def _begins(trials: tuple[Trial, ...]) -> list[str]:
+    """Return what is said or assumed of how trials begin, one sentence for each kind of begin."""
+    groups: dict[tuple[Start, bool], list[str]] = {}
+    for trial in trials:
+        matters = trial.kind is TrialKind.DRIVEN or (trial.kind is TrialKind.FORCED and trial.force[0] != 0.0)
+        if matters or not trial.begin_assumed:
+            groups.setdefault((trial.begins, trial.begin_assumed), []).append(repr(trial.name))
+    found = []
+    for (begins, assumed), names in groups.items():
+        several, are = ("", "is") if len(names) == 1 else ("s", "are")
+        how = _BEGINS[begins] + (_ASSUMED if assumed else "")
+        found.append(f"The trial{several} {', '.join(names)} {are} {how}.")
+    return found
+
+
+def _not_whitened(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) -> list[str]:
+    """Return a sentence for each channel whose coloured noise cannot be whitened in some trial."""
+    found = []
+    for name, channel in channels.items():
+        noise = noise_model(channel, 1.0)
+        there = (trial for trial in trials if name in trial.channels)
+        where = [trial.name for trial in there if noise.stays_coloured(trial)]
+        if where:
+            trials_there = f"{counted(len(where), 'trial')} {', '.join(map(repr, where))}"
+            found.append(said("remarks.not_whitened", channel=name, trials=trials_there))
+    return found

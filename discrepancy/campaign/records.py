@@ -7,21 +7,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
-from math import inf, isinf
+from math import inf
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, WrapValidator
-from pydantic_core import PydanticKnownError
+from pydantic import ConfigDict, Field
 
-from discrepancy.campaign.protocol import IN_FILES, Event, Release
-from discrepancy.campaign.sampling import IntArray, nearly_even
+from discrepancy.campaign.protocol import IN_FILES, NOT_IN_FILES, Deviation, Event, InFiles, Release
+from discrepancy.campaign.sampling import nearly_even
 from reporting.toml_file import Name, NotNegative, Number, Positive
 from reporting.words import brief
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 
 class Quantity(StrEnum):
@@ -96,28 +96,6 @@ class TrialKind(StrEnum):
     FORCED = "forced"  # rows are samples in time under a recorded force
     DRIVEN = "driven"  # rows are samples in time under any recorded inputs, or none (a fall)
     FLIGHT = "flight"  # rows are steady turns: a load factor
-
-
-def _refused(value: object) -> object:
-    raise PydanticKnownError("unexpected_keyword_argument")
-
-
-def _needed(value: str) -> str:
-    if not value:
-        raise PydanticKnownError("missing")
-    return value
-
-
-NOT_IN_FILES = BeforeValidator(_refused)
-"""Of a key that the tables of samples at rest say, and a file cannot."""
-InFiles = Annotated[str, AfterValidator(_needed), Field(max_length=200, validate_default=True)]
-"""What all have that are in files."""
-Deviation = Annotated[
-    NotNegative,
-    WrapValidator(lambda value, check: inf if value == "free" else check(value)),
-    PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
-]
-"""In files an infinite one is "free"."""
 
 
 @dataclass(frozen=True)
@@ -358,6 +336,18 @@ class Trial(TrialKeys):
         return tuple(item.name for item in self.inputs)
 
     @property
+    def load(self) -> FloatArray:
+        """What was applied (N,): the load factor in flight, else the force [N]."""
+        return self.load_factor if self.kind is TrialKind.FLIGHT else self.force
+
+    @property
+    def level(self) -> float:
+        """Release displacement, or the largest load."""
+        if self.release is not None:
+            return abs(self.release.displacement)
+        return float(np.max(np.abs(self.load)))
+
+    @property
     def is_dynamic(self) -> bool:
         """Whether the rows are samples in time of a motion."""
         return self.kind in (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN)
@@ -421,6 +411,11 @@ class Campaign:
                 if event.until is not None:
                     found[f"{event.name}_until"] = event.until
         return found
+
+    def outputs(self, trial: Trial) -> tuple[tuple[str, Quantity], ...]:
+        """Return the outputs that the channels of a trial measure, and as what quantity."""
+        channels = (self.channels[name] for name in trial.channels)
+        return tuple((channel.output, channel.quantity) for channel in channels)
 
     @property
     def fitted(self) -> tuple[Trial, ...]:

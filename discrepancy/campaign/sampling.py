@@ -9,7 +9,6 @@ from discrepancy.errors import CampaignDataError, said
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 EVEN = 1e-3
 """Largest departure of a sample from the even grid, as a share of the interval."""

@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import isinf
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
@@ -14,12 +16,11 @@ from discrepancy.models.scales import PortScale
 from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
 
-from .entry import Setting
+from .entry import ROW, EffectKeys, Number, Setting
 
 Kinds = frozenset[TrialKind]
 Names = tuple[str, ...]
 
-EVERY_TRIAL = frozenset(TrialKind)
 DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN})
 SKINS = {"lower skin": 1.0, "upper skin": -1.0}
 """Skin that is cracked, and the sign of x that opens it: upward bending stretches the lower skin."""
@@ -27,6 +28,24 @@ EVERY_PORT = "every port"
 """Place of a law that acts at all ports of states alike."""
 ALL = "all "
 """Begins the place that stands for all channels of a quantity."""
+
+
+USUAL = ("trial", "event", "law", "place")
+"""Needs of an entry that does not name its own."""
+Text = Annotated[str, Field(min_length=0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectSection(EffectKeys):
+    """`[[effect]]`, or the whole of a file with one."""
+
+    __pydantic_config__ = ROW
+
+    primitives: tuple[dict[str, Text | Number], ...] = ()
+    places: str | tuple[str, ...] | None = None
+    preferred: tuple[str, ...] = ()
+    needs: tuple[str, ...] = USUAL
+    events: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -37,17 +56,10 @@ class Asked:
     ----------
     setting : Setting
         Campaign and model.
-    identifier : str
-        Of the effect.
-    kinds : frozenset of TrialKind
-        Trials that it changes.
-    places : str, tuple of str or None
-        A word of `PLACES`, the places themselves, or none: there is no choice.
-    preferred : tuple of str
-        Ports that stand for all where the model has one of them. The port "planform" of a force that is
-        spread over an area is "span" in a model without one.
-    needs : tuple of str
-        Words of `NEEDS`.
+    section : EffectSection
+        What its file says. Its `places` are a word of `PLACES`, the places themselves, or none: there is no
+        choice; `preferred` are ports that stand for all where the model has one of them. The port "planform"
+        of a force that is spread over an area is "span" in a model without one.
     primitives : tuple of type
         What it is made of.
     moments : frozenset of str
@@ -55,20 +67,16 @@ class Asked:
     """
 
     setting: Setting
-    identifier: str = ""
-    kinds: Kinds = EVERY_TRIAL
-    places: str | Names | None = None
-    preferred: Names = ()
-    needs: Names = ()
-    primitives: tuple[type[Primitive], ...] = ()
-    moments: frozenset[str] = frozenset()
+    section: EffectSection
+    primitives: tuple[type[Primitive], ...]
+    moments: frozenset[str]
 
     # ------------------------------------------------------------ what the campaign and the model have
 
     @property
     def trials(self) -> tuple[Trial, ...]:
         """Trials that it changes and that may be used for fitting."""
-        return tuple(trial for trial in self.setting.campaign.fitted if trial.kind in self.kinds)
+        return tuple(trial for trial in self.setting.campaign.fitted if trial.kind in self.section.acts_on)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -94,7 +102,9 @@ class Asked:
         """Return the ports where forces act: those of `preferred` that the model has, else all."""
         flows, scales = self.state_ports, self.setting.scales.ports
         known = tuple(port for port in self.setting.model.ports if port not in flows)
-        wanted = ["span" if name == PLANFORM and name not in scales else name for name in self.preferred]
+        wanted = [
+            "span" if name == PLANFORM and name not in scales else name for name in self.section.preferred
+        ]
         found = tuple(name for name in wanted if name in known or name == PLANFORM) or known
         return tuple(name for name in found if name not in scales or chosen(scales[name]))
 
@@ -111,21 +121,22 @@ class Asked:
 
     def found_places(self) -> Names:
         """Return the places where it may act; ("",) if there is no choice."""
-        return PLACES[self.places](self) if isinstance(self.places, str) else self.places or ("",)
+        places = self.section.places
+        return PLACES[places](self) if isinstance(places, str) else places or ("",)
 
     def reason(self) -> str | None:
         """Return why it cannot be tested: the first of its needs that is not met; None if all are."""
-        anywhere = replace(self, preferred=())
-        return next((why for need in self.needs if (why := NEEDS[need](anywhere))), None)
+        anywhere = replace(self, section=replace(self.section, preferred=()))
+        return next((why for need in self.section.needs if (why := NEEDS[need](anywhere))), None)
 
     def targets(self, place: str) -> "tuple[Target, ...]":
         """Return what a place stands for; a law acts at each."""
-        if self.places == "skins at ports":
+        if self.section.places == "skins at ports":
             port, _, skin = place.rpartition(", ")
             return (Target(port, number=SKINS[skin]),)
         if place == EVERY_PORT:
             return tuple(map(Target, self.state_ports))
-        if self.places == "mains lines":
+        if self.section.places == "mains lines":
             line, _, name = place.partition(", ")
             frequency = float(line.split()[0])
             if name.startswith(ALL) and name not in self.setting.campaign.channels:
@@ -250,9 +261,14 @@ TEMPERATURE_STEP = 0.1
 INPUTS = DYNAMIC - {TrialKind.RINGDOWN}
 
 
-def _trial(asked: Asked) -> str | None:
-    names = [name for kind, name in KIND_NAMES.items() if kind in asked.kinds]
-    return None if asked.trials else said("needs.trial", kinds=" or ".join(names))
+def _trial(asked: Asked, kinds: Kinds = frozenset()) -> str | None:
+    wanted = kinds or asked.section.acts_on
+    names = [name for kind, name in KIND_NAMES.items() if kind in wanted]
+    return (
+        None
+        if any(trial.kind in wanted for trial in asked.setting.campaign.fitted)
+        else said("needs.trial", kinds=" or ".join(names))
+    )
 
 
 def _event(asked: Asked) -> str | None:
@@ -277,7 +293,9 @@ def _law(asked: Asked) -> str | None:
 def _place(asked: Asked) -> str | None:
     if asked.found_places():
         return None
-    return SENTENCES.tables["places"].get(asked.places) or said("needs.place", effect=asked.identifier)
+    return SENTENCES.tables["places"].get(asked.section.places) or said(
+        "needs.place", effect=asked.section.identifier
+    )
 
 
 def _port(asked: Asked) -> str | None:
@@ -320,12 +338,10 @@ NEEDS: dict[str, Callable[[Asked], str | None]] = {
     "temperature": _temperature,
     "channel": _met(lambda asked: asked.setting.campaign.fitted, "needs.no_channel"),
     "second clock": _met(
-        lambda asked: len(asked.setting.campaign.loggers) != 1 or not replace(asked, kinds=INPUTS).trials,
+        lambda asked: len(asked.setting.campaign.loggers) != 1 or _trial(asked, INPUTS),
         "needs.no_second_clock",
     ),
-    "input": lambda asked: _trial(replace(asked, kinds=INPUTS)),
+    "input": lambda asked: _trial(asked, INPUTS),
     "strain across": _met(_sees_across, "needs.no_strain_across"),
 }
 """What tells that a need is not met, by its word."""
-USUAL = ("trial", "event", "law", "place")
-"""Needs of an entry that does not name its own."""

@@ -23,8 +23,7 @@ from discrepancy.campaign.sampling import digit_of
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.quality import is_still, rest_faults, roughness
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import fit
-from discrepancy.fits.normal_equations import normal_equations
+from discrepancy.fits.fitting import fit, normal_equations
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.separability import begun
 from discrepancy.models.interface import Conditions, Model
@@ -69,7 +68,6 @@ def unobservable(campaign: Campaign, model: Model) -> Iterator[DataFault]:
 LEAST_PERIODS = 3.0
 """Fewest periods of the first mode in a record in time."""
 LEAST_SAMPLES = 4.0
-_FROM_MOTION = {Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION}
 MATTERS = 0.3
 """Difference between two readings of an input from which on it is said, in deviations of the noise (rms)."""
 _VISIBLE = 0.01  # share of the largest prediction of its kind below which a channel tells nothing
@@ -94,9 +92,10 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     missing = tuple(_missing_outputs(campaign, model))
     if missing:
         return missing
-    faults = list(_lengths(campaign, model))
+    faults: list[DataFault] = []
     if model.oscillates:
-        faults += rest_faults(campaign, model.scales(campaign).angular_frequency / (2.0 * pi))
+        frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
+        faults = [*_lengths(campaign, frequency), *rest_faults(campaign, frequency)]
     predictions = {
         trial.name: observe(model, campaign, trial, ModelPatch(), prior_mean(campaign, model, trial)).values
         for trial in campaign.trials
@@ -156,20 +155,16 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
         quantity = model.output_quantity(channel.output)
         if quantity is None:
             yield fault(FaultKind.MISSING_OUTPUT, name, output=channel.output, model=model.name)
-        elif channel.quantity is not Quantity.SIGNAL and not (
-            channel.quantity is quantity or {channel.quantity, quantity} <= _FROM_MOTION
-        ):
+        elif not channel.quantity.shows(quantity):
             told = {"measured": channel.quantity.value, "given": quantity.value, "model": model.name}
             yield fault(FaultKind.WRONG_QUANTITY, name, output=channel.output, **told)
 
 
-def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
+def _lengths(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
     # A driven trial is long enough if the parameters can be observed in it, see `unobservable`.
-    dynamic = [trial for trial in campaign.trials if trial.is_dynamic and trial.kind is not TrialKind.DRIVEN]
-    if not dynamic or not model.oscillates:
-        return
-    frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
-    for trial in dynamic:
+    for trial in campaign.trials:
+        if not trial.is_dynamic or trial.kind is TrialKind.DRIVEN:
+            continue
         periods = float(trial.time[-1] - trial.time[0]) * frequency
         told: dict[str, Any] = {"trial": trial.name, "frequency": frequency}
         if periods < LEAST_PERIODS:

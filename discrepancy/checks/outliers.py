@@ -291,8 +291,7 @@ def _repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArra
 def _row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Channel) -> BoolArray:
     """Return the one row that a parabola through the others misses, if they agree among themselves."""
     found = np.zeros(len(values), dtype=bool)
-    load = trial.force if np.any(trial.force) else trial.load_factor
-    rows = np.flatnonzero(used)
+    load, rows = trial.load, np.flatnonzero(used)
     if channel.noise is None or len(rows) < 8 or np.ptp(load[rows]) == 0.0:
         return found
     left, singular, _ = np.linalg.svd(

@@ -13,8 +13,16 @@ from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise import MAINS, line_near, repeat_record, without_lines
 from discrepancy.campaign.noise_tests import lag_products
-from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, NoiseRecord, Trial
-from discrepancy.campaign.sampling import IntArray, digit_of
+from discrepancy.campaign.records import (
+    BoolArray,
+    Campaign,
+    Channel,
+    FloatArray,
+    IntArray,
+    NoiseRecord,
+    Trial,
+)
+from discrepancy.campaign.sampling import digit_of
 from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
 
@@ -327,11 +335,7 @@ def is_still(trial: Trial, name: str) -> bool:
     used = trial.used[:, column]
     if used.sum() < CLIPPED_RUN or np.ptp(trial.values[used, column]) > 0.0:
         return False
-    return trial.is_dynamic or bool(np.ptp(_load(trial)[used]) > 0.0)
-
-
-def _load(trial: Trial) -> FloatArray:
-    return trial.load_factor if np.any(trial.load_factor) else trial.force
+    return trial.is_dynamic or bool(np.ptp(trial.load[used]) > 0.0)
 
 
 def _clipped(trial: Trial, name: str, values: FloatArray, used: BoolArray) -> Iterator[DataFault]:
@@ -339,8 +343,8 @@ def _clipped(trial: Trial, name: str, values: FloatArray, used: BoolArray) -> It
     if len(kept) < CLIPPED_RUN:
         return
     if not trial.is_dynamic:
-        order = np.argsort(_load(trial)[used], kind="stable")
-        kept, load = kept[order], _load(trial)[used][order]
+        order = np.argsort(trial.load[used], kind="stable")
+        kept, load = kept[order], trial.load[used][order]
     for extreme, side in ((float(kept.max()), "largest"), (float(kept.min()), "smallest")):
         if run := clipped_run(kept, extreme, load):
             yield fault(FaultKind.CLIPPED, name, trial.name, run=run, side=side, extreme=extreme)

@@ -90,21 +90,19 @@ def read_residuals(path: Path) -> ResidualSet:
         tree = read_groups(path)
         schema = tree.attrs.get("schema")
         if schema == SCHEMA:
-            return _residuals(tree)
+            groups = {name: group.to_dataset() for name, group in tree.children.items()}
+            noise = {
+                str(group.attrs["channel"]): group.to_dataset()
+                for group in (
+                    tree["noise"].children.values() if groups.pop("noise", None) is not None else ()
+                )
+            }
+            channels = {row["name"]: _channel(row, noise) for row in json.loads(tree.attrs["channels"])}
+            return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
     except _DAMAGED as error:
         reason = f"{type(error).__name__}: {one_line(error)}"
         raise VerdictFileError(said("models.residuals_file", path=path, reason=reason)) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
-
-
-def _residuals(tree: xr.DataTree) -> ResidualSet:
-    groups = {name: group.to_dataset() for name, group in tree.children.items()}
-    noise = {
-        str(group.attrs["channel"]): group.to_dataset()
-        for group in (tree["noise"].children.values() if groups.pop("noise", None) is not None else ())
-    }
-    channels = {row["name"]: _channel(row, noise) for row in json.loads(tree.attrs["channels"])}
-    return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
 
 
 def _channel_row(channel: Channel) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from discrepancy.campaign import noise_tests
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.verdict import Gate
 
 from .fitting import CandidateFit
@@ -99,18 +99,35 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
 
 def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
     """Return name and p-value of the Ljung-Box test of each channel, its dynamic records combined."""
-    found: dict[str, list[float]] = {}
-    coloured = _dependent(problem, fit) > 1.0
+    tests = []
+    for channel in np.flatnonzero(_dependent(problem, fit) == 1.0).tolist():
+        series, used, _ = records_of(problem, fit, channel)
+        if series:
+            tests.append((f"whiteness of {problem.channel_names[channel]}", whiteness(series, used)))
+    return tests
+
+
+def whiteness(series: list[FloatArray], used: list[BoolArray]) -> float:
+    """Return the p-value of the Ljung-Box test of records together, of which some samples count."""
+    return noise_tests.combine([p_value for _, p_value in map(noise_tests.ljung_box, series, used)])
+
+
+def records_of(
+    problem: Problem, fit: CandidateFit, channel: int
+) -> tuple[list[FloatArray], list[BoolArray], list[FloatArray]]:
+    """Return the residuals of a channel in motion, which samples of them count, and steps in time [s].
+
+    Of records whose noise is white they are one.
+    """
+    series, used, steps = [], [], []
     for data, residual in zip(problem.trials, fit.residuals, strict=True):
-        if not data.trial.is_dynamic or len(residual) < noise_tests.SHORTEST_SERIES:
-            continue
-        whole = bool(np.all(data.weight > 0.0))
-        for column, name in enumerate(data.trial.channels):
-            if coloured[data.groups[column]]:
-                continue
-            used = None if whole else data.weight[:, column] > 0.0
-            found.setdefault(name, []).append(noise_tests.ljung_box(residual[:, column], used=used)[1])
-    return [(f"whiteness of {name}", noise_tests.combine(p_values)) for name, p_values in found.items()]
+        for column in np.flatnonzero(data.groups == channel) if data.trial.is_dynamic else ():
+            if len(residual) >= noise_tests.SHORTEST_SERIES:
+                series.append(np.ascontiguousarray(residual[:, column]))
+                used.append(data.weight[:, column] > 0.0)
+                taken, coloured = np.diff(data.trial.time), data.noise[column].stays_coloured(data.trial)
+                steps.append(taken if coloured else np.median(taken, keepdims=True))
+    return series, used, steps
 
 
 def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:

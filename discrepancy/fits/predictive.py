@@ -12,8 +12,7 @@ from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit
-from discrepancy.fits.normal_equations import trial_rows
+from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.location.residuals import FittedTrial, ResidualSet

@@ -13,8 +13,7 @@ from math import inf
 import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel, noise_model
-from discrepancy.campaign.records import Campaign, FloatArray, Trial
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError, said
 from discrepancy.models.interface import Model

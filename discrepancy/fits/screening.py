@@ -24,8 +24,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
 
 from .candidate import Candidate, Term
-from .fitting import LARGEST_EFFECT, CandidateFit
-from .normal_equations import finite, normal_equations, upper_factor
+from .fitting import LARGEST_EFFECT, CandidateFit, finite, normal_equations, upper_factor
 from .problem import Problem
 
 

@@ -15,8 +15,7 @@ from math import inf, isinf, prod
 import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Quantity, Start, Trial, TrialKind
 from discrepancy.models.interface import Conditions, Model
 
 FREE_MOTION = 3.0
@@ -236,24 +235,12 @@ class TrialData:
     weight: FloatArray
     noise: tuple[NoiseModel, ...]
 
-    @cached_property
-    def steps(self) -> FloatArray:
-        """Time since the sample before (N,) [s], of a dynamic trial; nought at the first."""
-        trial = self.trial
-        even = np.full(len(trial.time), trial.interval)
-        given = np.diff(trial.time, prepend=trial.time[0])
-        # stamps are rounded: samples that are even within that share one step
-        found = even if np.all(np.abs(given[1:] - even[1:]) < 1e-3 * even[1:]) else given
-        return np.concatenate((np.zeros(1), found[1:]))
-
     def standardised(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
         scaled = columns / self.deviation
-        interval = self.trial.whitened_at
-        if interval is not None:
-            for number, noise in enumerate(self.noise):
-                if noise.applies(interval):
-                    scaled[..., number] = noise.whiten(scaled[..., number], interval)
+        for number, noise in enumerate(self.noise):
+            if noise.applies(self.trial.whitened_at):
+                scaled[..., number] = noise.whiten(scaled[..., number], self.trial.whitened_at)
         return np.asarray(scaled * self.weight)
 
     @classmethod
@@ -263,22 +250,14 @@ class TrialData:
         """Return a trial of a campaign with its noise, by the noise models of the channels."""
         names = list(campaign.channels)
         noise = tuple(models[name] for name in trial.channels)
-        interval = trial.whitened_at
-        deviation = trial.noise_factor * np.array(
-            [
-                item.standard_deviation
-                if interval is not None and item.applies(interval)
-                else item.static_deviation
-                for item in noise
-            ]
-        )
+        whitened = [item.applies(trial.whitened_at) for item in noise]
+        single, innovation = [m.static_deviation for m in noise], [m.standard_deviation for m in noise]
+        deviation = trial.noise_factor * np.where(whitened, innovation, single)
         groups = np.array([names.index(name) for name in trial.channels])
         weight = trial.used.astype(np.float64)
-        if interval is not None:  # the filter smears what is left out over its order
-            for number, item in enumerate(noise):
-                if item.applies(interval):
-                    for row in np.flatnonzero(~trial.used[:, number]):
-                        weight[row : row + len(item.autoregression) + 1, number] = 0.0
+        for number in np.flatnonzero(whitened):  # the filter smears what is left out over its order
+            for row in np.flatnonzero(~trial.used[:, number]):
+                weight[row : row + len(noise[number].autoregression) + 1, number] = 0.0
         return cls(trial, deviation, groups, local_unknowns(campaign, trial, deviation, model), weight, noise)
 
 

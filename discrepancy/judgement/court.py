@@ -207,19 +207,13 @@ class Court:
         Errors of the readings beside laws take up what is left, whatever it is: they are no part of a name.
         """
         found: dict[Key, tuple[Any, float]] = {}
-        for item in self.ranked:
-            core = self._core(item)
+        for item in (one for one in self.ranked if one.candidate.terms):
+            acts = [number for number, term in enumerate(item.candidate.terms) if self.acts(term)]
+            core = self._with(item, acts) if 0 < len(acts) < len(item.candidate.terms) else item
             if core is not None and core.candidate.key not in found and not self.against(core):
                 found[core.candidate.key] = core, self.score(item)
         best = max((score for _, score in found.values()), default=0.0)
         return [item for item, score in found.values() if score > best - SEARCH.contenders]
-
-    def _core(self, item: Any) -> Any:
-        """Return a hypothesis without errors of the readings beside its laws; None without an effect."""
-        acts = [self.acts(term) for term in item.candidate.terms]
-        if all(acts) or not any(acts):
-            return item if acts else None
-        return self._with(item, [number for number, within in enumerate(acts) if within])
 
     def _with(self, item: Any, kept: Sequence[int]) -> Any:
         """Return a hypothesis with some of its effects only."""

@@ -13,8 +13,7 @@ from scipy.special import logsumexp
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import SENTENCES, DiscrepancyError
 from discrepancy.fits.candidate import Point
-from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.normal_equations import finite
+from discrepancy.fits.fitting import CandidateFit, finite
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
@@ -51,7 +50,7 @@ class Proposal:
 
 
 def next_experiments(
-    problem: Problem, open_fits: Sequence[tuple[CandidateFit, float]], count: int = PROPOSED
+    problem: Problem, open_fits: Sequence[tuple[CandidateFit, float]]
 ) -> tuple[Experiment, ...]:
     """Return the experiments that decide most among open hypotheses.
 
@@ -61,8 +60,6 @@ def next_experiments(
         Campaign and model of the fits.
     open_fits : sequence of (CandidateFit, float)
         Hypotheses that are still open, with their probabilities.
-    count : int
-        Largest number of proposals.
 
     Returns
     -------
@@ -80,7 +77,7 @@ def next_experiments(
             continue
         if information >= LEAST_INFORMATION:
             found.append(Experiment(proposal.description, information, proposal.cost, proposal.reason))
-    return tuple(sorted(found, key=lambda item: -item.information / item.cost)[:count])
+    return tuple(sorted(found, key=lambda item: -item.information / item.cost)[:PROPOSED])
 
 
 def mutual_information(
@@ -168,27 +165,16 @@ def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
         Whether a release oscillates: a longer record of one that does not shows rest.
     """
     for row in SENTENCES.tables["proposal"]:
-        done = [
-            trial
-            for trial in problem.campaign.trials
-            if trial.kind.value == row["kind"] and _size(trial) >= 0.0
-        ]
+        done = [trial for trial in problem.campaign.trials if trial.kind.value == row["kind"]]
         if not done or (row["change"] == "length" and not swings):
             continue
-        largest = (min if row.get("of") == "smallest" else max)(done, key=_size)
+        largest = (min if row.get("of") == "smallest" else max)(done, key=lambda trial: trial.level)
         found = _changed(problem, largest, row["change"], row["by"])
         if found is not None:
-            (trial, value, added), top = found, _size(largest)
+            (trial, value, added), top = found, largest.level
             told = {"top": top, "most": abs(row["by"]) * top, "signed": row["by"] * top, "value": value}
             description = row["description"].format(**told)
             yield Proposal(replace(trial, name=row["name"]), description, row["reason"], row["cost"], added)
-
-
-def _size(trial: Trial) -> float:
-    """Return what counts for the size of a trial; below zero where it says nothing of it."""
-    if trial.kind is TrialKind.RINGDOWN:
-        return -1.0 if trial.release is None else abs(trial.release.displacement)
-    return float(np.abs(trial.load_factor if trial.kind is TrialKind.FLIGHT else trial.force).max())
 
 
 def _changed(problem: Problem, trial: Trial, what: str, by: float) -> tuple[Trial, float, ModelPatch] | None:

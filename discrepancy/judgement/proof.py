@@ -11,8 +11,7 @@ import numpy as np
 from scipy import stats
 
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
-from discrepancy.campaign.records import BoolArray, FloatArray
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError, said
 from discrepancy.location.omnibus_tests import mean_square
 from discrepancy.location.residuals import FittedTrial, ResidualSet
@@ -60,6 +59,8 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         [log_density(item)[use] for item, use in zip(residuals.trials, used, strict=True)]
     )
     square, deviation = chi_square_per_dof(residuals)
+    white = residuals.white(np.random.default_rng(seed))
+    channels = [ljung_box(series)[1] for _, _, series in residuals.series(white)]
     uniform = stats.norm.cdf(z)
     counts = np.histogram(uniform, bins=PIT_BINS, range=(0.0, 1.0))[0]
     return Scores(
@@ -68,7 +69,7 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         log_score=float(density.mean()),
         coverage_50=float(np.mean(np.abs(z) <= stats.norm.ppf(0.75))),
         coverage_90=float(np.mean(np.abs(z) <= stats.norm.ppf(0.95))),
-        whiteness=_whiteness(residuals, seed),
+        whiteness=min(1.0, len(channels) * min(channels)) if channels else nan,
         sample_count=int(z.size),
         chi_square_deviation=deviation,
         pit=tuple(float(value) for value in counts / z.size),
@@ -114,13 +115,6 @@ def _rms(residuals: ResidualSet) -> dict[str, float]:
             total[0] += float(values @ values)
             total[1] += values.size
     return {name: sqrt(total / count) for name, (total, count) in sums.items() if count}
-
-
-def _whiteness(residuals: ResidualSet, seed: int) -> float:
-    """Return the least p-value of Ljung-Box over dynamic channels times their number."""
-    white = residuals.white(np.random.default_rng(seed))
-    found = [ljung_box(series)[1] for _, _, series in residuals.series(white)]
-    return min(1.0, len(found) * min(found)) if found else nan
 
 
 def correlation_time(series: FloatArray) -> float:

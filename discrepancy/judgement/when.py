@@ -29,12 +29,8 @@ def window_text(window: GapWindow) -> str:
     """Return since when and until when, in words."""
     if window.begin is None and window.end is None:
         return "throughout the record"
-    if window.begin is None:
-        assert window.end is not None
-        return f"from the first sample until {moment_text(window.end)}"
-    if window.end is None:
-        return f"since {moment_text(window.begin)}, to the end of the record"
-    return f"since {moment_text(window.begin)} until {moment_text(window.end)}"
+    since = f"since {moment_text(window.begin)}" if window.begin else "from the first sample"
+    return since + (f" until {moment_text(window.end)}" if window.end else ", to the end of the record")
 
 
 def when_sentence(windows: Sequence[GapWindow]) -> str:

@@ -239,8 +239,7 @@ def _bases(
     if not items[0].trial.is_dynamic:
         if np.ptp(within) > 0.0:
             bases["", "time"] = np.column_stack([np.ones_like(within), within - within.mean()])
-        force = joined([item.trial.force for item in items])
-        load = force if np.any(force) else joined([item.trial.load_factor for item in items])
+        load = joined([item.trial.load for item in items])
         if np.ptp(load) > 0.0:
             bases["", "load (proportional)"] = np.column_stack([stack("x")[:, 0], load])
             bases["", "load (not proportional)"] = np.column_stack([load, np.abs(load) * load, load**2])

@@ -210,8 +210,7 @@ def _stretches(item: FittedTrial, column: int) -> Iterator[tuple[str, float, flo
     if trial.is_dynamic:
         axes.append(("time", trial.time, np.linspace(trial.time[0], trial.time[-1], BINS + 1)))
     else:
-        load = trial.force if np.any(trial.force) else trial.load_factor
-        axes.append(("load", load, np.linspace(load.min(), load.max(), 4)))
+        axes.append(("load", trial.load, np.linspace(trial.load.min(), trial.load.max(), 4)))
     if trial.is_dynamic and item.rates is not None and (amplitude := envelope(item, column)).any():
         least = max(amplitude.min(), 1e-4 * amplitude.max())
         axes.append(("amplitude", amplitude, np.geomspace(least, amplitude.max(), BINS + 1)))

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from discrepancy.campaign.records import BoolArray, FloatArray
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 
 from .filtered import Filtered, Process, without
 from .kalman import Steps, discretised, joined

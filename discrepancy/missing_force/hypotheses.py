@@ -182,7 +182,7 @@ class Columns:
         """Return what a patch does, None where it cannot be."""
         try:
             parts = [
-                self._part(view, trial, motion, number, patch.in_trial(trial.name), acts_on)
+                self._part(trial, motion, number, patch.in_trial(trial.name), acts_on)
                 for trial, motion, number in zip(view.trials, motions, self.numbers, strict=True)
             ]
         except (DiscrepancyError, InvalidPatchError):
@@ -190,13 +190,7 @@ class Columns:
         return parts if all(np.all(np.isfinite(part.readings)) for part in parts) else None
 
     def _part(
-        self,
-        view: View,
-        trial: SeenTrial,
-        motion: Motion,
-        number: int,
-        patch: ModelPatch,
-        acts_on: frozenset[TrialKind],
+        self, trial: SeenTrial, motion: Motion, number: int, patch: ModelPatch, acts_on: frozenset[TrialKind]
     ) -> Part:
         kind = self.problem.trials[number].trial.kind
         if kind not in acts_on or not len(patch):

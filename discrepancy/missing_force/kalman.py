@@ -14,8 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from discrepancy.campaign.records import BoolArray, FloatArray
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from fe.compilation import callable_when_compiled, compiled
 
 SMALL_PART, ORDERS = 0.25, 12

@@ -115,7 +115,12 @@ class Explained:
             return covariance
         wider = np.zeros((len(self.effect),) * 2)
         for port, process in self.processes.items():
-            columns = self._columns_at(port)
+            rows = []
+            for number, trial in enumerate(self.view.trials):
+                nothing = np.zeros(len(trial.fine_time))
+                forces = [item[number].forces.get(port, nothing) for item in self.view.effects]
+                rows.append(np.array([np.asarray(force)[:: trial.parts] for force in forces]))
+            columns = np.concatenate(rows, axis=-1)  # the forces (E, T) at the samples of all trials
             acting = np.flatnonzero(columns.any(axis=1))
             if len(acting):
                 size = (ALONG * process.size) ** 2
@@ -123,15 +128,6 @@ class Explained:
                 wider[np.ix_(acting, acting)] += size * np.linalg.inv(gram + size * np.eye(len(acting)))
         follow = np.linalg.lstsq(covariance[at:, at:], covariance[at:], rcond=None)[0].T
         return np.asarray(covariance + follow @ wider @ follow.T)
-
-    def _columns_at(self, port: int) -> FloatArray:
-        """Return the forces (E, T) of the effects at a port, at the samples of all trials."""
-        rows = []
-        for number, trial in enumerate(self.view.trials):
-            nothing = np.zeros(len(trial.fine_time))
-            forces = [item[number].forces.get(port, nothing) for item in self.view.effects]
-            rows.append(np.array([np.asarray(force)[:: trial.parts] for force in forces]))
-        return np.concatenate(rows, axis=-1)
 
 
 class ForceSearch:

@@ -16,15 +16,12 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import BoolArray, FloatArray, Quantity, Trial
-from discrepancy.campaign.sampling import IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import PortedSystem
 
 from .kalman import driven
-
-Outputs = tuple[tuple[str, Quantity], ...]
 
 FINEST, COARSEST = 16, 4
 """Steps of an interval on which laws are evaluated, at most and at least."""
@@ -223,12 +220,12 @@ class SeenTrial:
         return np.asarray(columns / self.deviation * self.used)
 
 
-def decaying_part(noise: NoiseModel, interval: float) -> tuple[float, float] | None:
+def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, float] | None:
     """Return the share of a noise's variance that decays in time, and its rate [1/s]; None: it is white.
 
     From the correlation at one and two samples: exact for an autoregression of first order.
     """
-    if not noise.applies(interval):
+    if interval is None or not noise.applies(interval):
         return None
     answer = lfilter([1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)])
     at = [float(answer[: len(answer) - lag] @ answer[lag:]) for lag in range(3)]
@@ -240,7 +237,7 @@ def decaying_part(noise: NoiseModel, interval: float) -> tuple[float, float] | N
 
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     """Return a dynamic trial of a problem, linear about a point; its model must tell how ports move."""
-    data, model, campaign = problem.trials[number], problem.model, problem.campaign
+    data, model = problem.trials[number], problem.model
     trial, shared, unknowns = data.trial, problem.shared, data.unknowns
     parts = problem.linearise(number, point, Candidate())
     gains = 1.0 + shared.gains(point.shared, trial.channels)
@@ -254,10 +251,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     by_shared[index] = columns[unknowns.size :]
     residual = trial.values - problem.prediction(number, point, parts.response)
     residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
-    outputs = tuple(
-        (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
-    )
-    base, slopes = _ported(problem, trial, outputs, point.shared)
+    base, slopes = _ported(problem, trial, point.shared)
     base = _shown(base, gains)
     slopes = [None if item is None else _shown(item, gains) for item in slopes]
     used = trial.used
@@ -265,7 +259,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     coloured = [
         (number, *part)
         for number, item in enumerate(data.noise)
-        if trial.whitened_at is not None and (part := decaying_part(item, trial.whitened_at)) is not None
+        if (part := decaying_part(item, trial.whitened_at)) is not None
     ]
     interval = float(np.median(np.diff(trial.time)))
     fastest = float(np.max(np.abs(np.linalg.eigvals(base.generator)), initial=0.0))
@@ -295,10 +289,10 @@ def _shown(system: PortedSystem, gains: FloatArray) -> PortedSystem:
 
 
 def _ported(
-    problem: Problem, trial: Trial, outputs: Outputs, shared: FloatArray
+    problem: Problem, trial: Trial, shared: FloatArray
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
     """Return how the ports of a trial move, and the derivatives of that by the shared unknowns."""
-    model, unknowns = problem.model, problem.shared
+    model, unknowns, outputs = problem.model, problem.shared, problem.campaign.outputs(trial)
 
     def system(u: FloatArray) -> PortedSystem:
         return model.ported(trial, outputs, unknowns.parameters(u))

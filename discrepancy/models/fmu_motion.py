@@ -251,10 +251,9 @@ class FmuMotion(FmuPace):
             values = self.rest(states, loads)
         except ModelError:
             for row, state in enumerate(states):
-                try:
+                where = f"The trial {trial!r}, row {row + 1} of its table: "
+                with ModelError.instead_of(ModelError, before=where):
                     self.rest([state], {name: values[row : row + 1] for name, values in loads.items()})
-                except ModelError as own:
-                    raise ModelError(f"The trial {trial!r}, row {row + 1} of its table: {own}") from own
             raise
         if not len(laws):
             return values

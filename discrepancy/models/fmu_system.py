@@ -1,7 +1,7 @@
 """An FMU with ports: its system where it is linear, what moves it, and at which pace it is stepped."""
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from math import ceil
 from pathlib import Path
@@ -184,13 +184,9 @@ class FmuPace(FmuRuns):
         self._linear, self._sizes = dict[Hashable, bool](), dict[str, float]()
         self._systems, self._paces = Memory(KEPT), Memory()
 
-    @contextmanager
-    def refusals(self) -> Iterator[None]:
-        """Say of which model it is what the FMU refuses."""
-        try:
-            yield
-        except FmuError as cause:
-            raise ModelError(f"The FMU model {self.description.name!r}: {cause}") from cause
+    def refusals(self) -> AbstractContextManager[None, None]:
+        """Return the context that says of which model it is what the FMU refuses."""
+        return ModelError.instead_of(FmuError, before=f"The FMU model {self.description.name!r}: ")
 
     def case(
         self, trial: Trial, state: State, ports: Sequence[str], levers: Mapping[str, float] | None = None

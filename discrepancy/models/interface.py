@@ -318,10 +318,8 @@ class Model(ABC):
                     portless = isinstance(item, INTERNAL_FORCES) and not self.ports
                     port = " (it has no port)" if portless else ""
                     raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
-            try:
+            with ModelError.instead_of(FiniteElementError):
                 return trial, self._respond(trial, outputs, whole, conditions)
-            except FiniteElementError as cause:
-                raise ModelError(str(cause)) from cause
 
         if self._kept is None:
             return answer()[1]

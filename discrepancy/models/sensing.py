@@ -41,9 +41,8 @@ def observe(
     CatalogueError
         If a sensor primitive names a channel that does not exist or has values that no sensor can have.
     """
-    channels = [campaign.channels[name] for name in trial.channels]
     patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
-    outputs = tuple((channel.output, channel.quantity) for channel in channels)
+    outputs, count = campaign.outputs(trial), len(trial.channels)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, outputs, patch, conditions)
     rate, zero = clock_of(patch)
@@ -55,7 +54,7 @@ def observe(
     turned = [column for column, (_, quantity) in enumerate(outputs) if quantity is Quantity.STRAIN]
     turned *= len(patch.of(SensorRotation)) > 0
     outputs += tuple((outputs[column][0] + part, Quantity.STRAIN) for part in ACROSS for column in turned)
-    if not all(model.output_quantity(output) for output, _ in outputs[len(channels) :]):
+    if not all(model.output_quantity(output) for output, _ in outputs[count:]):
         raise ModelError(said("models.turned_gauge", model=model))
     values = np.zeros((len(trial.time), len(outputs)))
     slopes, by_output = np.zeros_like(values), np.append(by_channel, np.tile(by_channel[turned], 2))
@@ -66,7 +65,7 @@ def observe(
         values[:, own] = found.values[:, own]
         if found.rates is not None:
             slopes[:, own] = found.rates[:, own]
-    count, width = len(channels), len(turned)
+    width = len(turned)
     across = np.zeros((2, len(values), count))
     across[:, :, turned] = values[:, count : count + width], values[:, count + width :]
     seen = Response(values[:, :count], slopes[:, :count] if trial.is_dynamic else None)
@@ -124,8 +123,6 @@ def observe_response(
         tuple((name, campaign.channels[name].quantity.value) for name in trial.channels), trial.kind.value,
         trial.time, trial.start, trial.temperature, trial.run, release,
     )  # fmt: skip
-    try:
+    with CatalogueError.instead_of(InvalidPatchError):
         check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])
         return Response(*apply_sensors(patch, record, *response, *across, filtered=filtered_record))
-    except InvalidPatchError as cause:
-        raise CatalogueError(str(cause)) from cause

@@ -229,11 +229,9 @@ class WingModel(SystemModel):
         ModelError
             If it cannot be read, modelled or reduced.
         """
-        try:
+        with ModelError.instead_of(FiniteElementError):
             design = load_design(path)
             return cls(patch_arrays(design, progress), design.name, design=design)
-        except FiniteElementError as cause:
-            raise ModelError(str(cause)) from cause
 
     @classmethod
     def of_calibration(cls, path: Path | str, progress: Progress | None = None) -> "WingModel":
@@ -244,13 +242,12 @@ class WingModel(SystemModel):
         ModelError
             If the calibration cannot be read, or its wing not be modelled.
         """
-        try:
+        unusable = f"The calibration {path} cannot be used: "
+        with ModelError.instead_of(FiniteElementError, CalibrationError, OSError, before=unusable):
             result = load_calibration(path)
             prior = {name: (result.mean(name), float(np.std(result.draws_of(name)))) for name in STATE}
             design = result.wing_design
             return cls(patch_arrays(design, progress), result.asset, prior, design)
-        except (FiniteElementError, CalibrationError, OSError) as cause:
-            raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
 
     # ------------------------------------------------------------ outputs, ports and loads
 

@@ -179,10 +179,9 @@ class SystemModel(Model):
             If it cannot begin so, or what acts is not the model's.
         """
         system, acting = self.begun(case)
-        try:
+        where = f"The trial {case.trial.name!r} of {self.name!r}: "
+        with ModelError.instead_of(ModelError, FiniteElementError, before=where):
             return motion_of(system, acting, laws, case.conditions.refinement)
-        except (ModelError, FiniteElementError) as cause:
-            raise ModelError(f"The trial {case.trial.name!r} of {self.name!r}: {cause}") from cause
 
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial.
@@ -217,10 +216,9 @@ class SystemModel(Model):
                 if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
                     raise ModelError(said("models.speed_at_rest", trial=trial))
             seen = np.array([np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown])
-            try:
+            where = f"The trial {trial.name!r} is at rest, but "
+            with ModelError.instead_of(ModelError, FiniteElementError, before=where):
                 values[rows], memory = system.static(units, laws, given, memory, before, seen=seen)
-            except (ModelError, FiniteElementError) as cause:
-                raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
             values[rows] += [item.constant for item in shown]
             before, start = amounts[rows.stop - 1], rows.stop
         return values
@@ -256,8 +254,7 @@ class SystemModel(Model):
         count, moving = len(rig.angular_frequency), rig.moving
         x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
         pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
-        channels = [campaign.channels[name] for name in trial.channels]
-        outputs = tuple((channel.output, channel.quantity) for channel in channels)
+        outputs = campaign.outputs(trial)
         self.check_outputs(outputs)
         for column, item in enumerate(self.shown(case, outputs, moved.acting)):
             kept = trial.values[trial.used[:, column], column] - item.constant

@@ -11,7 +11,6 @@ from scipy.stats import truncnorm
 
 from calibration.result.record import Calibration, ChannelFit, ParameterPrior, correlation, prior_samples
 from discrepancy.campaign.records import Campaign, FloatArray
-from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import LEFT
 from discrepancy.errors import CampaignDataError, ModelError, said
@@ -74,7 +73,7 @@ def calibrate_parameters(
     fatal = [fault for fault in faults if fault.fatal]
     if fatal:
         raise CampaignDataError(fatal[0].sentence)
-    problem = without_wrong_ends(Problem(campaign, model, Setting(campaign, model, model.scales(campaign))))
+    problem = without_wrong_ends(campaign, model)
     campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
@@ -175,12 +174,12 @@ def findings(
         found.append(said("parameters.not_explained", reason=small(gate.reason)))
     elif gate.passed is None:
         found.append(gate.reason)
-    found += [*_disagreements(priors, posterior), *_untold(priors, posterior)]
+    found += _of_posterior(priors, posterior)
     found += [fault.sentence for fault in faults if fault.kind is not FaultKind.UNOBSERVABLE]
     return (*found, *(text for text in remarks if text not in found))
 
 
-def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> Iterator[str]:
+def _of_posterior(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> Iterator[str]:
     marginal, optima = posterior.marginal, posterior.optima
 
     def listed(values: FloatArray) -> str:
@@ -212,6 +211,14 @@ def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPoste
         yield said("parameters.maxima", count=len(optima), places=places)
     if not optima[0].converged:
         yield said("parameters.not_settled")
+    for prior, share in zip(priors, kept_shares(posterior).tolist(), strict=True):
+        if share > LEFT:
+            left = "all" if share > 0.995 else f"{100.0 * share:.0f} %"
+            yield said("parameters.not_told", prior=prior, left=left)
+    matrix = correlation(posterior.draws)
+    for (at, first), (beside, second) in combinations(enumerate(priors), 2):
+        if abs(matrix[at, beside]) > TIED:
+            yield said("parameters.tied", first=first, second=second, value=matrix[at, beside])
 
 
 def _told_apart(posterior: ParameterPosterior, u: FloatArray) -> float:
@@ -226,14 +233,3 @@ def kept_shares(posterior: ParameterPosterior) -> FloatArray:
     """Return the deviation of each parameter (P,) over that of its prior, cut off at its range [1]."""
     marginal = posterior.marginal
     return np.asarray(posterior.draws.std(axis=0, ddof=1) / truncnorm.std(marginal.low, marginal.high))
-
-
-def _untold(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> Iterator[str]:
-    for prior, share in zip(priors, kept_shares(posterior).tolist(), strict=True):
-        if share > LEFT:
-            left = "all" if share > 0.995 else f"{100.0 * share:.0f} %"
-            yield said("parameters.not_told", prior=prior, left=left)
-    matrix = correlation(posterior.draws)
-    for (at, first), (beside, second) in combinations(enumerate(priors), 2):
-        if abs(matrix[at, beside]) > TIED:
-            yield said("parameters.tied", first=first, second=second, value=matrix[at, beside])

@@ -20,8 +20,7 @@ from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, fit
-from discrepancy.fits.normal_equations import normal_equations, solved, upper_factor
+from discrepancy.fits.fitting import CandidateFit, fit, normal_equations, solved, upper_factor
 from discrepancy.fits.problem import Problem
 
 NOTHING = Candidate()

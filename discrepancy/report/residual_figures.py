@@ -174,7 +174,7 @@ def _draw_loads(axes: Axes, shown: Shown, kind: TrialKind, names: Sequence[str],
     for item in shown.residuals.trials:
         if item.trial.kind is not kind:
             continue
-        load = item.trial.force if kind is TrialKind.STATIC else item.trial.load_factor
+        load = item.trial.load
         wide = float(np.ptp(load)) or 1.0
         for name in (name for name in names if name in item.trial.channels):
             column = item.column(name)

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from discrepancy.campaign import noise_tests
-from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Key, Remainder
 from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.gates import records_of, whiteness
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 
@@ -44,7 +45,7 @@ def left_by(problem: Problem, found: CandidateFit) -> Remainder:
     factor, of_noise = np.ones(count), np.zeros(count, dtype=bool)
     noise_of = noise_levels(problem, found)
     for channel, name in enumerate(problem.channel_names):
-        series, used, steps = _records(problem, found, channel)
+        series, used, steps = records_of(problem, found, channel)
         counted = sum(float(item.sum()) for item in used)
         if not series:
             continue
@@ -53,13 +54,7 @@ def left_by(problem: Problem, found: CandidateFit) -> Remainder:
         interval = max(float(np.median(item)) for item in steps)
         colour, doubt, fewer = _recorded_colour(problem, name, steps, interval)
         larger = known > 0.0 and noise_tests.variance_p_value(left, freedom / fewer, known / fewer) < LEVEL
-        if (
-            not larger
-            and noise_tests.combine(
-                [noise_tests.ljung_box(x, used=u)[1] for x, u in zip(series, used, strict=True)]
-            )
-            > LEVEL
-        ):
+        if not larger and whiteness(series, used) > LEVEL:
             continue
         rho, chance = _autocorrelation(series)
         of_noise[channel] = not larger and abs(rho[0] - colour) < LIKE_RECORD * np.sqrt(1.0 / counted + doubt)
@@ -86,7 +81,7 @@ def noise_levels(problem: Problem, found: CandidateFit) -> FloatArray:
     """
     levels = np.ones(len(problem.channel_names))
     for channel in np.flatnonzero(problem.freedom == 0.0):
-        series, _, _ = _records(problem, found, int(channel))
+        series, _, _ = records_of(problem, found, int(channel))
         total = sum(float(item @ item) for item in series) / max(sum(len(item) for item in series), 1)
         quick = [np.diff(item, 2) for item in series]
         white = sum(float(item @ item) for item in quick) / 6.0 / max(sum(len(item) for item in quick), 1)
@@ -117,24 +112,6 @@ def refitted(problem: Problem, wide: Problem, found: CandidateFit, **options: An
         here, log_evidence=again.log_evidence, covariance=again.covariance, converged=again.converged,
         remainder=left if left.acts else None,
     )  # fmt: skip
-
-
-def _records(
-    problem: Problem, found: CandidateFit, channel: int
-) -> tuple[list[FloatArray], list[BoolArray], list[FloatArray]]:
-    """Return the residuals of a channel in motion, which samples of them count, and steps in time [s].
-
-    Of records whose noise is white they are one.
-    """
-    series, used, steps = [], [], []
-    for data, residual in zip(problem.trials, found.residuals, strict=True):
-        for column in np.flatnonzero(data.groups == channel) if data.trial.is_dynamic else ():
-            if len(residual) >= noise_tests.SHORTEST_SERIES:
-                series.append(np.ascontiguousarray(residual[:, column]))
-                used.append(data.weight[:, column] > 0.0)
-                white = not data.noise[column].stays_coloured(data.trial)
-                steps.append(np.median(data.steps[1:], keepdims=True) if white else data.steps[1:])
-    return series, used, steps
 
 
 def _autocorrelation(series: list[FloatArray]) -> tuple[FloatArray, FloatArray]:

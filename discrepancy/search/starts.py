@@ -36,10 +36,9 @@ def each(tell: Tell, items: Sequence[T], words: Callable[[T], str]) -> Iterator[
         yield item
 
 
-def starts(screen: Screen, effect: Effect, count: int = SEARCH.starts) -> list[Change]:
+def starts(screen: Screen, effect: Effect) -> list[Change]:
     """Return the most promising changes of an effect; more of them where a box is to be placed."""
-    if sum(not item.magnitude for item in effect.parameters) > 1:
-        count *= 3
+    count = SEARCH.starts * (3 if sum(not item.magnitude for item in effect.parameters) > 1 else 1)
     found: list[Change] = []
     places = effect.places(screen.problem.setting)
     for place in places:

@@ -18,12 +18,12 @@ from discrepancy.campaign.records import (
     USUAL_REGIONS,
     Campaign,
     Channel,
+    FloatArray,
     NoiseRecord,
     Quantity,
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.sampling import FloatArray
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError, said
 from discrepancy.models.structures import WingModel
 from fmu_asset.door.binding import load_binding
@@ -97,7 +97,11 @@ def run_campaign(
 def _campaign(
     folder: Path, turns: tuple[int | None, int | None], held_out_share: float, scenario: dict[str, Any]
 ) -> Campaign:
-    _refuse_others(folder, scenario)
+    states = {item["name"] for item in scenario["state"]}
+    if scenario["observation"].get("role") != STRAIN or states != {*USUAL_REGIONS}:
+        raise CampaignFileError(said("runs.no_wing", folder=folder))
+    if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
+        raise CampaignDataError(said("runs.force", force=force, folder=folder))
     run = _run(folder)
     # Turns before a patch that was adopted on the way were believed with another model.
     adopted = run.attrs.get(PATCH_STEP)
@@ -172,11 +176,9 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
     file = folder / str(run.attrs.get(PATCH_NAME, MODEL_PATCH_FILE))  # of the last one
     patch = file if file.is_file() else None
     if patch is not None:
-        try:
+        with CampaignFileError.instead_of(FmuError, before="The patch of the twin's model cannot be read: "):
             sensors = len(run["observed"]["sensor"])
             effects = load_patch(patch).for_gauges(sensors).effects
-        except FmuError as cause:
-            raise CampaignFileError(f"The patch of the twin's model cannot be read: {cause}") from cause
         for effect in effects:
             model = model.patched(effect.patch)
     return model, wing, patch
@@ -204,20 +206,9 @@ def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
 # ---------------------------------------------------------------- parts
 
 
-def _refuse_others(folder: Path, scenario: dict[str, Any]) -> None:
-    """Refuse the run of another asset than the wing, and one with a force beside the load factor."""
-    states = {item["name"] for item in scenario["state"]}
-    if scenario["observation"].get("role") != STRAIN or states != {*USUAL_REGIONS}:
-        raise CampaignFileError(said("runs.no_wing", folder=folder))
-    if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
-        raise CampaignDataError(said("runs.force", force=force, folder=folder))
-
-
 def _config(folder: Path) -> dict[str, Any]:
-    try:
+    with CampaignFileError.instead_of(CampaignFileError, before=f"{folder} is no run folder. "):
         config = read_json(folder / CONFIG_FILE, CampaignFileError)
-    except CampaignFileError as cause:
-        raise CampaignFileError(f"{folder} is no run folder. {cause}") from cause
     if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
         raise CampaignFileError(f"{folder / CONFIG_FILE} is not that of a run: it has no `scenario`.")
     return config
@@ -241,10 +232,8 @@ def _run(folder: Path) -> xr.DataTree:
 def _step_size(folder: Path) -> float:
     """Return the seconds of a turn, 1 where the run has no binding of its own."""
     path = folder / BINDING_FILE
-    try:
+    with CampaignFileError.instead_of(FmuError, before="The binding of the run cannot be read: "):
         return load_binding(path).binding.step_size if path.exists() else 1.0
-    except FmuError as cause:
-        raise CampaignFileError(f"The binding of the run cannot be read: {cause}") from cause
 
 
 def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[FloatArray, bool]:

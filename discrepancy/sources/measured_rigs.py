@@ -15,7 +15,7 @@ from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.errors import CalibrationError
 from calibration.static.experiments import read_measurements
 from discrepancy.campaign.reading import CAMPAIGN_FILE
-from discrepancy.campaign.sampling import FloatArray
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
@@ -183,12 +183,12 @@ def _wing(data: Path, *, begin: float = BEGIN, columns: int = COLUMNS, detrended
         weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
         What moves slowly in one trial alone is noise and stays.
     """
-    try:
+    with CampaignFileError.instead_of(
+        CalibrationError, before="The measurements of the wing cannot be read: "
+    ):
         records = read_records(data)
         loaded = any((data / above / "step2").is_dir() for above in (".", "datafiles", "src/datafiles"))
         pairs = read_measurements(data) if loaded else None
-    except CalibrationError as cause:
-        raise CampaignFileError(f"The measurements of the wing cannot be read: {cause}") from cause
     if any(len(record.time) != len(records[0].time) for record in records) or len(records) < 2:
         raise CampaignDataError(said("rigs.records", data=data, count=len(records)))
     zero = _shared_zero(records) if detrended else np.zeros(records[0].count)

@@ -23,7 +23,7 @@ from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import guarded
 from uav_twin.options import show
-from uav_twin.wing import end_with
+from uav_twin.structure import end_with
 
 
 def compare(

@@ -23,7 +23,7 @@ from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import guarded
 from uav_twin.options import show
-from uav_twin.wing import end_with
+from uav_twin.structure import end_with
 
 # R. H. MacNeal and R. L. Harder (1985), table 3, HEX20: in plane and out of plane.
 MACNEAL_HARDER = {"regular": (0.970, 0.961), "trapezoid": (0.886, 0.920), "parallelogram": (0.967, 0.941)}

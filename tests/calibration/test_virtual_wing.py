@@ -24,6 +24,7 @@ from calibration.virtual_wing import (
 from calibration.wing.lab_data import published_data, read_lab_folder, write_lab_folder
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
+from tests.calibration.decays import free_decay
 from tests.refusals import Inputs
 from tests.wings import wing_integrator
 
@@ -39,11 +40,7 @@ class Beam:
 
     def ring_down(self, initial_tip_displacement, duration, rate):
         time = virtual_wing.sampling_times(duration, rate)
-        signal = np.zeros_like(time)
-        for frequency, ratio, share in ((5.65, 0.028, 0.8), (29.0, 0.05, 0.5)):
-            omega = 2.0 * math.pi * frequency
-            damped = omega * math.sqrt(1.0 - ratio**2)
-            signal += share * np.exp(-ratio * omega * time) * np.cos(damped * time)
+        signal = free_decay(time, 5.65, 0.028, 0.8) + free_decay(time, 29.0, 0.05, 0.5)
         return time, 0.4 * initial_tip_displacement * signal
 
 

@@ -267,25 +267,13 @@ def test_a_model_is_found_beside_its_patch(laboratory, tmp_path):
 
 
 def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory, tmp_path):
-    """It is read, but does not say where its model is."""
+    """It is read (`files/test_verdict_file.py`), but does not say where its model is."""
     folder = shutil.copytree(laboratory / "verdict", tmp_path / "verdict")
-
-    def older(content):
-        is_patch = "patch" in content["schema"]
-        content["schema"] = "uav-twin patch 1" if is_patch else "uav-twin verdict 2"
-        del content["model_file"]
-        for table in (content, content["verdict"]):
-            for key in ("parameters", "force") if isinstance(table, dict) else ():
-                table.pop(key, None)
-        for row in () if is_patch else content["verdict"]["hypotheses"]:
-            del row["parameters"]
-
-    for name in ("verdict.json", "patch.json"):
-        rewritten(folder / name, older)
-    stored = uav_twin.read_verdict(folder)
-    assert stored.verdict.parameters == ()
-    assert stored.patch == uav_twin.read_verdict(laboratory / "verdict").patch
     patch = folder / "patch.json"
+    rewritten(folder / "verdict.json", lambda content: content.update(model_file=None))
+    rewritten(patch, lambda content: [content.pop(key) for key in ("model_file", "parameters")])
+    rewritten(patch, lambda content: content.update(schema="uav-twin patch 1"))
+    assert read_patch(patch).patch == read_patch(laboratory / "verdict" / "patch.json").patch
     for call in (lambda: apply_verdict(folder, tmp_path / "x.toml"), lambda: choose_model(patch)):
         with pytest.raises(VerdictFileError, match="was left by an earlier version"):
             call()

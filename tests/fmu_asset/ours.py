@@ -1,8 +1,6 @@
 """Our own FMUs by name, each packed once; most are of the shipped wing on a coarse mesh."""
 
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -29,7 +27,7 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
 from tests.fmu_asset.making import tables
-from tests.kept import FE, ROOT, compiled_wing, kept, packed
+from tests.kept import FE, ROOT, compiled_wing, exported, kept
 
 HERE = Path(__file__).parent
 SPRING_MASS = HERE / "spring_mass.py"
@@ -85,7 +83,7 @@ class OurFmus:
         if name in asset_scripts():
             return build_script_fmu(asset_scripts()[name], path).path
         if name == "spring_mass":
-            return packed(path, lambda: exported(path), (SPRING_MASS,), name)
+            return exported(shutil.copy(SPRING_MASS, self._folder / "SpringMass.py")).rename(path)
         options = self.options(name)
         if options.get("kind") != "compiled":
             return build_fmu(self.model(name), path, **options).path
@@ -111,13 +109,3 @@ class OurFmus:
         if "state" in options:
             options["state"] = DigitalState(**options["state"])
         return options
-
-
-def exported(path: Path) -> None:
-    """Let pythonfmu pack the spring as its users do."""
-    folder = path.with_suffix("")
-    folder.mkdir()
-    shutil.copy(SPRING_MASS, folder / "SpringMass.py")
-    words = [sys.executable, "-m", "pythonfmu", "build", "-f", "SpringMass.py"]
-    subprocess.run(words, cwd=folder, check=True, capture_output=True)
-    (folder / "SpringMass.fmu").rename(path)

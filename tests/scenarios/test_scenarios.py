@@ -6,7 +6,7 @@ import pytest
 
 from fe.wing.design import SHIPPED_DESIGN
 from scenarios import asset_scripts, binding_files, recording_files, scenario_files
-from twin_master.mission.truth import Truth
+from twin_master.mission.turns import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 

@@ -5,16 +5,13 @@ import json
 import os
 import re
 import shutil
-from dataclasses import dataclass
-from functools import cached_property
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import xarray as xr
 from fmpy import read_model_description
-from fmpy.validation import validate_fmu
 
 from calibration.dynamics.records import read_records
 from calibration.dynamics.trials import average, fit_trials
@@ -26,10 +23,10 @@ from calibration.virtual_wing import VirtualWing, measure_load_test, measure_rin
 from calibration.wing.lab_data import read_weighed_mass, write_lab_folder
 from fe.runtime.state import DigitalState
 from fe.wing.design import SHIPPED_DESIGN
-from tests.command_line import call, command, refused, said
+from tests.command_line import command, refused, said
 from tests.kept import FE, ROOT, kept_folder
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, cut_off_after, edited, text_of, written
+from tests.twin_master.runs import check_same, edited, written
 from tests.wings import tip_stiffness
 from uav_twin import FmiAsset, assemble, load_calibration, load_design, reduced_model
 
@@ -94,73 +91,51 @@ def test_an_fmu_and_another_design_are_measured_alike(tmp_path):
     assert lengths.measured == pytest.approx(1.9, abs=5e-4)
 
 
-@dataclass(frozen=True)
-class Tailored:
-    """One virtual wing: its name, its truth and its laboratory folder; it is calibrated when asked for."""
-
-    name: str
-    truth: DigitalState
-    lab: Path
-
-    @property
-    def out(self) -> Path:
-        return self.lab.with_name(f"calibrated_{self.name}")
-
-    @property
-    def file(self) -> Path:
-        """The file of its calibration, which is made at the first call; the soft one has a report."""
-        assert self.said
-        return self.out / "calibration.nc"
-
-    @cached_property
-    def said(self) -> str:
-        report = ["--no-report"] if self.name == "stiff" else []
-        lab = [path.read_bytes() for path in sorted(self.lab.rglob("*")) if path.is_file()]
-        places = (*FE, ROOT / "calibration", ROOT / "uav_twin")
-        return kept_folder(self.out, lambda: said(*self.words, "--out", self.out, *report), places, lab)
-
-    @property
-    def words(self) -> tuple[object, ...]:
-        return "calibrate", "--data", self.lab, "--asset", self.name, "--fitted"
-
-    @cached_property
-    def result(self) -> Calibration:
-        return load_calibration(self.file)
-
-
 @pytest.fixture(scope="module")
-def wings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Tailored]:
-    """Two wings of the published planform, measured with errors."""
+def labs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Laboratories of two wings of the published planform, measured with errors."""
     made = {}
     for number, (name, truth) in enumerate(TRUTHS.items()):
-        lab = tmp_path_factory.mktemp(name) / "lab"
+        made[name] = tmp_path_factory.mktemp(name) / "lab"
         bench = VirtualWing(reduced_model(), truth)
         write_lab_folder(
-            lab,
+            made[name],
             lengths=published_lengths(),
             load_test=measure_load_test(bench, number),
             records=measure_ring_down(bench, number, trials=3, noise=2e-5),
             total_mass=weighed(2.0 * truth.servo_mass + truth.pitot_mass, 1e-3),
         )
-        made[name] = Tailored(name, truth, lab)
     return made
 
 
-@pytest.mark.parametrize("name", ["soft", pytest.param("stiff", marks=pytest.mark.long)])
-def test_the_truth_lies_in_the_posterior(wings, name):
-    made = wings[name]
-    assert made.result.asset == name
-    assert made.result.design_hash == reduced_model().design_hash  # published lengths: nothing was built anew
+class Calibrated(NamedTuple):
+    """The soft wing, calibrated: the words without --out, the folder, what was said, the result."""
+
+    words: tuple[object, ...]
+    out: Path
+    said: str
+    result: Calibration
+
+
+@pytest.fixture(scope="module")
+def soft(labs: dict[str, Path]) -> Calibrated:
+    lab = labs["soft"]
+    words, out = ("calibrate", "--data", lab, "--asset", "soft", "--fitted"), lab.with_name("calibrated")
+    measured = [path.read_bytes() for path in sorted(lab.rglob("*")) if path.is_file()]
+    places = (*FE, ROOT / "calibration", ROOT / "uav_twin")
+    told = kept_folder(out, lambda: said(*words, "--out", out), places, measured)
+    return Calibrated(words, out, told, load_calibration(out / "calibration.nc"))
+
+
+def test_the_truth_lies_in_the_posterior(soft):
+    result, truth = soft.result, TRUTHS["soft"]
+    assert result.asset == "soft"
+    assert result.design_hash == reduced_model().design_hash  # published lengths: nothing was built anew
     for entry in STATE:
-        off = made.result.mean(entry) - getattr(made.truth, entry)
-        assert abs(off) < 4.0 * made.result.standard_deviation(entry), (name, entry)
-    mass = 2.0 * made.result.samples[:, 1] + made.result.samples[:, 2]
-    np.testing.assert_allclose(mass, 2.0 * made.truth.servo_mass + made.truth.pitot_mass, atol=6e-3)
-    if name == "stiff":
-        soft = wings["soft"].result
-        assert made.result.mean("young_modulus_factor") - soft.mean("young_modulus_factor") > 0.03
-        for entry in ("tip_stiffness", "damping_ratio_2"):
-            assert made.result.mean(entry) > soft.mean(entry)
+        off = result.mean(entry) - getattr(truth, entry)
+        assert abs(off) < 4.0 * result.standard_deviation(entry), entry
+    mass = 2.0 * result.samples[:, 1] + result.samples[:, 2]
+    np.testing.assert_allclose(mass, 2.0 * truth.servo_mass + truth.pitot_mass, atol=6e-3)
 
 
 def test_the_published_figures_give_table_1():
@@ -174,27 +149,26 @@ def test_the_published_figures_give_table_1():
     assert {name: table[name][6] for name in lengths} == lengths
 
 
-def test_what_a_calibration_leaves_and_says(wings):
-    made = wings["soft"]
+def test_what_a_calibration_leaves_and_says(soft):
     for word in (
         "Step 1: step1/geometry_data.csv read",
         "8 pairs",
         "initialconditiondata_1.DAT to",
         "Report:",
     ):
-        assert word in made.said
-    names = {path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()}
+        assert word in soft.said
+    names = {path.relative_to(soft.out).as_posix() for path in soft.out.rglob("*") if path.is_file()}
     figures = ["load_test", "modes", "posterior", "prior_and_posterior", "procedure", "readings", "ring_down"]
     assert names == {
         "calibration.nc", "report.html", "table_1.csv", "wing.vtu", "modes.vtu",
         *(f"figures/{name}.{kind}" for name in figures for kind in ("svg", "png")),
     }  # fmt: skip
-    page = (made.out / "report.html").read_text(encoding="utf-8")
+    page = (soft.out / "report.html").read_text(encoding="utf-8")
     assert "Calibration of soft" in page
     assert "This calibration beside Table 1 of the paper" in page
     assert not re.search(r"https?://", page.replace("http://www.w3.org", ""))  # nothing is fetched
     assert not re.search(r"""(?<=[\s"'>(=])/(?:[\w.-]+/)+""", page)  # no folder of this machine
-    result = made.result
+    result = soft.result
     assert [reading.experiment for reading in result.readings] == [
         *["planform"] * 3, "load test", "weighing", *["ring-down"] * 4,
     ]  # fmt: skip
@@ -207,85 +181,42 @@ def test_what_a_calibration_leaves_and_says(wings):
 
 
 @pytest.mark.long
-def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(wings, tmp_path):
-    made, out, file = wings["soft"], tmp_path / "out", tmp_path / "out" / "calibration.nc"
-    before = made.file.read_bytes()
-    shutil.copytree(made.out, out)
-    assert "is the calibration of soft, not of other: choose another --out" in refused(
-        "calibrate", "--out", out, "--asset", "other"
-    )
-    assert file.read_bytes() == before
-    old = file.stat().st_ino
-    said(*made.words, "--no-report", "--out", out)
-    assert {path.name for path in out.iterdir()} == {"calibration.nc", "table_1.csv"}
-    assert file.stat().st_ino != old  # it was written anew
-    check_same(out, made.out, "calibration.nc", "table_1.csv")
-    said(*made.words, "--out", tmp_path)
-    check_same(tmp_path, made.out, "calibration.nc", "report.html", "table_1.csv", "figures/posterior.svg")
+def test_a_calibration_repeats_to_the_byte(soft, tmp_path):
+    said(*soft.words, "--out", tmp_path)
+    check_same(tmp_path, soft.out, "calibration.nc", "report.html", "table_1.csv", "figures/posterior.svg")
+    said(*soft.words, "--no-report", "--out", tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"calibration.nc", "table_1.csv"}
+    check_same(tmp_path, soft.out, "calibration.nc", "table_1.csv")
 
 
 @pytest.mark.long
-def test_two_wings_are_two_fmus(wings, tmp_path):
-    seen, guid = {}, set()
-    variables = ("young_modulus_factor", "mass.servo", "mass.pitot", "damping.alpha", "damping.beta")
-    for name, made in wings.items():
-        fmus = [tmp_path / f"{name}{copy}.fmu" for copy in (1, 2)]
-        for fmu in fmus:
-            said("fmu", "build", "--calibration", made.file, "--out", fmu)
-        assert fmus[0].read_bytes() == fmus[1].read_bytes()
-        assert validate_fmu(str(fmus[0])) == []
-        if name == "soft":
-            said("fmu", "check", fmus[0], "--cycles", "5")
-        described = read_model_description(str(fmus[0]))
-        guid.add(described.guid)
-        assert f"Calibrated for the wing '{name}'" in described.description
-        start = {variable.name: variable.start for variable in described.modelVariables}
-        assert [float(start[variable]) for variable in variables] == [made.result.mean(e) for e in STATE]
-        shutil.unpack_archive(fmus[0], tmp_path / name, "zip")
-        record = json.loads((tmp_path / name / "resources" / "calibration.json").read_text(encoding="utf-8"))
-        assert record["asset"] == name
-        deviation = record["state"]["servo_mass"]["standard_deviation"]
-        assert deviation == pytest.approx(made.result.standard_deviation("servo_mass"))
-        with FmiAsset(fmus[0], "scenarios/bindings/uav_wing.toml", isolated=False) as asset:
+def test_a_calibrated_wing_is_an_fmu_of_its_own(soft, tmp_path):
+    described, seen = {}, {}
+    for name, given in (("drawn", ()), ("soft", ("--calibration", soft.out / "calibration.nc"))):
+        fmu = tmp_path / f"{name}.fmu"
+        said("fmu", "build", *given, "--out", fmu)
+        described[name] = read_model_description(str(fmu))
+        with FmiAsset(fmu, "scenarios/bindings/uav_wing.toml", isolated=False) as asset:
             seen[name] = asset.step({"load_factor": 3.0}, {"z1": 0.0, "z2": 0.0})
-    assert len(guid) == 2
-    ratio = seen["soft"].values / seen["stiff"].values
+    said("fmu", "check", fmu, "--cycles", "5")
+    assert described["soft"].guid != described["drawn"].guid
+    assert "Calibrated for the wing 'soft'" in described["soft"].description
+    start = {variable.name: variable.start for variable in described["soft"].modelVariables}
+    variables = ("young_modulus_factor", "mass.servo", "mass.pitot", "damping.alpha", "damping.beta")
+    assert [float(start[variable]) for variable in variables] == [soft.result.mean(e) for e in STATE]
+    with zipfile.ZipFile(fmu) as archive:
+        assert json.loads(archive.read("resources/calibration.json"))["asset"] == "soft"
+    ratio = seen["soft"].values / seen["drawn"].values
     assert np.all(ratio > 1.0)
-    assert seen["soft"].extra["tip_displacement"] > seen["stiff"].extra["tip_displacement"]
-    soft, stiff = (wings[name].result.mean("young_modulus_factor") for name in ("soft", "stiff"))
-    assert 1.0 < np.median(ratio) < stiff / soft * 1.01
+    assert seen["soft"].extra["tip_displacement"] > seen["drawn"].extra["tip_displacement"]
+    (drawn,) = (v.start for v in described["drawn"].modelVariables if v.name == variables[0])
+    assert 1.0 < np.median(ratio) < float(drawn) / soft.result.mean("young_modulus_factor") * 1.01
 
 
-@pytest.mark.long
-@pytest.mark.usefixtures("no_report")
-def test_the_truth_of_the_scenario_stays_and_a_run_needs_nothing_but_its_folder(wings, tmp_path):
-    """It is told where a wing is another one than the truth; the file of the calibration may be gone."""
-    true, scenario = [], written(tmp_path, text_of("level_turns", ("steps = 50", "steps = 3")))
-    for name, made in wings.items():
-        file = Path(shutil.copy(made.file, tmp_path / "wing.nc"))
-        given = ("run", scenario, "--calibration", file, "--out")
-        done = command(*given, tmp_path / name)
-        assert done.returncode == 0
-        off = abs(1.0073 - made.result.mean("young_modulus_factor"))
-        far = off > 3.0 * made.result.standard_deviation("young_modulus_factor")
-        sentence = "true Young modulus factor of the asset flown is 1.0073"
-        assert (sentence in " ".join(done.stderr.split())) == far
-        assert far or name == "stiff"  # at least the soft wing is another one
-        with xr.open_datatree(tmp_path / name / "run.nc", engine="h5netcdf") as tree:
-            true.append(tree["truth"]["strain"].values[0].copy())
-    np.testing.assert_array_equal(*true)
-    with cut_off_after(2, ends=False), pytest.MonkeyPatch.context() as patch:
-        assert call(patch, *given, tmp_path / "part", "-q") == 130
-    file.unlink()
-    said("run", "--resume", tmp_path / "part", "-q")
-    names = "run.nc config.json summary.json calibration.json asset/asset.fmu wing.vtu"
-    check_same(tmp_path / "part", tmp_path / name, *names.split())
-
-
-def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(wings, tmp_path, monkeypatch):
+def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(labs, tmp_path, monkeypatch):
     # The published frequencies ask the softer wing for masses beyond the model.
     lab = tmp_path / "lab"
-    shutil.copytree(wings["stiff"].lab / "step2", lab / "step2")
+    shutil.copytree(labs["stiff"] / "step2", lab / "step2")
     replace, count = Path.replace, 0
 
     def full(self: Path, target: Path) -> Path:
@@ -309,8 +240,8 @@ def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(wings, tmp_path, 
 
 
 @pytest.mark.long
-def test_records_may_be_left_aside(wings):
-    out = said("calibrate", "--data", wings["stiff"].lab, "--published", "--procedure", "paper")
+def test_records_may_be_left_aside(labs):
+    out = said("calibrate", "--data", labs["stiff"], "--published", "--procedure", "paper")
     assert "Nothing was written" in out.splitlines()[-1]
     assert "Step 3: records left aside as asked; published" in out
     assert re.search(r"frequency_1 +Hz +5\.649 ±", out)
@@ -375,9 +306,9 @@ def one_mode(text: str) -> str:
     ],
     ids=["lengths", "pairs", "record"],
 )
-def test_a_wrong_file_is_one_sentence_and_leaves_nothing(wings, tmp_path, name, change, sentence):
+def test_a_wrong_file_is_one_sentence_and_leaves_nothing(labs, tmp_path, name, change, sentence):
     lab, out = tmp_path / "lab", tmp_path / "out"
-    shutil.copytree(wings["soft"].lab, lab)
+    shutil.copytree(labs["soft"], lab)
     (lab / name).write_text(change((lab / name).read_text(encoding="utf-8")), encoding="utf-8")
     assert sentence in refused("calibrate", "--data", lab, "--out", out)
     assert not out.exists()

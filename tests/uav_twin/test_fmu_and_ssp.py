@@ -14,7 +14,7 @@ import xarray as xr
 
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import load_binding, parse_binding
-from fmu_asset.door.experiment import default_experiment, fly, read_histories
+from fmu_asset.door.experiment import default_experiment, read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from scenarios import binding_files
@@ -67,27 +67,28 @@ def test_an_fmu_alone(foreign_fmu, tmp_path):
     assert plot.read_bytes()[:4] == b"\x89PNG"
     told = said("fmu", "simulate", fmu, "--in-process", "--stop-time", 0.4)
     assert "500 steps to t = 0.4 s, every 0.0008 s" in told
-
-
-@pytest.mark.parametrize("where", [(), ("--in-process",)], ids=["worker", "in process"])
-def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path, where):
-    """Each element sums its weight times its input: n of them, set in configuration mode."""
-    fmu, out = foreign_fmu("resize3"), tmp_path / "x.csv"
-    wanted = ("--stop-time", 3, "--step-size", 1, "--out", out, *where)
-    said("fmu", "simulate", fmu, *wanted, "--set", "n=4", "--set", "u=1,2,0,-1")
-    rows = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
-    assert rows.dtype.names == ("time", "y[1]", "y[2]", "y[3]", "y[4]", "total")
-    assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
+    text = '<DefaultExperiment startTime="2.0" stopTime="3.0" stepSize="0.25"/><ModelVariables>'
+    fmu = foreign_fmu.changed("ball2", "ball_with_experiment", ("<ModelVariables>", text))
+    assert "4 steps to t = 3 s" in said("fmu", "simulate", fmu, "--in-process", "--out", out, "--replace")
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    assert rows["time"].tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
+    assert rows["h"][0] == 1.0
 
 
 SIZED = INPUTS.text("sized.toml")
 
 
-def test_an_array_may_be_empty(foreign_fmu, tmp_path):
-    out, fmu = tmp_path / "x.csv", foreign_fmu("resize3")
-    wanted = ("--stop-time", 2, "--step-size", 1, "--set", "n=0", "--in-process", "--out", out)
-    said("fmu", "simulate", fmu, *wanted)
-    assert out.read_text(encoding="utf-8").splitlines() == ["time,total", "0.0,0.0", "1.0,0.0", "2.0,0.0"]
+def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path):
+    """Each element sums its weight times its input: n of them, set in configuration mode; it may be none."""
+    fmu, out = foreign_fmu("resize3"), tmp_path / "x.csv"
+    wanted = ("fmu", "simulate", fmu, "--stop-time", 3, "--step-size", 1, "--replace", "--out", out)
+    for where in ((), ("--in-process",)):
+        said(*wanted, *where, "--set", "n=4", "--set", "u=1,2,0,-1")
+        rows = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
+        assert rows.dtype.names == ("time", "y[1]", "y[2]", "y[3]", "y[4]", "total")
+        assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
+    said(*wanted, "--in-process", "--set", "n=0")
+    assert out.read_text(encoding="utf-8").splitlines()[:3] == ["time,total", "0.0,0.0", "1.0,0.0"]
     bound, given = tmp_path / "empty.toml", tmp_path / "u.csv"
     bound.write_text(SIZED.replace("n = 3", "n = 0"), encoding="utf-8")
     given.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
@@ -96,10 +97,13 @@ def test_an_array_may_be_empty(foreign_fmu, tmp_path):
 
 
 def test_histories_of_an_array_of_another_size(foreign_fmu, tmp_path):
-    """Weights 1, 2, 3; the two start values of the FMU are no longer of use. A state holds them, too."""
+    """Weights 1, 2, 3; the two start values of the FMU are no longer of use. A state holds them, too.
+
+    Columns stand in any order.
+    """
     bound, given, out = tmp_path / "b.toml", tmp_path / "u.csv", tmp_path / "x.csv"
     bound.write_text(SIZED, encoding="utf-8")
-    given.write_text("time,u[1],u[2],u[3]\n0,1,2,3\n1,0,0,1\n", encoding="utf-8")
+    given.write_text("u[2],time,u[1],u[3]\n2,0,1,3\n0,1,0,1\n", encoding="utf-8-sig")
     fmu = foreign_fmu("resize3")
     said("fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--out", out, "--in-process")
     assert out.read_text(encoding="utf-8").splitlines()[1:] == ["1.0,1.0,4.0,9.0", "2.0,1.0,4.0,12.0"]
@@ -141,32 +145,13 @@ def test_structural_parameters_of_a_binding(foreign_fmu):
         FmiAsset(exchange, default_experiment(read_fmu(exchange), values={"n": 3.0}).binding)
 
 
-def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu):
-    text = '<DefaultExperiment startTime="2.0" stopTime="3.0" stepSize="0.25"/><ModelVariables>'
-    fmu = foreign_fmu.changed("ball2", "ball_with_experiment", ("<ModelVariables>", text))
-    planned = default_experiment(read_fmu(fmu))
-    assert (planned.binding.binding.start_time, planned.binding.step_size, planned.steps) == (2.0, 0.25, 4)
-    with FmiAsset(fmu, planned.binding, isolated=False) as asset:
-        history = fly(asset, planned)
-    assert history.time.tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
-    assert history.values[0].tolist() == [1.0, 0.0, 0.0]
-
-
 @pytest.mark.parametrize(("content", "sentence"), HISTORIES)
 def test_files_that_are_refused(tmp_path, content, sentence):
     given = tmp_path / "inputs.csv"
     given.write_text(content, encoding="utf-8")
     with pytest.raises(FmuInputError, match=sentence):
         read_histories(given, load_binding(ROOM))
-
-
-def test_columns_of_arrays_in_any_order_and_time_alone(tmp_path):
-    given = tmp_path / "inputs.csv"
-    given.write_text("power[2],time,power[1]\n1,120,2\n3,180,4\n", encoding="utf-8-sig")
-    steps, roles = read_histories(given, load_binding(ROOM))
-    assert steps == 2
-    assert roles["control"]["power"].tolist() == [[2.0, 1.0], [4.0, 3.0]]
-    given.write_text("time\n120\n180.00001\n240\n", encoding="utf-8")
+    given.write_text("time\n120\n180.00001\n240\n", encoding="utf-8")  # the time alone will do
     assert read_histories(given, load_binding(ROOM)) == (3, {})
 
 

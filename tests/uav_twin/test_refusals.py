@@ -37,6 +37,9 @@ def folder(
         "library.toml": text.replace(flown, library), "pull.csv": TWO["pull.csv"].decode(),
         "filled/pull.csv": TWO["pull.csv"].decode(),
         "run.nc": "", "misspelt.csv": "turn,strian_24\n0,1e-4\n", "lines.jsonl": "{}\n",
+        "torn.toml": "mass = [", "half.toml": "name = 'half a wing'",
+        "hole.csv": "F [N];Weg [mm]\n1;0,5\n;0,75\n3;0,8\n",
+        "back.csv": "t [ms];Weg [mm]\n" + "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14)),
         "room.toml": INPUTS.text("room.toml"), "cold.csv": "time,outside\n120,5\n180,-41\n",
         "my_part.toml": structure_files()["bracket"].read_text(encoding="utf-8"),
     }.items():  # fmt: skip

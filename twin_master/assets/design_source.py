@@ -31,11 +31,10 @@ from twin_master.assets.parameter import (
 )
 from twin_master.assets.reduced_model import NamedStructure, ReducedModelSource
 from twin_master.assets.structure_source import StructureFmuSource
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
-from twin_master.sentences import said
+from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, BeliefSection
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration

@@ -24,12 +24,11 @@ from twin_master.assets.asset_source import OBSERVATIONS_COPY, AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.errors import InvalidModelError, MissionInputError
+from twin_master.errors import InvalidModelError, MissionInputError, said
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.asset import BeliefSection
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
+from twin_master.scenario.section import BeliefSection
 
 if TYPE_CHECKING:
     import xarray as xr

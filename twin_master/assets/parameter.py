@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reporting.arrays import Float
-from twin_master.errors import MissionInputError, check_names
+from twin_master.errors import MissionInputError, check_names, said
 from twin_master.scenario.schema import Calibration
 from twin_master.seeds import generator, seed_sequence
-from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration as Calibrated

@@ -13,21 +13,19 @@ from fe.structure.tables import StructureDesign
 from fmu_asset.door.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress
-from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, InnerTruth, StatelessAsset
+from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import (
     SAME_NAMES,
     ParameterDraws,
     calibrated_means,
     check_calibration,
 )
-from twin_master.errors import MissionInputError, check_names
+from twin_master.errors import MissionInputError, check_names, said
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import packed_row
-from twin_master.scenario.asset import FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import ROLE, ModesSection
+from twin_master.scenario.section import ROLE, FileSection, ModesSection
 from twin_master.seeds import seed_sequence
-from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
@@ -427,7 +425,7 @@ class RecordedStructure(Asset):
         return AssetReading(
             section.observed(modal_values(model, vector, section, damping)),
             {f"standard_error_{title}": error for title, error in zip(titles, errors, strict=True)},
-            InnerTruth({}, sensed),
+            sensed=sensed,
         )
 
     def save_state(self) -> bytes:

@@ -20,11 +20,11 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import (
     MissionInputError,
     check_names,
+    said,
 )
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
-from twin_master.scenario.asset import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
+from twin_master.scenario.section import AssetSection, BeliefSection
 
 FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""

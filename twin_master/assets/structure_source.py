@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from fmu_asset.door.binding import Binding
 from reporting.files import atomic_write_text
@@ -17,13 +17,9 @@ from twin_master.assets.asset_source import (
 )
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection, FmuSource
 from twin_master.assets.reduced_model import NamedStructure, RecordedStructure, ReducedModelSource
-from twin_master.errors import MissionInputError
-from twin_master.scenario.asset import BeliefSection, FileSection
+from twin_master.errors import MissionInputError, said
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
-
-if TYPE_CHECKING:
-    pass
+from twin_master.scenario.section import BeliefSection, FileSection
 
 FLOWN_COPY, MODEL_COPY = "asset/flown/structure.toml", "asset/model/structure.toml"
 

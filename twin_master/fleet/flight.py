@@ -16,7 +16,7 @@ from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
-from twin_master.errors import FleetError, RunFolderError
+from twin_master.errors import FleetError, RunFolderError, said
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
 from twin_master.fleet.shard import Engine, Piece, ShardResult, flown, unflown, with_parameters
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store, sizes_of
@@ -32,7 +32,6 @@ from twin_master.run_folder import (
     to_json,
 )
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 from twin_master.watch.feeds import file_feed
 
 if TYPE_CHECKING:

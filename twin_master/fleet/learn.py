@@ -17,7 +17,7 @@ from reporting.provenance import hash_record
 from reporting.toml_file import toml_text
 from reporting.words import counted
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.errors import FleetError
+from twin_master.errors import FleetError, said
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import fleet_config, source_of
 from twin_master.fleet.posterior import POINTS, Grid, Line, masses, narrowed, population, refined, shared
@@ -26,7 +26,6 @@ from twin_master.fleet.store import open_group
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
-from twin_master.sentences import said
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -12,13 +12,12 @@ from pydantic import Field
 from reporting.provenance import hash_file
 from reporting.toml_file import Fault, NotNegative, Number, checked, read_toml
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import FleetError, TwinMasterError
+from twin_master.errors import FleetError, TwinMasterError, said
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, Probability, Section, Seed
 from twin_master.seeds import generator
-from twin_master.sentences import said
 from twin_master.watch.feeds import is_broker
 from twin_master.watch.message import Fed
 
@@ -223,8 +222,7 @@ def ensemble(scenario: str, seeds: range, overrides: Overrides | None = None, *,
 
     The calibration is drawn once, under the seed of the scenario or of the overrides, for all of them.
     """
-    loaded = load_scenario(scenario)
-    resolved = resolve_scenario(loaded, overrides or Overrides())
+    resolved = resolve_scenario(load_scenario(scenario), overrides)
     members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
     group = Group(resolved.mission.name, (resolved,), {}, members)
     mission = resolved.mission

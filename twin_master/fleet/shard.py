@@ -31,7 +31,7 @@ from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.errors import FleetError
+from twin_master.errors import FleetError, said
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import FAILED, outcomes_of
 from twin_master.mission.loop import BelievedModel, filtered_again, operate
@@ -40,7 +40,6 @@ from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one,
 from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import Fed
 

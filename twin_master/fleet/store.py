@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from reporting.files import written
-from twin_master.errors import FleetError
+from twin_master.errors import FleetError, said
 from twin_master.fleet.plan import Fleet, Group, Member
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 from twin_master.store.mission_result import SCHEMA
 from twin_master.store.summary import find_fallback
 

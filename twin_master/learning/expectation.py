@@ -14,7 +14,7 @@ import numpy as np
 from reporting.arrays import Float
 from twin_master.learning.learning_filter import Hypotheses, LearningFilter, quantiles_of
 from twin_master.network.estimator import Carried, Learnt
-from twin_master.network.rewards import RewardModel
+from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
 
 _LEVELS = np.array([0.025, 0.975])

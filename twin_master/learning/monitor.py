@@ -19,16 +19,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from twin_master.errors import InvalidModelError
-from twin_master.learning import switching
-from twin_master.learning.rivals import Shown, mix_onset, weigh_gauges, weigh_model, weigh_none
-from twin_master.learning.switching import GAUGES, MENDED, NONE
-from twin_master.learning.words import Words
-from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
+from twin_master.errors import InvalidModelError, said
+from twin_master.learning.rivals import (
+    ENDS,
+    GAUGES,
+    MENDED,
+    NONE,
+    Shown,
+    at_first,
+    beliefs_of,
+    hypotheses,
+    mix_onset,
+    one_turn_later,
+    weigh_gauges,
+    weigh_model,
+    weigh_none,
+)
+from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion, Words
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing
-from twin_master.sentences import said
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -54,7 +64,7 @@ class WatchfulEstimator:
     """An estimator with notices beside it; absurd readings are left out.
 
     Its belief is that of the mixture: of the estimator, of each gauge being off, and of what was off and is
-    mended (`switching`). It carries beside the arrays of the estimator, under the prefix `notice/`, beliefs
+    mended (see `rivals`). It carries beside the arrays of the estimator, under the prefix `notice/`, beliefs
     of the model and the rivals over draws and states, their log e-values, shares and sums of squares.
 
     Parameters
@@ -145,9 +155,9 @@ class WatchfulEstimator:
         suspicion = self._suspicion(own)
         notices += self._alarms(own, suspicion, turn)
         believed = own["share"], estimate.filtered, own["mended"], own["gauge"]
-        found = switching.hypotheses(*believed, self._names)
+        found = hypotheses(*believed, self._names)
         notices += self._leading(own, found, turn)
-        own["belief"], own["rivals"], right = switching.beliefs_of(*believed)
+        own["belief"], own["rivals"], right = beliefs_of(*believed)
         own["right"] = np.array([right])
         return replace(
             estimate,
@@ -181,7 +191,7 @@ class WatchfulEstimator:
             "gauge": np.broadcast_to(model, self._shape).astype(np.float32, order="C"),
             "none": model[None].astype(np.float32),
             "mended": model.copy(),
-            "share": switching.at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
+            "share": at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
             "leading": np.zeros(1),
             "log_gauge": np.full((sensors, gains), weight - np.log(gains)),
             "log_none": np.full(1, weight),
@@ -227,8 +237,8 @@ class WatchfulEstimator:
         twice = 2.0 * self._settings.prior
         hazard = np.log(twice) + inflow - np.log1p(twice * (self._to_begin(turn - 1.0) - 1.0))
         before = own["share"][MENDED]
-        own["share"], ended = switching.one_turn_later(own["share"], hazard, self._begins)
-        fresh = max(0.0, -np.expm1(before + np.log1p(-switching.ENDS) - own["share"][MENDED]))
+        own["share"], ended = one_turn_later(own["share"], hazard, self._begins)
+        fresh = max(0.0, -np.expm1(before + np.log1p(-ENDS) - own["share"][MENDED]))
         weight = np.exp(ended)
         of_gauge = weight[1:].reshape(self._shape[:2])
         belief = weight[1:].astype(np.float32) @ own["gauge"].reshape(len(weight) - 1, -1)

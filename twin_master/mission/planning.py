@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
-from twin_master.errors import PlanningError
+from twin_master.errors import PlanningError, said
 from twin_master.network.belief_planning import (
     BeliefPlan,
     Decide,
@@ -19,10 +19,9 @@ from twin_master.network.belief_planning import (
 )
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy, value_iteration
-from twin_master.network.rewards import RewardModel
+from twin_master.network.quantity import RewardModel
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
-from twin_master.sentences import said
 
 MISSIONS = 400
 """That are simulated for each rule."""

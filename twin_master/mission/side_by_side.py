@@ -18,8 +18,7 @@ from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import DamageGrowth, Truth, checked_values, decided_to_end
-from twin_master.mission.turns import History
+from twin_master.mission.turns import DamageGrowth, History, Truth, checked_values, decided_to_end
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import filter_many
 from twin_master.network.planner import decision, rationed

@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.kernels import backward_pass, forward_pass
-from twin_master.network.transition import TransitionModel
+from twin_master.network.transition import TransitionModel, expect_controls, expect_shape
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,10 @@ from scipy.special import rel_entr
 
 from reporting.arrays import Float, Index
 from reporting.words import brief
-from twin_master.errors import InvalidModelError, InvalidObservationError
-from twin_master.network.distributions import expect_controls, expect_shape
+from twin_master.errors import InvalidModelError, InvalidObservationError, said
+from twin_master.network.kernels import LOG_ROOT_TWO_PI, log_densities, separated
 from twin_master.network.quantity import QuantityModel
-from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI, log_densities, separated
-from twin_master.sentences import said
+from twin_master.network.transition import expect_controls, expect_shape
 
 _WORST_SHOWN = 3
 LARGEST = 1e140

@@ -2,10 +2,11 @@
 
 A table of S states has S² entries, the tables of its factors together a few hundred. What is small is kept as
 one table, whose loops are the shortest; what is not, as the tables of the factors, each applied along its own
-axis.
+axis. Distributions, stochastic matrices, the shapes of arrays, and whether they fit in memory, are checked
+where they come in.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from math import prod
@@ -13,15 +14,123 @@ from math import prod
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float
-from twin_master.errors import InvalidModelError
-from twin_master.network.distributions import expect_shape, stochastic_matrix
+from reporting.arrays import Float, Index
+from reporting.memory import memory_left
+from twin_master.errors import InvalidModelError, TwinMasterError, said
 from twin_master.network.kernels import Lists
-from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
-from twin_master.sentences import said
 
+ROW_SUM_TOLERANCE = 1e-12
+"""Largest departure of the sum of a probability distribution from one."""
+
+
+def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
+    """Return `rows` as a checked, read-only array of probability distributions along the last axis.
+
+    Parameters
+    ----------
+    rows : (..., n) dimensionless
+        Finite, non-negative, each row summing to one within `ROW_SUM_TOLERANCE`.
+    name : str
+        What the matrix is, for the error message.
+
+    Raises
+    ------
+    InvalidModelError
+        With the index of the first row that is no distribution.
+    """
+    matrix = np.array(rows, dtype=np.float64, order="C")
+    if matrix.ndim == 0 or matrix.size == 0:
+        raise InvalidModelError(said("network.no_rows", name=name, shape=matrix.shape))
+    for bad, reason in (
+        (~np.isfinite(matrix).all(axis=-1), "holds a value that is not finite"),
+        ((matrix < 0.0).any(axis=-1), "holds a negative probability"),
+        (np.abs(matrix.sum(axis=-1) - 1.0) > ROW_SUM_TOLERANCE, "does not sum to one"),
+    ):
+        if np.any(bad):
+            where = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0]) if matrix.ndim > 1 else ()
+            row = matrix[where]
+            label = f"row {where[0] if len(where) == 1 else where}" if where else "the distribution"
+            sizes, what = (row.sum(), row.min()), f"{name}: {label} {reason}"
+            raise InvalidModelError(said("network.no_distribution", what=what, sizes=sizes))
+    matrix.setflags(write=False)
+    return matrix
+
+
+def distribution(probabilities: ArrayLike, *, size: int, name: str) -> Float:
+    """Return one checked, read-only probability distribution of length `size`.
+
+    Raises
+    ------
+    InvalidModelError
+        If it has another shape, or does not pass `stochastic_matrix`.
+    """
+    vector = stochastic_matrix(probabilities, name=name)
+    expect_shape(name, vector.shape, size)
+    return vector
+
+
+def expect_shape(
+    what: str, shape: Sequence[int], *wanted: int | str, error: type[TwinMasterError] = InvalidModelError
+) -> None:
+    """Refuse an array of another shape.
+
+    Parameters
+    ----------
+    what : str
+        What it is, for the sentence.
+    shape : tuple of int
+        That it has.
+    *wanted : int or str
+        Lengths of its axes; a word stands for any length.
+    error : type
+        What is raised.
+    """
+    pairs = zip(wanted, shape, strict=False)
+    if len(shape) != len(wanted) or any(isinstance(length, int) and length != has for length, has in pairs):
+        told = ", ".join(map(str, wanted)) + "," * (len(wanted) == 1)
+        raise error(f"expected {what} of shape ({told}), got {tuple(shape)}")
+
+
+def expect_controls(index: int | Index, count: int) -> None:
+    """Refuse indices of controls, an array of any shape, that are none of `count`."""
+    low, high = np.min(index, initial=0), np.max(index, initial=0)
+    if low < 0 or high >= count:
+        raise InvalidModelError(f"expected control indices between 0 and {count - 1}, got {low} to {high}")
+
+
+NUMBER = 8
+"""Bytes of a number."""
+TRANSITION_COPIES = 3
+"""The tables of the controls, the array of all of them, and the checked copy."""
 JOINT_NON_ZEROS = 512
 """Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
+
+
+def check_fits(parts: Mapping[str, float], advice: str) -> None:
+    """Check that arrays fit in memory together.
+
+    Parameters
+    ----------
+    parts : dict of str to float
+        What is to be built, in words with its numbers, and its size [bytes].
+    advice : str
+        What makes it smaller.
+
+    Raises
+    ------
+    InvalidModelError
+        They do not; the sentence has all sizes.
+    """
+    needed, there = sum(parts.values()), memory_left()
+    if needed > there:
+        listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
+        sizes = [f"{size / 1e9:.3g} GB" for size in (needed, there)]
+        raise InvalidModelError(said("network.memory", listed=listed, sizes=sizes, advice=advice))
+
+
+def transition_bytes(states: int, controls: int) -> float:
+    """Return the size of one table of transitions (U, S, S) [bytes]."""
+    return float(NUMBER * controls * states * states)
 
 
 def predecessor_lists(blocks: Sequence[Float]) -> Lists:

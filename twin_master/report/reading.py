@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from reporting.json_file import read_json
-from twin_master.errors import RunFolderError, TwinMasterError
+from twin_master.errors import RunFolderError, TwinMasterError, said
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
 from twin_master.network.twin import build_graphical_model
@@ -19,7 +19,6 @@ from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.sentences import said
 from twin_master.store.mission_result import MOMENTS, LearntQuantity, paths_of, printed_learnt, titles_of
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 

@@ -10,11 +10,10 @@ from typing import Any
 from reporting.toml_file import checked, read_toml
 from reporting.words import brief
 from scenarios import scenario_files
-from twin_master.errors import ScenarioError
-from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME
+from twin_master.errors import ScenarioError, said
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
-from twin_master.sentences import said
 
 _OF_SEVERAL = ("component", "connection", "algorithm", "iterations", "tolerance")
 _OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
@@ -90,8 +89,8 @@ def find_scenario(name: str) -> Path:
     raise ScenarioError(said("scenario.unknown", name=name, shipped=", ".join(shipped)))
 
 
-def load_scenario(name_or_path: str | Path) -> LoadedScenario:
-    """Read and check a scenario by its shipped name or its path.
+def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
+    """Read and check a scenario by its shipped name or its path; one that was read stays as it is.
 
     Where the file says nothing of `notice` the twin gives notices, if it can. `config.json` of a run says
     what was flown: nothing is added to that.
@@ -102,7 +101,9 @@ def load_scenario(name_or_path: str | Path) -> LoadedScenario:
         There is no such scenario, or the file cannot be read, is not TOML, or breaks the schema; the sentence
         names file and key.
     """
-    path = find_scenario(str(name_or_path))
+    if isinstance(given, LoadedScenario):
+        return given
+    path = find_scenario(str(given))
     table = read_toml(path, ScenarioError, what="scenario")
     content_hash = hashlib.sha256(path.read_bytes()).hexdigest()
     scenario, remark = parse_scenario(table, str(path)), ""

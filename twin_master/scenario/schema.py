@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, model_validator
 
 from reporting.toml_file import Fault, NotNegative, Number
-from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
+from twin_master.errors import said
 from twin_master.scenario.section import (
+    AssetSection,
+    BeliefSection,
     Count,
+    FileSection,
     Name,
     ObservationSection,
     Probability,
@@ -42,7 +45,6 @@ from twin_master.scenario.tables import (
     WatchSection,
     with_actions,
 )
-from twin_master.sentences import said
 
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge beyond which a unit was forgotten [1]."""

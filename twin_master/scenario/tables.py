@@ -9,9 +9,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field
 
 from reporting.toml_file import Fault, NotNegative, Number, Positive
-from twin_master.scenario.asset import FileSection
+from twin_master.errors import said
 from twin_master.scenario.section import (
     Count,
+    FileSection,
     Flag,
     Name,
     PerSensor,
@@ -23,7 +24,6 @@ from twin_master.scenario.section import (
     one_or_each,
     short,
 )
-from twin_master.sentences import said
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
@@ -71,6 +71,12 @@ class Transition(Section):
                 yield wide or len(entry[state]) != size, said("scenario.table_size", **told, size=size)
                 worst = max(abs(sum(row) - 1.0) for row in entry[state])
                 yield worst > ROW_SUM_TOLERANCE, said("scenario.table_sum", **told, worst=worst)
+
+
+def probability_of(table: Mapping[str, float | Mapping[str, float]], control: str, state: str) -> float:
+    """Return the probability of a factor of the state to worsen under a control."""
+    entry = table[control]
+    return entry[state] if isinstance(entry, Mapping) else entry
 
 
 class Span(Section):

@@ -13,7 +13,7 @@ from reporting.groups import Group, Variable
 from reporting.table_file import table_text
 from twin_master.learning.expectation import joined
 from twin_master.mission.loop import expected_in
-from twin_master.mission.truth import SensorStatus, Truth
+from twin_master.mission.turns import SensorStatus, Truth
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult

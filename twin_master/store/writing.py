@@ -16,9 +16,8 @@ from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.provenance import hash_record
 from twin_master.assets.asset_source import FlownAndBelieved
-from twin_master.errors import NotResumableError, RunFolderError
+from twin_master.errors import NotResumableError, RunFolderError, said
 from twin_master.run_folder import FIELD_NAME, read_config, to_json
-from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult, learnt_record
 from twin_master.store.results import groups_of, tables_of
 from twin_master.store.summary import Figure, Told, control_changes, noticed, summarise

@@ -27,7 +27,7 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError, ReportingError
 from reporting.json_file import read_json
 from reporting.record_json import plain
-from twin_master.errors import RunFolderError, TwinMasterError
+from twin_master.errors import RunFolderError, TwinMasterError, said
 from twin_master.learning.expectation import Expected, expected_of, joined
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, kept_knowledge
@@ -37,7 +37,6 @@ from twin_master.report.reading import NORMAL_95, printed_factors, printed_senso
 from twin_master.report.structure import design_of, planform_of
 from twin_master.run_folder import PICTURE, VERDICT, kept_scenario
 from twin_master.scenario.schema import REWARD_NAMES
-from twin_master.sentences import said
 
 TURNS_AT_ONCE = 200
 """Turns that are read before the viewers are answered again."""

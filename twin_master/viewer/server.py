@@ -13,8 +13,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from reporting.page import script_source
-from twin_master.errors import ViewError
-from twin_master.sentences import said
+from twin_master.errors import ViewError, said
 from twin_master.viewer.flight import Flight, Request, Teller
 
 ADDRESS = "127.0.0.1"

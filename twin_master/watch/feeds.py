@@ -20,13 +20,24 @@ import xarray as xr
 
 from reporting.errors import DamagedFileError
 from reporting.netcdf import read_groups
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
-from twin_master.watch.growing import GrowingFile, Pipe, Place, first_line, found, holds, rotated
 from twin_master.watch.intake import GIVEN, MISSING, Feed
-from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
+from twin_master.watch.message import (
+    LARGEST_MESSAGE,
+    Fed,
+    GrowingFile,
+    Message,
+    MessageReader,
+    Pipe,
+    Place,
+    Refused,
+    first_line,
+    found,
+    holds,
+    rotated,
+)
 
 Observations = Iterable[Mapping[str, Any]] | str | Path
 STANDARD_INPUT = "-"
@@ -47,11 +58,11 @@ def json_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
 
 def mappings(scenario: Scenario, messages: Iterable[Mapping[str, Any]]) -> Feed:
     """Return the feed of messages of a program; arrays of numbers may stand where JSON has lists."""
-    return Feed(fed(scenario, (json.dumps(message, default=_plain).encode() for message in messages)))
 
+    def plain(value: Any) -> Any:
+        return np.asarray(value).tolist()
 
-def _plain(value: Any) -> Any:
-    return np.asarray(value).tolist()
+    return Feed(fed(scenario, (json.dumps(message, default=plain).encode() for message in messages)))
 
 
 def shown(line: bytes | Refused) -> str:

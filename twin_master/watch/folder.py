@@ -15,7 +15,7 @@ from reporting.progress import Progress
 from reporting.provenance import hash_record
 from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
@@ -30,7 +30,6 @@ from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Told
 from twin_master.store.writing import store_flight

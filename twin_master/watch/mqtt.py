@@ -17,15 +17,13 @@ from secrets import token_hex
 from typing import Any
 
 from reporting.files import atomic_write_text, written
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, said
 from twin_master.mission.journal import JOURNAL_NAME, last_turn, records
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, shown
 from twin_master.watch.folder import Watch
-from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed
-from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Place, Refused
 
 CLIENT_SUFFIX, PUBLISHED_NAME = ".mqtt", "published"
 """Of the file with the name of the client, and of that which says how far decisions were published."""

@@ -17,7 +17,7 @@ from twin_master.assets.resolution import (
     given_overrides,
     resolve_scenario,
 )
-from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.errors import MissionInputError, NotResumableError, said
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
 from twin_master.run_folder import (
     CONFIG_NAME,
@@ -30,7 +30,6 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.sentences import said
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of
@@ -247,7 +246,7 @@ def watch(
     TwinMasterError, FiniteElementError, CalibrationError
         With one clear sentence; what was observed is kept.
     """
-    loaded = scenario if isinstance(scenario, LoadedScenario | None) else load_scenario(scenario)
+    loaded = None if scenario is None else load_scenario(scenario)
     given, progress = given_overrides(overrides), progress or SilentProgress()
     patch = None if model_patch is None or from_turn is None else (Path(model_patch), from_turn)
     if (model_patch, from_turn) != (None, None) and (patch is None or not resume):

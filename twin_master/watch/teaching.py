@@ -20,13 +20,12 @@ from fmu_asset.errors import FmuError
 from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
-from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.errors import MissionInputError, TwinMasterError, said
 from twin_master.mission.journal import damaged, records_backwards
 from twin_master.mission.loop import BelievedModel, gap_of, replay
 from twin_master.mission.preparation import Knowledge, prepared_alone
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.sentences import said
 
 CANNOT = (TwinMasterError, FmuError, FiniteElementError)
 """Why a twin cannot believe a patch."""

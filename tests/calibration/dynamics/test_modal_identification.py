@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from calibration.dynamics.damped_cosine import DampedCosines
 from calibration.dynamics.modal_identification import identify_modes
 from calibration.errors import ExperimentDataError
+from tests.calibration.decays import free_decay
 
 Float = NDArray[np.float64]
 
@@ -64,15 +64,6 @@ def test_errors_are_those_of_the_records(kind, count):
     assert 0.6 < np.mean(np.square(white)) < 1.6
 
 
-def test_errors_of_a_free_decay_are_those_of_its_waves():
-    decay, poles = record("decay", 0), OMEGA * (-RATIO + 1j * np.sqrt(1.0 - RATIO**2))
-    waves = DampedCosines(np.arange(len(decay)) / RATE, decay, drift=False).fit(poles)
-    wanted = np.array([[*mode.standard_error.values()] for mode in waves.modes])
-    assert identify_modes(decay, RATE, BANDS, "decay").standard_error[:, :2] == pytest.approx(
-        wanted, rel=1e-4
-    )
-
-
 @pytest.mark.parametrize(("kind", "samples"), [("ambient", 8000), ("decay", 1500)])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_noise_alone_has_no_mode(kind, samples, channels):
@@ -102,10 +93,7 @@ def test_a_band_without_a_mode_stays_empty_beside_one_with(kind):
 def test_a_record_without_noise_is_told_to_all_digits():
     """A free decay of one channel, sampled from its closed form."""
     time = np.arange(400) / RATE
-    decay = np.exp(-0.02 * 2.0 * np.pi * 5.0 * time) * np.cos(
-        2.0 * np.pi * 5.0 * np.sqrt(1.0 - 0.02**2) * time
-    )
-    found = identify_modes(decay, RATE, [[4.0, 6.0], [20.0, 30.0]], "decay")
+    found = identify_modes(free_decay(time, 5.0, 0.02), RATE, [[4.0, 6.0], [20.0, 30.0]], "decay")
     np.testing.assert_allclose(found.value[0], [5.0, 0.02], rtol=1e-9)
     assert found.standard_error[0, 0] < 1e-6
     assert np.isnan(found.value[1]).all()

@@ -12,16 +12,19 @@ from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH, Cantilever
 from benchmarks.effect_pictures import FLOWS
-from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.catalogue.effect_file import loss_integral
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.catalogue.needs import mains_lines
-from discrepancy.catalogue.scales import loss_integral
-from discrepancy.models.interface import Conditions
+from discrepancy.errors import CatalogueError
+from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import (
     EVERY_CHANNEL,
     SENSORS,
+    Clock,
+    DecayingLine,
     FreePlay,
     LoadGain,
     ModelPatch,
@@ -29,6 +32,8 @@ from fe.runtime.patch import (
     PowerStiffness,
     RunOffset,
     SensorDrift,
+    SensorGain,
+    SensorRotation,
     StiffnessDrift,
 )
 
@@ -199,6 +204,43 @@ def test_sizes_in_closed_form(setting):
         assert only(setting, identifier, values, place) == primitive
 
 
+def test_observations_are_responses_through_the_sensors_of_a_patch(setting):
+    ring, pull = (
+        next(item for item in setting.campaign.trials if item.kind is kind)
+        for kind in (TrialKind.RINGDOWN, TrialKind.STATIC)
+    )
+
+    def seen(trial, *items, **conditions):
+        given = Conditions(np.ones(1), **conditions)
+        return observe(setting.model, setting.campaign, trial, ModelPatch(items), given).values
+
+    # clocks of patch and conditions add up
+    one = seen(ring, Clock(0.004, 0.001), clock=(0.001, 0.002))
+    assert one == pytest.approx(seen(ring, clock=(0.005, 0.003)), rel=1e-12)
+    assert np.abs(one - seen(ring)).max() > 1e-5
+    # a turned gauge asks for components
+    c, s = np.cos(0.2), np.sin(0.2)
+    output = setting.campaign.channels["g0"].output
+    parts = tuple((f"{output}{part}", Quantity.STRAIN) for part in ("", *ACROSS))
+    strains = setting.model.respond(pull, parts, ModelPatch(), Conditions(np.ones(1))).values
+    assert np.abs(strains[-1]).min() > 1e-6
+    turned = seen(pull, SensorRotation("g0", 0.2))[:, pull.channels.index("g0")]
+    assert turned == pytest.approx(strains @ [c**2, s**2, s * c])
+    # a decaying line scales with the release
+    for initial in (np.zeros((0, 2)), np.array([[0.1, 0.0]])):
+        line, bare = (seen(ring, *items, initial=initial)[0] for items in ((LINE,), ()))
+        size = 0.2 * ring.release.displacement * (1.0 + initial[:, 0].sum())
+        assert (line - bare)[ring.channels.index("tip")] == pytest.approx(size)
+    # a channel of another trial changes nothing, one of none is refused
+    alone = replace(ring, channels=("tip",), values=ring.values[:, :1], used=ring.used[:, :1])
+    assert np.array_equal(seen(alone), seen(alone, SensorGain("g0", 0.2)))
+    with pytest.raises(CatalogueError, match="'g7', which does not exist; there are tip, g0, g1"):
+        seen(ring, SensorGain("g7", 0.2))
+
+
+LINE = DecayingLine("tip", 7.0, 0.01, 0.2, 0.0)
+
+
 # ---------------------------------------------------------------- mains and sampling
 
 
@@ -268,7 +310,9 @@ def test_what_a_campaign_cannot_carry_is_not_offered(setting):
     free = {name: replace(channel, gain_deviation=np.inf) for name, channel in given.channels.items()}
     assert "gauge_gain" not in names_available(setting, channels=free)
     # a model that carries nothing still has sensors
-    bare = names_available(setting, model=OutputsOnly())
+    bare, closed = names_available(setting, model=OutputsOnly()), replace(setting, model=OutputsOnly())
+    assert "has no port where an internal force can act" in by_name("coulomb_friction").unavailable(closed)
+    assert "cannot carry the primitive 'point_mass'" in by_name("point_mass").unavailable(closed)
     assert {"gauge_gain", "gauge_zero_drift", "thermal_strain", "clock_error", "mains_hum"} <= bare
     assert bare.isdisjoint({"point_mass", "coulomb_friction", "cubic_stiffness", "load_place", "washout"})
 

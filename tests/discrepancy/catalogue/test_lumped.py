@@ -6,68 +6,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.cantilever import campaign as campaign_of_all
 from benchmarks.tank import tank_setting
-from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Start, TrialKind
+from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
 from discrepancy.catalogue.library import library
-from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.sensing import observe
+from discrepancy.sources.examples import example_campaign, plan_for
 from fe.runtime.patch import LoggerClock, ModelPatch
 from tests.discrepancy.asking import campaign, seen, trial
 from tests.discrepancy.rigs import INPUTS, chosen, model_of, setting_of
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
-OUTPUTS = {"tip": ("x3", Quantity.DISPLACEMENT), "g0": ("base_strain", Quantity.STRAIN)}
+WITHOUT_STATION = {"local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief"}
+OF_STORES = {"outflow", "overflow"}
+WARM = {"thermal_strain", "temperature_dependent_modulus"}
 
 
-@pytest.fixture(scope="module")
-def setting():
+def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show() -> None:
     model = LumpedModel.load("three_mass_chain")
-    given = campaign_of_all()
-    noise = NoiseRecord(1e-6, 200.0)
-    channels = {
-        name: Channel(name, quantity, output, noise, 0.005, 1e-5)
-        for name, (output, quantity) in OUTPUTS.items()
-    }
-    given_to_all = {"channels": tuple(OUTPUTS), "load_place": "end"}
-    trials = tuple(
-        replace(item, **given_to_all, values=item.values[:, :2], used=item.used[:, :2], release=release)
-        for item, release in ((item, item.release and Release(0.01)) for item in given.trials)
-        if item.name != "flight"
-    )
-    chain = replace(given, channels=channels, trials=trials)
-    means = np.array([item.mean for item in model.parameters])
-    for item in trials:
-        item.values[:] = observe(model, chain, item, ModelPatch(), Conditions(means)).values
-    return setting_of(chain, model)
-
-
-ABSENT = ("local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief", "outflow", "overflow")
-
-
-@pytest.mark.parametrize("effect", library(), ids=lambda effect: effect.identifier)
-def test_an_effect_that_is_available_shows_and_another_says_why(effect, setting):
-    reason = effect.unavailable(setting)
-    model = setting.model
-    if effect.identifier in ABSENT:
-        assert reason.endswith(".")
-        return
-    assert reason is None
-    means = np.array([item.mean for item in model.parameters])
-    values = {item.name: item.prior.value(0.0) or item.prior.value(1.0) for item in effect.parameters}
-    for place in effect.places(setting):
-        patch = effect.patch(setting, values, place)
-        changes = []
-        for item in setting.campaign.trials:
-            moved = observe(model, setting.campaign, item, patch, Conditions(means)).values - item.values
-            changes.append(np.max(np.abs(moved) / np.max(np.abs(item.values), axis=0)))
-        assert max(changes) > 1e-3, place
-
-
-# ---------------------------------------------------------------- which effects are offered where
+    plan = plan_for(model, ("x3", "base_strain"), "end")
+    setting = setting_of(example_campaign(model, "laboratory", 1, plan), model)
+    reasons = {effect.identifier: effect.unavailable(setting) for effect in library()}
+    absent = {name for name, reason in reasons.items() if reason is not None}
+    assert absent == WITHOUT_STATION | OF_STORES | WARM | {"logger_clock"}
+    assert all(reasons[name].endswith(".") for name in absent)
 
 
 def test_flows_are_offered_at_states_and_forces_are_not() -> None:

@@ -9,7 +9,7 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, TrialKind
-from discrepancy.catalogue.scales import loss_integral
+from discrepancy.catalogue.effect_file import loss_integral
 from discrepancy.models.structures import WingModel
 from tests.discrepancy.models.test_wing import RING
 from tests.discrepancy.rigs import chosen, setting_of

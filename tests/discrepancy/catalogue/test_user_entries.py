@@ -64,13 +64,15 @@ def test_a_file_with_several_effects_places_and_a_family(write, setting):
     assert gauge.patch(setting, {"g": 0.8}).to_list() == [
         {"kind": "sensor_gain", "channel": "g0", "gain": 0.5, "quantity": ""}
     ]
-
-
-def test_an_effect_whose_place_is_no_port(write, setting):
-    text = BUFFER.replace('places = "ports"', 'places = ["flap"]')
-    buffer = load_catalogue([write(text)], installed=False)[-2]
-    with pytest.raises(CatalogueError, match="has no port 'flap'; it has root, tip, span"):
-        buffer.patch(setting, {"share": 0.05}, "flap")
+    # a place that is no port, a value that no primitive can have
+    for old, new, place, sentence in (
+        ('places = "ports"', 'places = ["flap"]', "flap", "has no port 'flap'; it has root, tip, span"),
+        ('side = "2 - 1"', 'side = "0.5 * power"', "tip", "side must be a number"),
+    ):
+        buffer = load_catalogue([write(BUFFER.replace(old, new))], installed=False)[-2]
+        with pytest.raises(CatalogueError, match=sentence):
+            buffer.patch(setting, {"share": 0.05, "power": 2.5}, place)
+    assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1
 
 
 @pytest.mark.parametrize(
@@ -124,14 +126,6 @@ def test_an_installed_package_adds_effects(tmp_path, monkeypatch):
         with pytest.raises(CatalogueError, match=f"entry point '{name}' .*{sentence}"):
             load_catalogue()
     sys.modules.pop("pylons", None)
-
-
-def test_values_that_no_primitive_can_have(write, setting):
-    text = BUFFER.replace('side = "2 - 1"', 'side = "0.5 * power"')
-    buffer = load_catalogue([write(text)], installed=False)[-2]
-    assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1
-    with pytest.raises(CatalogueError, match="side must be a number"):
-        buffer.patch(setting, {"share": 0.05, "power": 2.5}, "tip")
 
 
 # ---------------------------------------------------------------- time and events

@@ -11,8 +11,7 @@ from scipy.stats import multivariate_normal
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
 from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.fitting import fit
-from discrepancy.fits.normal_equations import upper_factor
+from discrepancy.fits.fitting import fit, upper_factor
 from discrepancy.fits.predictive import residual_set
 
 from . import kit

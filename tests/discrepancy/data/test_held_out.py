@@ -9,17 +9,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from discrepancy.campaign.held_out import choose_held_out, level
+from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    Hold,
+    NoiseRecord,
+    Quantity,
+    RecordedInput,
+    Start,
+    Trial,
+    TrialKind,
+)
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.checks.outliers import mark_outliers
 from discrepancy.checks.quality import check_data
-from discrepancy.errors import CampaignFileError, ModelError
+from discrepancy.errors import ModelError
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.sources.examples import example_campaign, plan_for, wing_plan, write_example
+from discrepancy.sources.examples import example_campaign, plan_for, write_example
 from fe.runtime.patch import HighPass, ModelPatch, PointMass, PowerDamping, RootCompliance, SensorGain
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
@@ -99,36 +109,38 @@ def test_what_is_left_covers_what_is_held_out(rows):
     for item in chosen.held_out:
         left = [other for other in chosen.fitted if other.kind is item.kind]
         assert left
-        lowest = 0.0 if "levels held out" in item.name else min(map(level, left))
-        assert lowest <= level(item) <= max(map(level, left))
+        lowest = 0.0 if "levels held out" in item.name else min(item.level for item in left)
+        assert lowest <= item.level <= max(item.level for item in left)
         assert any(other.run == item.run for other in chosen.fitted)
 
 
 MODEL = Inputs(__file__).text("cart.toml")
-TOML = Inputs(__file__).text("cart_campaign.toml")
-
 CART = model_of(MODEL)
 
 
-def written(folder, toml, table):
-    (folder / "push.csv").write_text(table)
-    (folder / "campaign.toml").write_text(toml)
-    return read_campaign(folder)
+def of_cart(time, values, drive, hold=None, forced=False):
+    """Return the campaign of a cart that begins at rest, its place [m] beside what its motor did [N]."""
+    given = {"force": drive, "hold": hold}
+    if not forced:
+        given = {"inputs": (RecordedInput("motor", Quantity.FORCE, values=drive, hold=hold),)}
+    kind, values = TrialKind.FORCED if forced else TrialKind.DRIVEN, values[:, None]
+    push = Trial.plain("push", kind, ("x",), time, values=values, begins=Start.STILL, **given)
+    channel = Channel("x", Quantity.DISPLACEMENT, "cart", NoiseRecord(5e-4))
+    return Campaign("Cart", {"x": channel}, (push,), None, {}, "")
 
 
-def pushed(folder, scale=1.0):
+def pushed(scale=1.0):
     time = np.linspace(0.0, 2.0, 81)
-    rows = [f"{t!r},1.0,{scale * 250.0 * t * t!r}" for t in time.tolist()]
-    return written(folder, TOML, "\n".join(["time,motor,x", *rows]))
+    return of_cart(time, scale * 0.25 * time**2, np.ones(81))
 
 
 def fatal(campaign):
     return [fault.kind for fault in check_against_model(campaign, CART) if fault.fatal]
 
 
-def test_what_is_left_of_each_prior(tmp_path):
+def test_what_is_left_of_each_prior():
     """Beside least squares of x by the two parameters, by hand; a short push of a cart is no short record."""
-    campaign = pushed(tmp_path)
+    campaign = pushed()
     left = prior_left(campaign, CART)
     time = campaign.trials[0].time
 
@@ -145,9 +157,9 @@ def test_what_is_left_of_each_prior(tmp_path):
     assert [left["mass_factor"], left["damping_factor"]] == pytest.approx(expected, rel=2e-3)
     assert left["mass_factor"] < 0.1
     assert not fatal(campaign)
-    assert fatal(pushed(tmp_path, 1000.0))  # mm for m, or kN for N
+    assert fatal(pushed(1000.0))  # mm for m, or kN for N
     for scale in (100.0, 9.81):  # no plausible slip
-        assert not fatal(pushed(tmp_path, scale))
+        assert not fatal(pushed(scale))
     slippery = model_of(MODEL.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }"))
     (found,) = unobservable(campaign, slippery)
     assert "do not tell the calibrated parameter 'damping_factor' (100%)" in found.sentence
@@ -155,21 +167,15 @@ def test_what_is_left_of_each_prior(tmp_path):
     assert (fault.kind, fault.fatal) == (FaultKind.UNOBSERVABLE, False)
 
 
-@pytest.mark.parametrize("hold", ["", 'hold = "linear"', 'hold = "smooth"'])
+@pytest.mark.parametrize("hold", [None, Hold.LINEAR, Hold.SMOOTH])
 @pytest.mark.parametrize("forced", [False, True])
 @pytest.mark.parametrize("samples", [9, 200])
-def test_it_is_asked_what_a_coarse_input_did_between_its_samples(tmp_path, samples, forced, hold):
+def test_it_is_asked_what_a_coarse_input_did_between_its_samples(samples, forced, hold):
     time = np.arange(12 * samples) / samples
-    rows = [f"{t!r},{float(np.sin(2.0 * np.pi * t))!r},{10.0 * t!r}" for t in time.tolist()]
-    before, _, after = TOML.partition("[[input]]")
-    section, _, last = after.partition("[[trial]]")
-    toml = f"{before}[[input]]{section}{hold}\n[[trial]]{last}"
-    if forced:
-        toml = f"{before}[[trial]]{last.replace('driven', 'forced')}{hold}\n"
-    table = "\n".join([f"time,{'force' if forced else 'motor'},x", *rows])
-    faults = check_against_model(written(tmp_path, toml, table), CART)
+    campaign = of_cart(time, 0.01 * time, np.sin(2.0 * np.pi * time), hold, forced)
+    faults = check_against_model(campaign, CART)
     found = [fault for fault in faults if fault.kind is FaultKind.BETWEEN_SAMPLES]
-    assert bool(found) is (samples == 9 and not hold)
+    assert bool(found) is (samples == 9 and hold is None)
     name, where = ("force", "[[trial]]") if forced else ("motor", "[[input]]")
     for fault in found:
         assert f"straight lines and curves between the samples of {name!r}" in fault.sentence
@@ -196,13 +202,6 @@ def test_hidden_effects_are_no_faults_of_the_data(chain, seed):
         assert sum(int((~trial.used).sum()) for trial in mark_outliers(campaign).trials) <= 2
 
 
-def test_what_cannot_be_an_example(chain):
-    with pytest.raises(CampaignFileError, match="no example 'mission': the kinds are static, ringdown"):
-        example_campaign(chain, "mission", 1)
-    with pytest.raises(ModelError, match="has no output 'x9'"):
-        plan_for(chain, ("x9",), "end")
-
-
 OUTPUTS = ("x3", "x1", "base_strain", "joint_strain")
 
 
@@ -212,6 +211,8 @@ def chain():
 
 
 def test_written_example_is_sound_and_repeats(chain, tmp_path):
+    with pytest.raises(ModelError, match="has no output 'x9'"):
+        plan_for(chain, ("x9",), "end")
     plan = plan_for(chain, OUTPUTS, "end")
     one = write_example(chain, tmp_path / "a", "laboratory", 3, plan)
     two = write_example(chain, tmp_path / "b", "laboratory", 3, plan)
@@ -223,13 +224,6 @@ def test_written_example_is_sound_and_repeats(chain, tmp_path):
     assert choose_held_out(one) is one
     unmarked = replace(one, trials=tuple(replace(trial, held_out=False) for trial in one.trials))
     assert {trial.kind for trial in choose_held_out(unmarked).held_out} >= {TrialKind.RINGDOWN}
-
-
-def test_plan_of_the_wing_names_its_outputs():
-    plan = wing_plan()
-    assert [channel.output for channel in plan.channels][-1] == "tip_displacement"
-    assert plan.names(TrialKind.FLIGHT) == plan.names(TrialKind.STATIC)[:-1]
-    assert np.isfinite([channel.noise.standard_deviation for channel in plan.channels if channel.noise]).all()
 
 
 def test_the_documented_campaign_is_read(tmp_path):

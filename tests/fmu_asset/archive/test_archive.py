@@ -34,23 +34,18 @@ def test_what_is_wrong_with_a_file_is_one_sentence(fmu, tmp_path, row) -> None:
         read_fmu(archive_of(path, in_utf_16(contents) if "utf_16" in row else contents))
 
 
-@pytest.mark.parametrize(
-    ("name", "size", "words"),
-    [
+def test_an_archive_that_would_fill_the_disk_is_refused(fmu, tmp_path) -> None:
+    for name, size, words in (
         ("resources/zeros", 300 * 1024**2, r"would extract to 30\d MiB, which looks like an archive"),
         (f"{3000 * 'd/'}x", 1, r"an entry 3001 folders deep; no tool exports that .*refused"),
-    ],
-    ids=["bomb", "deep"],
-)
-def test_an_archive_that_would_fill_the_disk_is_refused(fmu, tmp_path, name, size, words) -> None:
-    with pytest.raises(errors.FmuFileError, match=words):
-        read_fmu(archive_of(tmp_path / "changed.fmu", members(fmu) | {name: bytes(size)}))
+    ):
+        with pytest.raises(errors.FmuFileError, match=words):
+            read_fmu(archive_of(tmp_path / "changed.fmu", members(fmu) | {name: bytes(size)}))
 
 
 def test_what_is_no_fmu_is_one_sentence(fmu, tmp_path) -> None:
     (tmp_path / "a.fmu").write_text("hello", encoding="utf-8")
     for path, words in (
-        (tmp_path / "none.fmu", "There is no FMU"),
         (tmp_path, "is a folder"),
         (tmp_path / "a.fmu", r"not a sound FMU archive .* fetch or build it again"),
     ):

@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -123,14 +124,20 @@ def test_driven_in_c_without_a_lost_byte(compiler, ours, name, tmp_path) -> None
     run_well([*watched, driver, (tmp_path / "resources").as_uri()])
 
 
-def test_nothing_but_the_fmi_functions_is_exported(extracted) -> None:
+@pytest.mark.parametrize(("name", "version"), [("compiled", 2), ("fmi3", 3)])
+def test_the_fmi_functions_of_the_header_are_exported_and_no_others(ours, name, version, tmp_path) -> None:
     nm = shutil.which("nm")
     if nm is None:
         pytest.skip("nm is not installed")
-    library = next((extracted / "binaries" / "linux64").glob("*.so"))
-    names = {line.split()[-1] for line in run_well([nm, "-D", "--defined-only", library]).splitlines()}
-    assert {"fmi2DoStep", "fmi2Instantiate"} <= names
-    assert not {name for name in names if not name.startswith("fmi2")}
+    shutil.unpack_archive(ours(name), tmp_path, "zip")
+    told = run_well([nm, "-D", "--defined-only", *(tmp_path / "binaries").rglob("*.so")])
+    header = (tmp_path / "sources" / f"fmi{version}Functions.h").read_text()
+    functions = re.findall(rf"^ *FMI{version}_Export .*?(\w+);", header, re.MULTILINE)
+    assert sorted(line.split()[-1] for line in told.splitlines()) == sorted(functions)
+    assert f"fmi{version}DoStep" in functions
+    assert {*(tmp_path / "sources").glob("structure_fmi?.c")} == {
+        tmp_path / "sources" / f"structure_fmi{version}.c"
+    }
 
 
 # ---------------------------------------------------------------------- other hosts

@@ -15,16 +15,14 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
 from tests.fmu_asset.coupling.reference import coupled, of_ours
 from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind
-from tests.fmu_asset.ours import NAMES, OurFmus
+from tests.fmu_asset.ours import NAMES, STRUCTURES, OurFmus
 
 Open = Callable[..., FmiAsset]
 Bits = list[tuple[bytes, bytes, float]]
 
 
 @pytest.fixture
-def open_asset(
-    request: pytest.FixtureRequest, ours: OurFmus, foreign_fmu: Any, scratch: Path
-) -> Iterator[Open]:
+def open_asset(ours: OurFmus, foreign_fmu: Any, scratch: Path) -> Iterator[Open]:
     """Open an asset of a kind; of all of them nothing is left behind."""
 
     def opened(kind: Kind, **options: Any) -> FmiAsset:
@@ -33,9 +31,7 @@ def open_asset(
             return CoupledAsset(of_ours(ours), kind.binding, **given)
         if kind.file.startswith("oscillator"):
             algorithm = {"algorithm": "jacobi"} if kind.file.endswith("jacobi") else {}
-            return CoupledAsset(
-                coupled("oscillator", request.getfixturevalue), kind.binding, **algorithm, **given
-            )
+            return CoupledAsset(coupled("oscillator", foreign_fmu), kind.binding, **algorithm, **given)
         file = ours(kind.file) if kind.file in NAMES else foreign_fmu(kind.file)
         return FmiAsset(file, kind.binding, **given)
 
@@ -99,19 +95,19 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
 
 
 def ways() -> Iterator[Any]:
-    """Yield each kind here, and in a worker one of each version, interface and way of keeping states.
+    """Yield each kind here, and in a worker one of each sort: how packed, version, interface, way of states.
 
-    Of what flies still and in motion one is here, one in a worker.
+    Of what flies still and in motion that is the one in motion, which is not here then.
     """
     seen = set()
     for name, kind in KINDS.items():
-        moving = name.endswith(" in motion")
-        twice = moving or f"{name} in motion" in KINDS
-        sort = kind.file.split()[0][-1], kind.binding.binding.interface, kind.state
-        for isolated in (moving,) if twice else (False, True)[: 2 - (sort in seen)]:
-            yield pytest.param(kind, isolated, id=f"{'worker' if isolated else 'in process'}-{name}")
-        if not twice:
+        how = kind.file in NAMES, STRUCTURES.get(kind.file, {}).get("kind"), *filter(str.isdigit, kind.file)
+        sort = *how, kind.binding.binding.interface, kind.state
+        first = sort not in seen and f"{name} in motion" not in KINDS
+        if first:
             seen.add(sort)
+        for isolated in (first,) if name.endswith(" in motion") else (False, True)[: 1 + first]:
+            yield pytest.param(kind, isolated, id=f"{'worker' if isolated else 'in process'}-{name}")
 
 
 @pytest.mark.parametrize(("kind", "isolated"), [*ways()])

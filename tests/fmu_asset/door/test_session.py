@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from fmu_asset import errors
-from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.check import check_fmu
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
-from fmu_asset.door import placement, session
+from fmu_asset.door import session
 from fmu_asset.door.session import FmiAsset
 from tests.fmu_asset.door.kinds import BINDINGS, BINDINGS_FOLDER, HOSTILE, INPUTS, KINDS
 from tests.fmu_asset.making import bound, changed, system
@@ -193,12 +192,14 @@ def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu) ->
         assert asset.step({"speed": 1.0}).values[0] == seen != 0.0
 
 
+FLIGHTS = [(False, (3, 7, 7)), (True, (3, 7, 7)), (False, (1,) * 7)]
+FLIGHTS += [(True, (4, 1, 7, 1)), (False, (2, 3, 1, 6))]
+"""Whether the steps are made in one go, and how many there are in each flight."""
 CLOCKS = [("INSTANCE_CLOCK", True), ("INSTANCE_CLOCK", False), ("process_clock", True)]
 
 
 @pytest.mark.parametrize(("clock", "isolated"), CLOCKS, ids=["instance", "in process", "process"])
-@pytest.mark.parametrize("in_one_go", [False, True], ids=["steps", "run"])
-@pytest.mark.parametrize("lengths", [(3, 7, 7), (1, 1, 1, 1, 1, 1, 1), (4, 1, 7, 1), (2, 3, 1, 6)], ids=str)
+@pytest.mark.parametrize(("in_one_go", "lengths"), FLIGHTS, ids=str)
 def test_a_hidden_clock_shows_at_no_start(foreign_fmu, clock, isolated, in_one_go, lengths, caplog) -> None:
     """The clock adds 1 from its sixth step on: where the first reset is looked at, nothing is to be seen."""
     case = f"CASE={sum(lengths)}{len(lengths)}{isolated}{in_one_go}"  # what is wrong is said once for a file
@@ -267,21 +268,7 @@ def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(fore
 # ---------------------------------------------------------------------- many instances of one FMU
 
 
-@pytest.fixture
-def extractions(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Return the folders into which FMUs are extracted during the test."""
-    made: list[Path] = []
-    extract = placement.extract_fmu
-
-    def counting(description: FmuDescription) -> Path:
-        made.append(extract(description))
-        return made[-1]
-
-    monkeypatch.setattr(placement, "extract_fmu", counting)
-    return made
-
-
-def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, extractions, isolated) -> None:
+def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, scratch, isolated) -> None:
     with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=isolated) as asset:
         asset.step({"u": 2.0})
         forks = [asset.fork() for _ in range(3)]
@@ -295,12 +282,11 @@ def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, ex
             assert asset.step({"u": 3.0}).values[0] == 3.0
         assert asset.worker_process_id == process
     assert not isolated or not (Path("/proc") / str(process)).exists()  # gone at once
-    assert len(extractions) == 1
-    assert extractions[0].is_dir()
+    assert len([*scratch.rglob("modelDescription.xml")]) == 1
     assert [fork.step().values[0] for fork in forks[1:]] == [4.0, 6.0]
     for fork in forks:
         fork.close()
-    assert not extractions[0].exists()
+    assert not list(scratch.iterdir())
 
 
 def test_siblings_have_parameters_of_their_own(foreign_fmu) -> None:
@@ -309,12 +295,12 @@ def test_siblings_have_parameters_of_their_own(foreign_fmu) -> None:
     np.testing.assert_allclose(seen, (1.0 - np.exp(-0.3)) * np.array([[2.0], [3.0]]), rtol=1e-12)
 
 
-def test_after_a_crash_the_files_are_extracted_again(foreign_fmu, extractions) -> None:
+def test_after_a_crash_the_files_are_extracted_again(foreign_fmu, scratch) -> None:
     with FmiAsset(foreign_fmu("hostile2", "ABORT"), HOSTILE) as asset, asset.fork() as fork:
         asset.step(), asset.step()
         saved = asset.save_state()
         with pytest.raises(Exception, match="SIGABRT"):
             asset.step()
         asset.restore_state(saved)
-        assert len(extractions) == 2
+        assert len([*scratch.rglob("modelDescription.xml")]) == 2
         assert fork.step().values[0] == 1.0

@@ -75,10 +75,6 @@ def test_what_is_written_is_read_back(structure, ssp, tmp_path) -> None:
     again = write_ssp(theirs, tmp_path / "again.ssp", parameter_names=NOISE, stop_time=9.0)
     assert again.read_bytes() == ssp.read_bytes()
     assert check_ssp(ssp).problems == ()
-    with pytest.raises(SspError, match="exists: choose another --out"):
-        write_ssp(theirs, again)
-    with pytest.raises(SspError, match=r"suffix \.ssp"):
-        write_ssp(theirs, tmp_path / "x.zip")
     written = write_ssp(theirs, again, parameter_names=NOISE, stop_time=9.0, replace=True)
     assert written.read_bytes() == ssp.read_bytes()
 
@@ -330,8 +326,6 @@ def test_archives_that_are_unsafe_or_damaged(theirs, tmp_path) -> None:
     """Checked as those of FMUs are."""
     (sentence,) = check_ssp(theirs(**{"resources/wing.fmu": "no FMU"})).problems
     assert "resources/wing.fmu is not a sound FMU archive" in sentence
-    with pytest.raises(SspError, match="There is no SSP file"):
-        check_ssp(tmp_path / "none.ssp")
     good, damaged = theirs().read_bytes(), tmp_path / "damaged.ssp"
     # Half of the file ends with one of its FMUs, which is an archive as well.
     damaged.write_bytes(good[: len(good) // 2])

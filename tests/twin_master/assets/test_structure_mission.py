@@ -16,10 +16,10 @@ from fe.runtime.errors import FiniteElementError, InvalidDesignError
 from fe.structure.operators import load_and_assemble
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, cut_off_after, edited, loaded_from, merged, table_of, written
-from twin_master.assets.candidates import with_candidates
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.assets.structure_source import StructureBelief
 from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.mission.sensor_design import with_candidates
 from twin_master.network.identified import packed_row
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.store.writing import open_run
@@ -188,25 +188,18 @@ def test_the_twin_finds_the_loss_from_records_of_accelerations(file, tmp_path):
 
 
 @pytest.mark.long
-def test_ambient_records_tell_the_same_mode(file, tmp_path):
+def test_ambient_records_tell_the_same_mode_also_when_the_flight_is_resumed(file, tmp_path):
     """White noise on the push: its three features within four standard errors of the record."""
     modes = {"bands": MODES["bands"][:1], "numbers": [1]}
     record = {"kind": "ambient", "duration": 2.0, "sampling_rate": 3000.0}
-    changes = {
-        "mission": {"steps": 1},
-        "truth": {"gains": [], "record": record},
-        "observation": {"modes": modes},
-    }
-    true, seen, errors = features(fly(mission(file, **changes), tmp_path / "run"), TITLES[:3])
+    truth = {"gains": [], "record": record}
+    loaded = mission(file, mission={"steps": 2}, truth=truth, observation={"modes": modes})
+    whole = new_run(loaded, tmp_path / "whole", report=False).folder
+    true, seen, errors = features(open_run(whole), TITLES[:3])
     assert np.all(np.abs(seen - true) < 4.0 * errors)
     assert errors[0, 0] < 0.01 * true[0, 0]
-
-
-@pytest.mark.long
-def test_a_resumed_flight_goes_on_with_its_records(file, tmp_path):
-    whole = new_run(mission(file), tmp_path / "whole", report=False).folder
-    with cut_off_after(3):
-        new_run(mission(file), tmp_path / "part", report=False)
+    with cut_off_after(1):
+        new_run(loaded, tmp_path / "part", report=False)
     resume(tmp_path / "part", report=False)
     check_same(tmp_path / "part", whole, "csv/observed.csv", "csv/estimated.csv")
 

@@ -71,13 +71,11 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability, name, success):
     points = np.array([worsening.assumed, 0.5 * worsening.assumed + 0.3])
     found = transition_evidence(worsening, points, likelihood, control)
     for row, point in enumerate(points):
-        given: dict[str, object] = {}
-        for place, value in zip(worsening.names, point.tolist(), strict=True):
-            own, _, factor = place.partition(", ")
-            if factor:
-                given.setdefault(own, {})[factor] = value  # type: ignore[index]
-            else:
-                given[own] = value
+        value = dict(zip(worsening.names, point.tolist(), strict=True))
+        given = {
+            control: {name: value.get(f"{control}, {name}", value.get(control)) for name in ("z1", "z2")}
+            for control in scenario.control_names
+        }
         model = build_graphical_model(tiny(given, name=name, success=success))
         for twin in range(2):
             *_, expected = precise_forward_backward(model, control[twin], np.log(likelihood[twin]))

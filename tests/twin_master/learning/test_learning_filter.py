@@ -1,5 +1,6 @@
 """What is learnt and expected, against sums over all trajectories, draws and factors, and closed forms."""
 
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -16,7 +17,7 @@ from twin_master.learning.learning_filter import (
 )
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
-from twin_master.network.rewards import RewardModel
+from twin_master.network.quantity import RewardModel
 from twin_master.scenario.tables import Learning
 from uav_twin import Carried, Estimate, GaussianSensorModel, GraphicalModel
 
@@ -61,6 +62,7 @@ def likelihood(sensor: GaussianSensorModel, row: Float, draw: int, state: int, c
     return float(np.prod(density[~np.isnan(row)]))
 
 
+@cache
 def enumerated(turns: int) -> Float:
     """Return p(path, draw, factor, o) over everything: (paths of S^T, E, R), not normalised."""
     sensor, seen = sensors(), observations()
@@ -80,27 +82,6 @@ def enumerated(turns: int) -> Float:
 def learner_of_all() -> LearningFilter:
     moves = {factor: model(factor).transition for factor in FACTORS}
     return LearningFilter(model(), sensors(), NOTHING, ("e", [0.9, 1.0, 1.1]), moves)
-
-
-def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories():
-    learner = learner_of_all()
-    estimates = run(learner, observations(), CONTROLS)
-    evidence = 0.0
-    for turn, estimate in enumerate(estimates):
-        table = enumerated(turn + 1)
-        evidence += estimate.log_evidence
-        assert evidence == pytest.approx(np.log(table.sum()), abs=1e-12)
-        joint = table.reshape(-1, 3, DRAWS, len(FACTORS)).sum(axis=0) / table.sum()
-        np.testing.assert_allclose(estimate.filtered, joint.sum(axis=(1, 2)), rtol=1e-11)
-        found = np.exp(estimate.carried.arrays["log_belief"]).reshape(len(FACTORS), DRAWS, 3)
-        np.testing.assert_allclose(found, joint.transpose(2, 1, 0), rtol=1e-11)
-        factor = estimate.learnt["transition_factor"]
-        assert factor.mean == pytest.approx(joint.sum(axis=(0, 1)) @ FACTORS, rel=1e-9)
-    table = enumerated(STEPS) / enumerated(STEPS).sum()
-    smoothed = learner.smoothed([estimate.carried for estimate in estimates])
-    for turn in range(STEPS):
-        others = tuple(axis for axis in range(STEPS + 2) if axis != turn)
-        np.testing.assert_allclose(smoothed[turn], table.sum(axis=others), rtol=1e-10)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 6.0])
@@ -208,15 +189,26 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
 
 @pytest.mark.parametrize("other", [None, np.array([0.2, 0.7, 0.1])])
 def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation, other):
-    """Where the model does not decide alone, the belief about the state is `other`."""
+    """States, draws and transition factors; what is expected to be seen, also of another belief."""
     carried, seen = [turn.carried for turn in turns], observations()
     rewards = RewardModel(sensors(), *SETTINGS)
     now, later = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
+    value, whole, evidence = sensors().value_per_draw, enumerated(STEPS), 0.0
+    for t, turn in enumerate(turns):
+        until = enumerated(t + 1)
+        evidence += turn.log_evidence
+        assert evidence == pytest.approx(np.log(until.sum()), abs=1e-12)
+        joint = until.reshape(-1, 3, DRAWS, len(FACTORS)).sum(axis=0) / until.sum()
+        np.testing.assert_allclose(now[t], joint.sum(axis=(1, 2)), rtol=1e-11)
+        belief = np.exp(turn.carried.arrays["log_belief"]).reshape(len(FACTORS), DRAWS, 3)
+        np.testing.assert_allclose(belief, joint.transpose(2, 1, 0), rtol=1e-11)
+        factor = turn.learnt["transition_factor"]
+        assert factor.mean == pytest.approx(joint.sum(axis=(0, 1)) @ FACTORS, rel=1e-9)
+        others = tuple(axis for axis in range(STEPS + 2) if axis != t)
+        np.testing.assert_allclose(later[t], whole.sum(axis=others) / whole.sum(), rtol=1e-10)
     if other is not None:
         now = later = np.tile(other, (STEPS, 1))
     filtered, smoothed = expectation.filtered(carried, now, seen), expectation.smoothed(carried, later, seen)
-    value = sensors().value_per_draw
-    whole = enumerated(STEPS)
     for t in range(STEPS):
         until = enumerated(t + 1)
         for found, table, axis in ((filtered, until, t), (smoothed, whole, t)):

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from tests.twin_master.runs import changed_scenario
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.learning import switching
+from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.switching import at_first, one_turn_later
-from twin_master.learning.words import Words
+from twin_master.learning.rivals import at_first, one_turn_later
 from twin_master.mission.journal import line_of, turn_record
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import Reading, Turn
+from twin_master.network.estimator import Words
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.twin import TwinTurn
 from twin_master.scenario.tables import Learning, Noticing
@@ -31,7 +32,6 @@ from uav_twin import (
     GraphicalModel,
     Twin,
     WatchfulEstimator,
-    load_scenario,
     prepare_twin,
 )
 
@@ -115,7 +115,7 @@ def test_shares_of_hypotheses_switch_as_their_chain_says():
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
     share = at_first(0.01, begins)
     np.testing.assert_allclose(np.exp(share), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
-    hazard, ends, chain = 0.03, switching.ENDS, np.zeros((7, 7))
+    hazard, ends, chain = 0.03, rivals.ENDS, np.zeros((7, 7))
     chain[0] = hazard * np.array([0.0, 0.0, 0.5, *[0.125] * 4])
     chain[0, 0] = 1.0 - hazard
     chain[1, [0, 2]], chain[1, 1] = (ends, 0.5 * hazard), 1.0 - ends - 0.5 * hazard
@@ -236,7 +236,7 @@ def twins() -> dict[str, Twin]:
 EXTREME = st.floats(allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308, np.nan])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(rows=st.lists(st.tuples(EXTREME, EXTREME), min_size=1, max_size=6), late=st.integers(0, 6))
 def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, late):
     ordinary = drawn(np.random.default_rng(2), 4, 2)
@@ -300,11 +300,7 @@ def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
 
 
 def at_levels(name: str, between: bool) -> Knowledge:
-    loaded = load_scenario(name)
-    observation = loaded.scenario.observation.model_copy(update={"between_levels": between})
-    return prepare_twin(
-        replace(loaded, scenario=loaded.scenario.model_copy(update={"observation": observation}))
-    )
+    return prepare_twin(changed_scenario(name, {"observation": {"between_levels": between}}))
 
 
 @pytest.fixture(scope="module")

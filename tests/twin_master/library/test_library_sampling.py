@@ -4,7 +4,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 
 from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.packing.contents import build_script_fmu
+from tests.kept import ROOT
 from tests.refusals import Inputs
 from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import MissionInputError
@@ -77,19 +77,10 @@ def test_the_bytes_do_not_depend_on_the_number_of_processes(files, tmp_path):
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-@pytest.fixture
-def heard_interruptions() -> Iterator[None]:
-    """What a shell starts in the background ignores SIGINT, and so would its children."""
+def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, request):
+    """Interrupted, resumed, and killed. What a shell starts in the background would ignore SIGINT."""
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, former)
-
-
-@pytest.mark.usefixtures("heard_interruptions")
-@pytest.mark.parametrize(
-    "signals", [pytest.param([signal.SIGKILL], marks=pytest.mark.long), [signal.SIGINT, signal.SIGKILL]]
-)
-def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, signals):
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, former))
     slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 20)))
     whole = sample_library(slow, tmp_path / "whole.nc", workers=2)
     fmu, binding = files
@@ -97,12 +88,8 @@ def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, signals)
     command = [sys.executable, "-m", "uav_twin", "library", "sample", "--quiet", "--workers", "1"]
     command += ["--fmu", str(fmu), "--binding", str(binding), "--out", str(out), "--grid", "wear=0,0.25,0.5"]
     command += ["--grid", "gain=0.8:1.2:20", "--grid", "push=2,4", "--grid", f"mode={SLOW}"]
-    wanted = 0
-    for end in signals:
-        wanted += 5
-        root = str(Path(__file__).parents[3])
-        resume = ["--resume"] if wanted > 5 else []
-        process = subprocess.Popen([*command, *resume], cwd=root, stderr=subprocess.PIPE)
+    for wanted, end, resume in ((5, signal.SIGINT, []), (10, signal.SIGKILL, ["--resume"])):
+        process = subprocess.Popen([*command, *resume], cwd=ROOT, stderr=subprocess.PIPE)
         while finished(out) < 2 * wanted and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(end)

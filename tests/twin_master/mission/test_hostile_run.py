@@ -1,4 +1,4 @@
-"""A run whose FMU crashes, hangs or lies stops with one sentence, and goes on when the cause is gone."""
+"""A run whose FMU hangs or ends stops with one sentence, and goes on when the cause is gone."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fmu_asset.errors import FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.errors import FmuTimeoutError
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, written
 from twin_master.fleet.plan import ensemble
@@ -31,25 +31,16 @@ def scenario(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = 
     )
 
 
-@pytest.mark.parametrize(
-    ("what", "kind", "sentence"),
-    [
-        pytest.param("SEGFAULT", FmuWorkerError, r"step 20 from t = 20 s: .*SIGSEGV", marks=pytest.mark.long),
-        ("HANG", FmuTimeoutError, r"step 20 from t = 20 s: .*longer than 1 s for the step"),
-        pytest.param(
-            "LEAK_IN_STEP", FmuMemoryError, "more than the limit of 400 MiB", marks=pytest.mark.long
-        ),
-    ],
-)
-def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch, what, kind, sentence):
-    fmu, flag = foreign_fmu("hostile2", what, "STATELESS", "AFTER=20"), tmp_path / "flag"
+def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch):
+    fmu, flag = foreign_fmu("hostile2", "HANG", "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
-    loaded = scenario(tmp_path, fmu, binding=f"{BINDING}limits = {{ step_time = 1.0, memory = 400.0 }}\n")
+    loaded = scenario(tmp_path, fmu, binding=f"{BINDING}limits = {{ step_time = 1.0 }}\n")
     whole = fly(loaded, tmp_path / "whole").folder
     flag.touch()
-    with pytest.raises(kind, match=sentence):
+    sentence = r"step 20 from t = 20 s: .*longer than 1 s for the step"
+    with pytest.raises(FmuTimeoutError, match=sentence):
         fly(loaded, tmp_path / "part")
-    with pytest.raises(kind, match=sentence):
+    with pytest.raises(FmuTimeoutError, match=sentence):
         resume(tmp_path / "part")
     flag.unlink()
     resume(tmp_path / "part")
@@ -82,8 +73,6 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
     (group,) = open_fleet(fleet.folder).values()
     assert group["status"].values.tolist() == [ENDED]
     assert (group["control_index"].values >= 0).sum() == 20
-    assert np.isfinite(group["belief"].values).all()
-    assert np.isfinite(group["credible"].values).all()
     assert "1 of 1 assets ended their simulation" in write_fleet_report(fleet.folder).read_text()
     with ScenarioEnvironment(loaded) as environment:
         environment.reset(seed=4)
@@ -98,21 +87,14 @@ def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
     """Its outputs grow with every step, so that only the way through twin, store and names is looked at."""
     fmu = foreign_fmu.changed("array3", "names", ('name="calls"', 'name="state/calls"'))
     changes = ("steps = 30", "steps = 3"), *[("standard_deviation = 0.1", "standard_deviation = 0.05")] * 2
+    binding = INPUTS.text("array_binding.toml")
     two, three = (
-        scenario(
-            tmp_path,
-            fmu,
-            *changes,
-            ("count = 1", f"count = {count}"),
-            binding=INPUTS.text("array_binding.toml"),
-        )
+        scenario(tmp_path, fmu, *changes, ("count = 1", f"count = {count}"), binding=binding)
         for count in (2, 3)
     )
     truth = open_run(fly(two, tmp_path / "run").folder)["truth"]
     assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
-    assert truth["y[1]"].attrs["units"] == "mm"
-    assert truth["y"].attrs["units"] == "m"
-    assert truth["y"].shape == (3, 2)
+    assert (truth["y[1]"].attrs["units"], truth["y"].attrs["units"]) == ("mm", "m")
     np.testing.assert_allclose(truth["y"].values[:, 1], 1e-3 * truth["y[2]"].values, rtol=1e-6)
     with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
         fly(three, tmp_path / "other")

@@ -16,7 +16,7 @@ from twin_master.fleet.store import ENDED, FLOWN, in_credible_set, outcomes_of
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
-from twin_master.mission.truth import DamageGrowth
+from twin_master.mission.turns import DamageGrowth
 from twin_master.network.transition import TransitionModel
 from uav_twin import GraphicalModel, load_scenario
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from reporting import progress
 from tests.twin_master.runs import flight_of, of_library
+from uav_twin import load_scenario
 
 ROOT = Path(__file__).parents[3]
 WITHOUT = "import runpy, sys; sys.modules['numba'] = None; runpy.run_path(sys.argv[1], run_name='__main__')"
@@ -15,7 +16,8 @@ WITHOUT = "import runpy, sys; sys.modules['numba'] = None; runpy.run_path(sys.ar
 
 def arrays(library: Path) -> dict[str, np.ndarray]:
     """Fly with notices, and return what was believed and decided."""
-    history = flight_of(*of_library("level_turns", library))
+    short = load_scenario("level_turns").scenario.mission.model_copy(update={"steps": 15})
+    history = flight_of(*of_library("level_turns", library, mission=short))
     names = ("observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted")
     return {name: getattr(history, name) for name in names}
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from twin_master.errors import InvalidModelError, PlanningError
 from twin_master.network.inference import known_control
 from twin_master.network.planner import given_policy, value_iteration
-from twin_master.network.quantity import QuantityModel
-from twin_master.network.rewards import RewardModel, health_reward
+from twin_master.network.quantity import QuantityModel, RewardModel, health_reward
 from twin_master.network.transition import TransitionModel
 
 SEEDS = st.integers(0, 2**32 - 1)

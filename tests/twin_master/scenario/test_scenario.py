@@ -17,9 +17,9 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import ScenarioError, TwinMasterError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.graphical_model import worsening_table
-from twin_master.scenario.asset import AssetSection
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import AssetSection
 
 TEXT = text_of("level_turns")
 

@@ -1,14 +1,12 @@
 """A watch over a real broker."""
 
 import json
-import os
-import random
 import shutil
-import signal
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,27 +15,28 @@ from reporting.progress import SilentProgress
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, wait_until
+from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, broker_of
+from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.mqtt import MqttFeed
+from twin_master.watch.mqtt import MqttFeed, Topic
 from twin_master.watch.opening import flown
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
-needs_mosquitto = pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
 TOPIC, DECISION = "wing/7", "wing/7/decision"
 Told = dict[str, Any]
 
 
 @pytest.fixture
-def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+def broker(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Mosquitto]:
     if shutil.which("mosquitto") is None:
         pytest.skip("no mosquitto")
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    broker = Mosquitto(tmp_path)
+    broker = Mosquitto(tmp_path, tls=getattr(request, "param", False))
     yield broker
     broker.stop()
 
@@ -83,12 +82,10 @@ def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, 
     return client, heard
 
 
-@needs_mosquitto
-@pytest.mark.parametrize("tls", [False, True])
-def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, tmp_path, tls, monkeypatch):
-    broker, turns = Mosquitto(tmp_path, tls=tls), len(mission.observed)
-    secure = f"mqtts://wing@localhost:{broker.port}/{TOPIC}"
-    where = broker_of(secure, broker.authority) if tls else where_of(broker)
+@pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
+def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, broker, monkeypatch):
+    secure, turns = f"mqtts://wing@localhost:{broker.port}/{TOPIC}", len(mission.observed)
+    where = broker_of(secure, broker.authority) if broker.tls else where_of(broker)
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")
     with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
         watch.run(MqttFeed(where, watch, str), str)
@@ -110,14 +107,13 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
         publisher.publish(TOPIC, b"x" * 3_000_000, qos=0)
         publisher.publish(TOPIC, json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which turn?
         send(15, 19)
-        if not tls:
+        if not broker.tls:
             broker.again()
             wait_until(publisher.is_connected)
         send(20, turns)
     wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
     publisher.disconnect()
     listener.disconnect()
-    broker.stop()
     last, expected = (journal(folder)[-1] for folder in (watch.folder, whole))
     assert last["filtered"] == expected["filtered"]
     counts = last["intake"]["counts"]
@@ -128,35 +124,24 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
 
-@pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
-def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(watch, broker, kills):
-    turns, chance, where = 60 * kills, random.Random(kills), where_of(broker)
-    listener, heard = heard_at(broker, "listener")
+def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watch, plain):
+    ran(watch, CsvFeed(plain, watch.scenario), 3)
+    published, sent = watch.folder / "published", list[Told]()
+    published.write_text("0" * 20)
 
-    def run(turns: int, note: Any = str) -> None:
-        feed = MqttFeed(where, watch, note)
-        watch.run(feed, str, turns=turns)
-        feed.close()
+    def send(_topic: str, decision: Told, _by: Topic) -> int:
+        sent.append(decision)
+        return len(sent)
 
-    run(1, lambda _note: publish(listener, *range(turns)))  # all but the first wait at the broker
-    listener.disconnect()
-    listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
-    met = 0
-
-    def next_end() -> int:
-        lines = chance.randrange(40) if met < kills else 2 * turns
-        return (watch.folder / JOURNAL_NAME).stat().st_size + 2000 * lines
-
-    while killed_at(watch, next_end(), lambda: run(turns)):
-        met += 1
-    assert met == kills
-    listener = broker.client("listener", heard)
-    wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
-    listener.disconnect()
-    assert [line["turn"] for line in journal(watch.folder)] == list(range(turns))
-    assert {decision["turn"] for decision in heard} == set(range(turns))
-    assert len([decision for decision in heard if decision.get("told_again")]) >= kills
-    assert len(heard) < turns + 100 * kills
+    topic = Topic(SimpleNamespace(behind={}, room=True, send=send), TOPIC, watch.scenario, str)
+    topic.begun(watch)
+    topic.publish()
+    topic.answered(1, None)
+    first, *_ = records(watch.folder / JOURNAL_NAME)
+    assert int(published.read_text()) == first[2]
+    topic.go_back()  # as where the broker is lost
+    topic.publish()
+    assert [decision["turn"] for decision in sent] == [0, 1, 2, 1, 2]
 
 
 def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
@@ -182,7 +167,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     (watch.folder / "published").write_text("0" * 20)
     watched(watch, 4)  # nothing more is wanted, and what was not published is
     wait_until(lambda: len([one for one in heard if "control" in one]) >= 4)
-    assert {one["turn"] for one in heard if "control" in one} == {0, 1, 2, 3}
+    assert {one["turn"] for one in heard if one.get("told_again")} == {0, 1, 2, 3}
     feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 4))
     with pytest.raises(ZeroDivisionError), closing(feed):
         watch.run(feed, lambda decision: decision["turn"] // 0)
@@ -263,47 +248,35 @@ def test_a_subscription_that_is_refused(watch, broker, tmp_path):
         watch.run(feed, str)
 
 
-def test_a_watch_that_hears_nothing_says_so(hasty, broker, monkeypatch):
+def test_a_watch_says_that_it_hears_nothing_that_it_ends_and_that_it_was_killed(hasty, broker, monkeypatch):
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.1)
     client, heard = heard_at(broker, "client", f"{TOPIC}/+")
-
-    def begin() -> int:
-        if not (child := os.fork()):
-            try:
-                feed = MqttFeed(where_of(broker), hasty, str)
-                hasty.run(feed, str)
-                feed.close()
-            finally:
-                os._exit(1)
-        return child
-
-    def end(child: int, by: signal.Signals, state: str) -> None:
-        os.kill(child, by)
-        os.waitpid(child, 0)
-        wait_until(lambda: states() == [state])
 
     def has(turn: int, kind: str) -> bool:
         told = [one for one in heard if one.get("turn") == turn]
         return any(notice["kind"] == kind for one in told for notice in one.get("notices", ()))
 
-    def states() -> list[str]:
-        return [one["state"] for one in heard if "state" in one][-1:]
+    def is_said(state: str) -> None:
+        wait_until(lambda: [one["state"] for one in heard if "state" in one][-1:] == [state])
 
-    child = begin()
-    wait_until(lambda: has(-1, "quiet"))
-    wait_until(lambda: states() == ["quiet"])
-    client.publish(TOPIC, b"garbage", qos=1)
-    client.publish(TOPIC, message(0), qos=1)
-    wait_until(lambda: has(0, "heard") and has(0, "quiet"))
-    end(child, signal.SIGKILL, "lost")
-    child = begin()
-    wait_until(lambda: states() == ["quiet"])
-    end(child, signal.SIGTERM, "ended")
+    def run() -> None:
+        hasty.run(MqttFeed(where_of(broker), hasty, str), str)
+
+    with watching(where_of(broker), hasty, 2):
+        wait_until(lambda: has(-1, "quiet"))
+        is_said("quiet")
+        client.publish(TOPIC, b"garbage", qos=1)
+        publish(client, 0)
+        wait_until(lambda: has(0, "heard") and has(0, "quiet"))
+        is_said("quiet")
+        beat = [one for one in heard if "state" in one][-1]
+        assert [beat[key] for key in ("turn", "lag", "received", "refused")] == [0, 0, 2, 1]
+        publish(client, 1)
+    is_said("ended")
+    assert killed_at(hasty, (hasty.folder / JOURNAL_NAME).stat().st_size + 1, run)
+    is_said("lost")
     client.disconnect()
-    beat = [one for one in heard if one.get("state") == "quiet"][-1]
-    assert [beat[key] for key in ("turn", "lag", "received", "refused")] == [0, 0, 2, 1]
-    assert (has(-1, "quiet"), has(0, "heard"), has(0, "quiet"), states()) == (True, True, True, ["ended"])
-    assert [notice.kind for _, notice in hasty.told(-1)][:3] == ["quiet", "heard", "quiet"]
+    assert [notice.kind for _, notice in hasty.told(-1)] == ["quiet", "heard", "quiet", "heard", "quiet"]
     with flown(hasty.folder, None, None, SilentProgress()) as copy:
         assert "see whether logger and broker are there" in (copy / "summary.json").read_text()
 

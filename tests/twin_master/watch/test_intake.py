@@ -132,13 +132,14 @@ def test_what_was_refused_behind_the_last_turn_is_refused_once_when_it_is_read_a
 INPUTS = Inputs(__file__)
 
 
-@pytest.mark.parametrize(("sent", "reason"), INPUTS.refused("messages"))
-def test_what_is_refused_changes_nothing(knowledge, clean, expected, tmp_path, sent, reason):
-    line = json.dumps(sent).encode() + b"\n"
-    twin, intake = watched(knowledge, [*clean, line], tmp_path / "rejected.jsonl")
+def test_what_is_refused_changes_nothing(knowledge, clean, expected, tmp_path):
+    rows, path = INPUTS.refused("messages"), tmp_path / "rejected.jsonl"
+    lines = [json.dumps(sent).encode() + b"\n" for sent, _ in rows]
+    twin, intake = watched(knowledge, [*clean, *lines], path)
     assert same(twin, expected)
-    assert intake.counts.rejected == 1
-    assert reason in json.loads((tmp_path / "rejected.jsonl").read_text())["reason"]
+    assert intake.counts.rejected == len(rows)
+    for (sent, reason), line in zip(rows, path.read_text().splitlines(), strict=True):
+        assert reason in json.loads(line)["reason"], sent
 
 
 KEYS = st.sampled_from(["turn", "time", "strain", "strain_1", "unit", "control"])

@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from discrepancy.report.figures import ReportInput
-from discrepancy.verdict_folder import write_verdict_folder
-from tests.discrepancy.rigs import ORIGIN, drag_found
+from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal
-from tests.twin_master.watch.watches import beliefs_of, decided, of_gauge, patch_of, ran, viewed, watchful
+from tests.twin_master.watch.watches import (
+    beliefs_of,
+    decided,
+    of_gauge,
+    patch_of,
+    ran,
+    viewed,
+    wait_until,
+    watchful,
+)
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import replay
@@ -29,7 +35,7 @@ from twin_master.watch.folder import Watch
 from twin_master.watch.teaching import Outcome, Teaching, both_patches, patched_model, policy_change
 from twin_master.watch.tutor import TRIED, Tutor, trial_sentence
 
-pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
+pytestmark = pytest.mark.xdist_group("teaching")  # one worker makes the wing and its watches
 
 # A search that knows its answer: it waits for a gate, and leaves what `discrepancy run` leaves.
 ANSWER = """
@@ -83,7 +89,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
-    assert viewed(watch).pictures == []  # turns show no motion, and no force in it
+    assert viewed(watch.folder).pictures == []  # turns show no motion, and no force in it
     # Stopped within the trial, and after the adoption: the same journal.
     stopped = watchful(base, tmp_path / "stopped")
     asked = verdict["to_turn"]
@@ -97,12 +103,15 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
 
 
 def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(noticing, recorded, tmp_path):
-    found, folder = drag_found(), tmp_path / "verdict"
-    alone = replace(found, before=None, proof=None)  # of its figures the missing force
-    write_verdict_folder(folder, ReportInput(alone, ORIGIN))
-    of_gauge(folder / "patch.json", -0.3)  # an effect that a table of a wing's strains takes at once
+    folder = tmp_path / "verdict"  # as `discrepancy run` leaves one
+    (folder / "figures").mkdir(parents=True)
+    (folder / "figures" / "missing_force.svg").write_bytes(to_svg(new_figure(2.0)))
+    (folder / "verdict.json").write_text(json.dumps({"verdict": {"sentence": "It is so."}}))
+    of_gauge(folder / "patch.json", -0.3)
     ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
-    assert viewed(noticing).pictures == []  # turns are no motion
+    flight = viewed(noticing.folder)
+    before, number = flight.believed(flight.seen(0, 5)).expected.mean, flight.number
+    assert flight.pictures == []  # turns are no motion
     with pytest.raises(MissionInputError, match="--from-turn names one of the 20 turns"):
         noticing.run(CsvFeed(recorded, noticing.scenario), str, patched=(folder / "patch.json", 21))
     given = (folder / "patch.json", 15)
@@ -116,16 +125,20 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
         expected, _ = model.knowledge.sensor_model.moments(known_control(believed[part], controls[part], 2))
         np.testing.assert_allclose(run["filtered"]["quantity_mean"].values[part], expected, rtol=1e-12)
     shutil.rmtree(folder)
-    flight = viewed(noticing)
+    while flight.update():
+        pass
+    assert flight.number > number  # what a view has told is void
+    shown = flight.believed(flight.seen(0, 5)).expected.mean
+    np.testing.assert_allclose(shown[:, 4], 0.7 * before[:, 4], rtol=1e-9)
     (picture,) = flight.pictures
     teller = Teller(flight)
     assert b"<svg" in picture.drawing.read_bytes()
     asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
     shown = json.loads(str(teller.answer(asked.model_copy(update={"turn": 19}))))["picture"]
-    assert shown["said"] == found.verdict.sentence
+    assert shown["said"] == "It is so."
     (picture.drawing.parent.parent / "verdict.json").write_text("{}")
-    assert viewed(noticing).pictures == []
+    assert viewed(noticing.folder).pictures == []
 
 
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):
@@ -144,53 +157,37 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         assert sum("searched for the cause" in text for text in notices) == 2
 
 
-def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence(noticing, recorded):
+def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence_and_is_no_decision(noticing, recorded):
     notice = {"kind": "verdict", "sentence": "It is so.", "sensors": []}
     with noticing.begun(CsvFeed(recorded, noticing.scenario)):
         noticing.write(verdict={"tried": False, "to_turn": 0, "notice": notice})
         noticing.is_quiet = True
         kinds = [[told["kind"] for told in next(noticing.decisions())["notices"]] for _ in range(2)]
+        noticing.write(verdict={"tried": False, "to_turn": 1, "notice": notice})
+        assert noticing.last_decision()["turn"] == 1
     assert kinds == [["verdict", "heard"], []]
 
 
-def test_live_turns_do_not_wait_for_the_search(noticing, loose, tmp_path):
+def test_live_turns_wait_neither_for_the_search_nor_for_the_patched_model(
+    noticing, mission, loose, tmp_path, monkeypatch
+):
+    """It is built beside them, and believed behind the turn that the journal says, to the bit."""
+    monkeypatch.setattr("twin_master.watch.tutor.COURTESY", 0)
     gate = tmp_path / "gate"
     live = tutor(noticing, tmp_path, "group", -0.3, str(gate), wait=False)
 
     def decide(decision: Any) -> None:
-        if decision["turn"] == 40:
+        if decision["turn"] == 32:  # the turns before were decided while the search went on
             gate.touch()
-            for _ in range(1000):
-                if any((noticing.folder / "teaching").glob("turns*/verdict.json")):
-                    return
-                time.sleep(0.02)
-
-    noticing.run(CsvFeed(loose, noticing.scenario), decide, live.act)
-    (verdict, *_) = [record for record in journal(noticing.folder) if "verdict" in record]
-    assert (verdict["turn"], verdict["verdict"]["turn"]) == (40, 40)
-    assert verdict["verdict"]["to_turn"] < 35
-
-
-def test_live_turns_do_not_wait_for_the_patched_model(noticing, mission, loose, tmp_path, monkeypatch):
-    """It is built beside them, and believed behind the turn that the journal says, to the bit."""
-    monkeypatch.setattr("twin_master.watch.tutor.COURTESY", 0)
-    live, trial_end = tutor(noticing, tmp_path, "group", -0.3, wait=False), 0
-
-    def decide(decision: Any) -> None:
-        nonlocal trial_end
-        records, teaching = journal(noticing.folder), noticing.folder / "teaching"
-        verdict = next((record["verdict"] for record in records if "verdict" in record), None)
-        while verdict is None and teaching.is_dir() and not [*teaching.glob("turns*/verdict.json")]:
-            time.sleep(0.02)
-        trial_end = verdict["turn"] + 10 if verdict else 0
-        if trial_end and decision["turn"] == trial_end + 3:
-            # The turns between were decided while it was built.
-            while live.outcome is None or not live.outcome.done():
-                time.sleep(0.02)
+            wait_until(lambda: [*(noticing.folder / "teaching").glob("turns*/verdict.json")])
+        if decision["turn"] == 45:  # and those behind the trial while the model was built
+            wait_until(lambda: live.outcome is not None and live.outcome.done())
 
     noticing.run(CsvFeed(loose, noticing.scenario), decide, live.act)
     model = next(record for record in journal(noticing.folder) if "model" in record)
-    assert model["turn"] == trial_end + 3
+    verdict = next(record["verdict"] for record in journal(noticing.folder) if "verdict" in record)
+    assert (verdict["turn"], model["turn"]) == (32, 45)
+    assert verdict["to_turn"] < 32
     assert model["model"]["from_turn"] < 20
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
     observed = mission.observed.copy()
@@ -207,14 +204,11 @@ def test_a_policy_that_changes_is_told(base):
     states, sharp = known.model.states, known.scenario.control_names.index("3g")
     z1, z2 = states.coordinates.T
     assert policy_change(known, known) == ""
-    for gentle, sentence in (
-        (z1 > 1.0, "With it another control is chosen in 10 of 25 states, first 3g in the place of 2g at "
-                   "z1 60 %, z2 0 %."),
-        ((z1 > 0.5) & (z2 > 0.1), "With it another control is chosen in 2 of 25 states, first 3g in the "
-                                  "place of 2g at z1 60 %, z2 0 %."),
-    ):  # fmt: skip
-        policy = np.eye(2)[np.where(gentle, 1 - sharp, sharp)]
-        assert policy_change(known, replace(known, policy=policy)) == sentence
+    policy = np.eye(2)[np.where((z1 > 0.5) & (z2 > 0.1), 1 - sharp, sharp)]
+    sentence = policy_change(known, replace(known, policy=policy))
+    assert sentence == (
+        "With it another control is chosen in 2 of 25 states, first 3g in the place of 2g at z1 60 %, z2 0 %."
+    )
     outcome = Outcome(b"", None, 3.5, {"policy_change": sentence})  # type: ignore[arg-type]
     for kind in TRIED:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")

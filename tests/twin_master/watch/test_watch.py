@@ -33,9 +33,8 @@ from tests.twin_master.watch.watches import (
     write_csv,
 )  # fmt: skip
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
-from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
+from twin_master.mission.journal import JOURNAL_NAME, whole_record
 from twin_master.mission.loop import BelievedModel, journalled_decision
-from twin_master.mission.turns import History
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines, mappings
@@ -59,13 +58,6 @@ def journalled(watch: Watch) -> list[Any]:
 
 def belief_of(watch: Watch) -> object:
     return json.loads(last_line(watch.folder))["filtered"]
-
-
-@pytest.fixture(scope="session")
-def plain(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mission as a CSV file."""
-    path = tmp_path_factory.mktemp("plain") / "m.csv"
-    return write_csv(path, mission.observed, mission.control_index)
 
 
 @pytest.fixture(scope="session")
@@ -99,6 +91,15 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tol
         assert belief_of(watch) == json.loads(last_line(whole))["filtered"]
     with pytest.raises(MissionInputError, match="holds no journal"):
         file_feed(tmp_path, base.scenario)
+    before = (whole / JOURNAL_NAME).read_bytes()
+    with flown(whole, 3, 20, SilentProgress()) as copy:  # up to a turn
+        assert (copy / "run.nc").is_file()
+        assert [record["turn"] for record in journal(copy)] == list(range(21))
+    assert not copy.exists()
+    assert (whole / JOURNAL_NAME).read_bytes() == before
+    nowhere = r"has the turns 0 to 20 up to turn 20, and none from 21 on"
+    with pytest.raises(MissionInputError, match=nowhere), flown(whole, 21, 20, SilentProgress()):
+        raise AssertionError
 
 
 def test_a_kill_at_any_moment_loses_no_turn(watch, recorded, whole, monkeypatch):
@@ -153,6 +154,11 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
         folders.append(watch.folder)
     check_same(*folders, *(["rejected.jsonl"] if case == "gap" else [JOURNAL_NAME]))
     assert last_line(folders[0]) == last_line(folders[1])
+    if case == "gap":
+        watch.store(counts, last=35, report=False)
+        assert figures_of(watch.folder)["blind_steps"] == "15, 16, 17, 18, 19"
+        summary = json.loads((watch.folder / "summary.json").read_text())
+        assert summary["control"] == "left 3g for 2g at turn 31"
     if case == "learning":
         last = json.loads(last_line(folders[0]))
         assert last["learnt"]["young_modulus_factor"]["standard_deviation"] < 0.01
@@ -201,6 +207,7 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     watch = watchful(base, tmp_path / "watch")
     told = decided(watch, CsvFeed(tmp_path / "late.csv", watch.scenario))
     assert journalled(watch) == told
+    assert watch.last_decision() == told[-1] | {"told_again": True}
     assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
 
 
@@ -232,26 +239,6 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
         with pytest.raises(NotResumableError, match=sentence):
             ran(watch, feed)
         assert file.read_bytes() == b"".join(wrong)
-
-
-def test_the_last_decision_is_read_from_the_journal(watch, whole, told):
-    file = watch.folder / JOURNAL_NAME
-    lines = (whole / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
-    again = told[-1] | {"told_again": True}
-    # What came late is told with the control of the last turn, not with that of its own.
-    late = json.loads(lines[-1][65:]) | {"observation_turn": 40, "control_index": 0, "observed": [None] * 24}
-    changed = {"control": "3g", "lost_sensors": 24, "revised_by_turn": 40}
-    for content, expected in (
-        (lines, again),
-        ([*lines, lines[-1][:90]], again),
-        ([*lines, line_of({"turn": 49, "model": {}})], again),
-        ([*lines, line_of(late | {"control_in_force": 1})], again | changed),
-        (lines[:1], None),
-    ):
-        file.write_bytes(b"".join(content))
-        assert watch.last_decision() == expected
-    file.unlink()
-    assert watch.last_decision() is None
 
 
 @pytest.mark.parametrize("source", ["standard input", "a file that grows"])
@@ -289,7 +276,7 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
     assert kinds(6)[5:] == [(2, ["heard"])]
     assert journalled(watch) == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
-    shown = viewed(watch).seen(0, 4)  # as the page shows it
+    shown = viewed(watch.folder).seen(0, 4)  # as the page shows it
     seen = [[notice["kind"] for notice in turn.get("notices", ())] for turn in shown]
     assert seen == [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
     assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
@@ -363,18 +350,6 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     assert "60 messages." in again.stderr
 
 
-def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole):
-    before = (whole / JOURNAL_NAME).read_bytes()
-    with flown(whole, 3, 20, SilentProgress()) as copy:
-        assert (copy / "run.nc").is_file()
-        assert [record["turn"] for record in journal(copy)] == list(range(21))
-    assert not copy.exists()
-    assert (whole / JOURNAL_NAME).read_bytes() == before
-    nowhere = r"has the turns 0 to 20 up to turn 20, and none from 21 on"
-    with pytest.raises(MissionInputError, match=nowhere), flown(whole, 21, 20, SilentProgress()):
-        raise AssertionError
-
-
 def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     scenario, mission, recorded, whole, told, tmp_path
 ):
@@ -408,16 +383,6 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     for group in ("filtered", "smoothed"):
         np.testing.assert_array_equal(run[group]["probability"].values, getattr(mission, group)[40:])
     assert last_line(folder) == last_line(whole)
-
-
-def test_a_turn_without_observation_has_its_number_in_a_report_of_the_last_ones(scenario, mission, tmp_path):
-    rows = mission.observed[:10].copy()
-    rows[8] = np.nan
-    path = write_csv(tmp_path / "m.csv", rows, np.array([1] * 8 + [0] * 2))
-    uav_twin.watch(scenario, path, tmp_path / "watch", last=4, report=False)
-    assert figures_of(tmp_path / "watch")["blind_steps"] == "8"
-    summary = json.loads((tmp_path / "watch" / "summary.json").read_text())
-    assert summary["control"] == "left 3g for 2g at turn 8"
 
 
 def test_a_slip_of_the_pen_is_passed_over_on_request_and_no_run_replaced_by_its_watch(

@@ -97,9 +97,9 @@ def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
     return ended[1] == signal.SIGKILL
 
 
-def viewed(watch: Watch) -> Flight:
-    """Return a watch as viewers see it."""
-    flight = Flight(watch.folder)
+def viewed(folder: Path) -> Flight:
+    """Return a run or watch as viewers see it."""
+    flight = Flight(folder)
     while flight.update():
         pass
     return flight

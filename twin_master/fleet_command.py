@@ -1,28 +1,25 @@
-"""`uav-twin fleet`, and `uav-twin run --seeds`."""
+"""`uav-twin fleet`, and `uav-twin run --seeds`; the process behind `--view` of all commands."""
 
 import json
+import multiprocessing
+import os
 import signal
 import sys
-from collections.abc import Mapping
-from contextlib import nullcontext
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from reporting import terminal
-from twin_master.viewer.command import shown
+from reporting.errors import ReportingError
+from twin_master import parts
+from twin_master.errors import TwinMasterError
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from twin_master.fleet.flight import FleetOutcome
-    from twin_master.fleet.plan import Fleet
-    from twin_master.fleet.reading import Estimated
-    from twin_master.fleet.shard import Engine
-    from twin_master.fleet.watching import WatchedAsset
-
-
+WORDS = "twin_master.fleet"
+"""Package whose words are printed."""
 ROWS = 20
 """Assets that the table on the console shows, the worst first."""
 
@@ -45,21 +42,16 @@ def watch(
 
     Ctrl-C ends it in order; the command repeated goes on.
     """
-    from twin_master.fleet.plan import load_fleet
-    from twin_master.fleet.report import is_fleet, serve_fleet
-    from twin_master.fleet.watching import FleetWatch
-    from twin_master.watch.intake import listening
-
-    fleet = load_fleet(file, seed)
+    fleet = parts.load_fleet(file, seed)
     folder = out if out is not None else Path("runs") / fleet.head.name
     console = _Console()
-    watched = FleetWatch(
+    watched = parts.FleetWatch(
         fleet, folder, console.tell, console.say, follow=follow, turns=turns, authority=ca_file
     )
 
-    fleet_view = is_fleet, serve_fleet
+    fleet_view = parts.is_fleet, parts.serve_fleet
     try:
-        with listening(watched.ask), shown(view, fleet_view) as begun, console.showing():
+        with parts.listening(watched.ask), shown(view, fleet_view) as begun, console.showing:
             if begun is not None:
                 begun(folder)
             watched.run(lambda: console.refresh(watched.standing))
@@ -75,17 +67,13 @@ class _Console:
     """Decisions as lines of JSON for a program, or a table for people; what is wrong as a line for both."""
 
     def __init__(self) -> None:
-        from rich.console import Console
-        from rich.live import Live
 
         self._people = sys.stdout.isatty()
-        self._live = Live(console=Console(), auto_refresh=False, transient=False)
+        self._live = parts.Live(console=parts.Console(), auto_refresh=False, transient=False)
         self._shown: Mapping[str, Any] = {}
+        self.showing: Any = self._live if self._people and not terminal.loudness.quiet else nullcontext()
 
-    def showing(self) -> "Any":
-        return self._live if self._people and not terminal.loudness.quiet else nullcontext()
-
-    def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
+    def tell(self, asset: "parts.WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Tell a decision to a program, and to people what is new of it."""
         for notice in decision["notices"]:
             if notice["sentence"] not in asset.alarms:  # which are told once
@@ -114,26 +102,22 @@ class _Console:
 
 
 def _heading(standing: Mapping[str, Any]) -> str:
-    from reporting.page import Words
-    from twin_master.fleet.watching import counts_of
 
-    return Words("twin_master.fleet").say("heading", counts=counts_of(standing))
+    return parts.Words(WORDS).say("heading", counts=parts.counts_of(standing))
 
 
-def _watched_table(standing: Mapping[str, Any]) -> "Table":
-    from reporting.console_table import console_table
-    from twin_master.mission.loop import health_in_words
+def _watched_table(standing: Mapping[str, Any]) -> "parts.Table":
 
     told = [(name, asset) for name, asset in standing["assets"].items() if asset["last"] is not None]
     worst = sorted(told, key=lambda row: (row[1]["alarms"], row[1]["severity"]), reverse=True)[:ROWS]
     states, rows = list(dict.fromkeys(name for _, asset in worst for name in asset["last"]["health"])), []
     for name, asset in worst:
-        last, health = asset["last"], health_in_words(asset["last"])
+        last, health = asset["last"], parts.health_in_words(asset["last"])
         cells = [health.get(state, "") for state in states]
         alarms = str(asset["alarms"] or "")
         rows.append((name, str(last["turn"]), last["control"], *cells, last["next_control"], alarms))
     headings = "asset", "turn", "control", *states, "next", "alarms"
-    table = console_table(headings, rows, terminal.console().width)
+    table = parts.console_table(headings, rows, terminal.console().width)
     table.title = _heading(standing)
     return table
 
@@ -150,9 +134,7 @@ def run(
     json: bool = False,
 ) -> None:
     """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped."""
-    from twin_master.fleet.plan import load_fleet
-
-    found = load_fleet(file, seed)
+    found = parts.load_fleet(file, seed)
     engine = engine_of(workers, cluster)
     fly_and_show(found, out, engine, replace=replace, report=not no_report, json=json)
 
@@ -161,43 +143,29 @@ def learn(
     folder: Path, *, out: Path = Path("learnt.toml"), no_report: bool = False, json: bool = False
 ) -> None:
     """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
-    from twin_master.fleet.learn import learn_from_fleet, lesson_rows
-
-    record = learn_from_fleet(folder, out, progress=terminal.progress())
+    record = parts.learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _report(folder)
-    _answer("learn", {"file": str(out), **record}, json=json, rows=lesson_rows(record), out=out)
+    told, rows = {"file": str(out), **record}, parts.lesson_rows(record)
+    terminal.answer("learn", WORDS, told, json=json, rows=rows, out=out)
 
 
-def _answer(command: str, record: Mapping[str, Any], *, json: bool, **values: Any) -> None:
-    from reporting.page import Words
-
-    terminal.answer(command, Words("twin_master.fleet"), record, json=json, **values)
-
-
-def engine_of(workers: int | None, cluster: str | None) -> "Engine":
+def engine_of(workers: int | None, cluster: str | None) -> "parts.Engine":
     """Return who flies, by what the user said."""
-    import os
-
-    from twin_master.fleet.shard import Engine
-
     if cluster is not None:
         if workers is not None:
             raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
-        return Engine(cluster=cluster)
-    return Engine(len(os.sched_getaffinity(0)) if workers is None else workers)
+        return parts.Engine(cluster=cluster)
+    return parts.Engine(len(os.sched_getaffinity(0)) if workers is None else workers)
 
 
 def fly_and_show(
-    fleet: "Fleet", out: Path | None, engine: "Engine", *, replace: bool, report: bool, json: bool
-) -> "FleetOutcome":
+    fleet: "parts.Fleet", out: Path | None, engine: "parts.Engine", *, replace: bool, report: bool, json: bool
+) -> "parts.FleetOutcome":
     """Fly a fleet and print what became of it."""
-    from twin_master.fleet.flight import fly_fleet
-    from twin_master.fleet.reading import figure_rows
-
     folder = out if out is not None else Path("runs") / fleet.head.name
     try:
-        outcome = fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
+        outcome = parts.fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
     except KeyboardInterrupt:
         sentence = f"Interrupted; what was flown is kept in {folder}: repeat the command to go on."
         typer.secho(sentence, fg="red", err=True)
@@ -207,37 +175,100 @@ def fly_and_show(
     figures = _figures([outcome.folder])
     told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": len(outcome.failures)}
     told |= {"failures": outcome.failures, "ended": outcome.ended, "groups": figures}
-    _answer(
-        "run", told, json=json, outcome=outcome, rows=figure_rows(figures), groups=list(figures),
+    terminal.answer(
+        "run", WORDS, told, json=json, outcome=outcome, rows=parts.figure_rows(figures), groups=list(figures),
         told=[*outcome.failures.items(), *outcome.ended.items()], page=outcome.folder / "report.html",
     )  # fmt: skip
     return outcome
 
 
 def _report(folder: Path) -> None:
-    from twin_master.fleet.report import write_fleet_report
 
     with terminal.progress().stage("Writing the report"):
-        write_fleet_report(folder)
+        parts.write_fleet_report(folder)
 
 
 def compare(folders: list[Path], *, json: bool = False) -> None:
     """Show the figures of several fleets or ensembles side by side."""
-    from twin_master.fleet.reading import figure_rows
-
     figures = _figures(folders)
-    _answer("compare", figures, json=json, rows=figure_rows(figures), groups=list(figures))
+    terminal.answer(
+        "compare", WORDS, figures, json=json, rows=parts.figure_rows(figures), groups=list(figures)
+    )
 
 
-Figures = dict[str, dict[str, "Estimated | int"]]
+Figures = dict[str, dict[str, "parts.Estimated | int"]]
 
 
 def _figures(folders: list[Path]) -> Figures:
     """Return the figures of each group; with the folder's name where there are several folders."""
-    from twin_master.fleet.reading import group_figures, open_fleet
-
     found = {}
     for folder in folders:
-        for name, group in open_fleet(folder).items():
-            found[name if len(folders) == 1 else f"{folder}: {name}"] = group_figures(group)
+        for name, group in parts.open_fleet(folder).items():
+            found[name if len(folders) == 1 else f"{folder}: {name}"] = parts.group_figures(group)
     return found
+
+
+_LOOK_AGAIN = 0.05
+"""Seconds between two looks for a flight that is being prepared."""
+_COURTESY = 5
+"""Niceness of a view beside a mission: the mission comes first."""
+
+Server = tuple[Callable[[Path], bool], Callable[[Path, int, Callable[[str], None], Callable[[], bool]], None]]
+"""Whether a folder can be shown, and what shows it, as `viewer.server.serve`."""
+
+
+@contextmanager
+def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path], None] | None]:
+    """Give what shows a mission from its beginning in a process beside it; at the end wait for Ctrl-C.
+
+    Parameters
+    ----------
+    wanted
+        Whether to show it at all; if not, None is given.
+    server
+        Says whether a folder can be shown yet, and shows it; that of one flight if left out.
+    """
+    if not wanted:
+        yield None
+        return
+    process: multiprocessing.process.BaseProcess | None = None
+
+    def begin(folder: Path) -> None:
+        nonlocal process
+        context = multiprocessing.get_context("spawn")
+        process = context.Process(target=_beside, args=(folder, os.getpid(), server), daemon=True)
+        process.start()
+
+    try:
+        yield begin
+        if process is not None and process.is_alive():
+            with suppress(KeyboardInterrupt):  # from the sentence on, which a quick hand may answer at once
+                _say("The view stays until Ctrl-C.")
+                process.join()
+    finally:
+        if process is not None:
+            process.terminate()
+            process.join()
+
+
+def _beside(folder: Path, mission: int, server: "Server | None") -> None:
+    """Show a mission as soon as it is prepared; end with the process that flies it."""
+    prepared, serving = server or (parts.is_prepared, parts.serve)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the mission ends it
+    os.nice(_COURTESY)
+
+    def wanted() -> bool:
+        return os.getppid() == mission
+
+    while wanted() and not prepared(folder):
+        time.sleep(_LOOK_AGAIN)
+    try:
+        serving(folder, 0, lambda address: _say(f"View: {address}"), wanted)
+    except (TwinMasterError, ReportingError) as error:
+        typer.secho(f"The view ended: {error}", fg="red", err=True)
+
+
+def _say(text: str) -> None:
+    """Print beside the results of a mission, which may be JSON."""
+    if not terminal.loudness.quiet:
+        typer.echo(text, err=True)
