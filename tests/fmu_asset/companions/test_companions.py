@@ -41,14 +41,17 @@ def test_growth_with_the_load_is_the_law_of_paris(damage) -> None:
     assert behaviour.advance(time, 1e6, [3.0])[0] == 0.8  # the ceiling
 
 
-def test_a_script_gives_at_each_mark_what_it_says(damage) -> None:
+@pytest.mark.parametrize("period", [1, 2])
+def test_a_script_gives_at_each_mark_what_it_says(damage, period) -> None:
     script = {
+        "period": float(period),
         "script[1].first": 10.0, "script[1].last": 19.0, "script[1].z1": 0.02,
         "script[2].first": 20.0, "script[2].last": 20.0, "script[2].z1": 0.2, "script[2].z2": 0.1,
     }  # fmt: skip
     behaviour = damage(**script)
     z1 = [behaviour.advance(float(step), 1.0, [3.0])[0] for step in range(25)]
-    assert z1 == [round(0.02 * min(max(step - 9, 0), 10) + 0.2 * (step >= 20), 12) for step in range(25)]
+    marks = [[mark for mark in range(0, step + 1, period) if 10 <= mark < 20] for step in range(25)]
+    assert z1 == [round(0.02 * len(passed) + 0.2 * (step >= 20), 12) for step, passed in enumerate(marks)]
 
 
 @settings(max_examples=60)
