@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import norm
 
 from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
 from calibration.joint.measurement import PUBLISHED_MODES
@@ -16,7 +15,6 @@ from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.figures import calibration_figure
 from calibration.paper.load_test import (
     calibrate_static,
-    kernel_density,
     normal_reference_bandwidth,
     particle_filter,
 )
@@ -70,18 +68,6 @@ def test_kernel_densities_are_those_of_the_ratio_and_of_the_particles():
     assert mean == pytest.approx(filtered.mean, abs=1e-5)
     deviation = np.sqrt(np.trapezoid(density * (grid - mean) ** 2, grid))
     assert deviation == pytest.approx(filtered.standard_deviation, rel=0.01)
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-def test_a_kernel_density_is_the_sum_of_kernels(weighted):
-    """Within its window, whatever lies beyond."""
-    generator = np.random.default_rng(1)
-    samples = np.append(generator.normal(1.0, 0.03, 500), 40.0)
-    weights = generator.random(501) if weighted else np.ones(501)
-    grid, density = kernel_density(samples, 0.02, (0.9, 1.1), weights if weighted else None)
-    seen = (grid > 0.9) & (grid < 1.1)
-    exact = norm.pdf(grid[seen, None], samples, 0.02) @ weights / weights.sum()
-    assert np.abs(density[seen] - exact).max() < 1e-3 * exact.max()
 
 
 def test_the_bandwidth_is_the_robust_normal_reference_rule():

@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from calibration.dynamics.damped_cosine import DampedCosines
 from calibration.dynamics.modal_identification import identify_modes
 from calibration.errors import ExperimentDataError
 from tests.calibration.decays import free_decay
@@ -63,13 +62,6 @@ def test_errors_are_those_of_the_records(kind, count):
         for mode in range(3)
     ]
     assert 0.6 < np.mean(np.square(white)) < 1.6
-
-
-def test_errors_of_a_free_decay_are_those_of_its_waves():
-    seen, poles = record("decay", 0), OMEGA * (-RATIO + 1j * np.sqrt(1.0 - RATIO**2))
-    waves = DampedCosines(np.arange(len(seen)) / RATE, seen, drift=False).fit(poles)
-    wanted = np.array([[*mode.standard_error.values()] for mode in waves.modes])
-    assert identify_modes(seen, RATE, BANDS, "decay").standard_error[:, :2] == pytest.approx(wanted, rel=1e-4)
 
 
 @pytest.mark.parametrize(("kind", "samples"), [("ambient", 8000), ("decay", 1500)])

@@ -231,8 +231,6 @@ def test_step_response_of_any_order(order, ratio):
 
 def test_limits_of_the_high_pass():
     signal = np.random.default_rng(3).normal(size=(50, 2))
-    assert high_pass(signal, 0.01, 0.3, 0.0, 0.0) == pytest.approx(signal, abs=1e-12)
-    assert high_pass(signal, 1e-3, 1e9, 1.0, 0.0) == pytest.approx(signal, abs=1e-9)
     assert high_pass(np.full((50, 2), 3.0), 0.01, 0.3) == pytest.approx(0.0, abs=1e-12)
     assert high_pass(np.zeros((0, 2)), 0.01, 0.3).shape == (0, 2)
     near, whole = high_pass(signal, 0.01, 0.3, 2.0 + 1e-9), high_pass(signal, 0.01, 0.3, 2.0)
