@@ -353,20 +353,12 @@ def write_beam() -> Callable[..., Path]:
     """
     import meshio
 
-    from fe.elements.kinds import KINDS
-
-    kind = KINDS["hexahedron20"]
-    corners = np.array(
-        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-    )
+    from tests.meshes import box
 
     def write(folder: Path, changes: Mapping[str, str] | None = None, cells: int = 4) -> Path:
-        nodes = np.array([corners + np.array([number, 0, 0]) for number in range(cells)], dtype=float)
-        middles = [0.5 * (nodes[:, a] + nodes[:, b]) for a, b in kind.edges]
-        whole = np.concatenate([nodes, *(middle[:, None] for middle in middles)], axis=1).reshape(-1, 3)
-        points, numbers = np.unique(whole, axis=0, return_inverse=True)
-        points *= [100.0 / cells, 20.0, 10.0]
-        meshio.write(folder / "beam.vtu", meshio.Mesh(points, [("hexahedron20", numbers.reshape(cells, 20))]))
+        points, numbers = box("hexahedron20", (cells, 1, 1))
+        mesh = meshio.Mesh(points * [100.0, 20.0, 10.0], [("hexahedron20", numbers)])
+        meshio.write(folder / "beam.vtu", mesh)
         text = BEAM
         for old, new in (changes or {}).items():
             assert old in text

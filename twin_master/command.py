@@ -20,8 +20,7 @@ from reporting.errors import ReportingError
 from reporting.words import counted
 from twin_master import parts
 from twin_master.errors import TwinMasterError, said
-from twin_master.fleet_command import engine_of, fly_and_show
-from twin_master.viewer.command import shown
+from twin_master.fleet_command import engine_of, fly_and_show, shown
 
 
 def run(

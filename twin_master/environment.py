@@ -16,7 +16,7 @@ from fmu_asset.errors import FmuEndedError
 from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import Asset
-from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
+from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError, said
 from twin_master.fleet.flight import source_of
 from twin_master.mission.preparation import prepare_knowledge
@@ -76,8 +76,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         *,
         progress: Progress | None = None,
     ) -> None:
-        loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
-        self.scenario = resolve_scenario(loaded, given_overrides(overrides))
+        self.scenario = resolve_scenario(load_scenario(scenario), overrides)
         if self.scenario.observation.role == "modes":
             raise MissionInputError(said("environment.modes", name=self.scenario.mission.name))
         source = source_of(self.scenario)

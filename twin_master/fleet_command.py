@@ -1,19 +1,22 @@
-"""`uav-twin fleet`, and `uav-twin run --seeds`."""
+"""`uav-twin fleet`, and `uav-twin run --seeds`; the process behind `--view` of all commands."""
 
 import json
+import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Mapping
-from contextlib import nullcontext
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from reporting import terminal
+from reporting.errors import ReportingError
 from twin_master import parts
-from twin_master.viewer.command import shown
+from twin_master.errors import TwinMasterError
 
 WORDS = "twin_master.fleet"
 """Package whose words are printed."""
@@ -48,7 +51,7 @@ def watch(
 
     fleet_view = parts.is_fleet, parts.serve_fleet
     try:
-        with parts.listening(watched.ask), shown(view, fleet_view) as begun, console.showing():
+        with parts.listening(watched.ask), shown(view, fleet_view) as begun, console.showing:
             if begun is not None:
                 begun(folder)
             watched.run(lambda: console.refresh(watched.standing))
@@ -68,9 +71,7 @@ class _Console:
         self._people = sys.stdout.isatty()
         self._live = parts.Live(console=parts.Console(), auto_refresh=False, transient=False)
         self._shown: Mapping[str, Any] = {}
-
-    def showing(self) -> "Any":
-        return self._live if self._people and not terminal.loudness.quiet else nullcontext()
+        self.showing: Any = self._live if self._people and not terminal.loudness.quiet else nullcontext()
 
     def tell(self, asset: "parts.WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Tell a decision to a program, and to people what is new of it."""
@@ -205,3 +206,69 @@ def _figures(folders: list[Path]) -> Figures:
         for name, group in parts.open_fleet(folder).items():
             found[name if len(folders) == 1 else f"{folder}: {name}"] = parts.group_figures(group)
     return found
+
+
+_LOOK_AGAIN = 0.05
+"""Seconds between two looks for a flight that is being prepared."""
+_COURTESY = 5
+"""Niceness of a view beside a mission: the mission comes first."""
+
+Server = tuple[Callable[[Path], bool], Callable[[Path, int, Callable[[str], None], Callable[[], bool]], None]]
+"""Whether a folder can be shown, and what shows it, as `viewer.server.serve`."""
+
+
+@contextmanager
+def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path], None] | None]:
+    """Give what shows a mission from its beginning in a process beside it; at the end wait for Ctrl-C.
+
+    Parameters
+    ----------
+    wanted
+        Whether to show it at all; if not, None is given.
+    server
+        Says whether a folder can be shown yet, and shows it; that of one flight if left out.
+    """
+    if not wanted:
+        yield None
+        return
+    process: multiprocessing.process.BaseProcess | None = None
+
+    def begin(folder: Path) -> None:
+        nonlocal process
+        context = multiprocessing.get_context("spawn")
+        process = context.Process(target=_beside, args=(folder, os.getpid(), server), daemon=True)
+        process.start()
+
+    try:
+        yield begin
+        if process is not None and process.is_alive():
+            with suppress(KeyboardInterrupt):  # from the sentence on, which a quick hand may answer at once
+                _say("The view stays until Ctrl-C.")
+                process.join()
+    finally:
+        if process is not None:
+            process.terminate()
+            process.join()
+
+
+def _beside(folder: Path, mission: int, server: "Server | None") -> None:
+    """Show a mission as soon as it is prepared; end with the process that flies it."""
+    prepared, serving = server or (parts.is_prepared, parts.serve)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the mission ends it
+    os.nice(_COURTESY)
+
+    def wanted() -> bool:
+        return os.getppid() == mission
+
+    while wanted() and not prepared(folder):
+        time.sleep(_LOOK_AGAIN)
+    try:
+        serving(folder, 0, lambda address: _say(f"View: {address}"), wanted)
+    except (TwinMasterError, ReportingError) as error:
+        typer.secho(f"The view ended: {error}", fg="red", err=True)
+
+
+def _say(text: str) -> None:
+    """Print beside the results of a mission, which may be JSON."""
+    if not terminal.loudness.quiet:
+        typer.echo(text, err=True)

@@ -7,8 +7,6 @@ from rich.table import Table as Table
 
 from calibration.errors import CalibrationError as CalibrationError
 from fe.runtime.errors import FiniteElementError as FiniteElementError
-from fe.structure.design import MeshDesign as MeshDesign
-from fe.structure.design import load_structure as load_structure
 from fe.structure.operators import write_vtu as write_vtu
 from fe.wing.design import load_design as load_design
 from fmu_asset.errors import FmuError as FmuError
@@ -57,6 +55,7 @@ from twin_master.mission.sensor_design import with_candidates as with_candidates
 from twin_master.network.belief_planning import BeliefPlan as BeliefPlan
 from twin_master.network.belief_planning import DecisionProblem as DecisionProblem
 from twin_master.report.structure import design_figure as design_figure
+from twin_master.report.structure import gauge_places as gauge_places
 from twin_master.report.structure import plan_figure as plan_figure
 from twin_master.report.structure import planform_of as planform_of
 from twin_master.scenario.reading import load_scenario as load_scenario
@@ -65,6 +64,7 @@ from twin_master.scenario.section import printed_state as printed_state
 from twin_master.store.writing import REPORT_NAME as REPORT_NAME
 from twin_master.store.writing import SUMMARY_NAME as SUMMARY_NAME
 from twin_master.store.writing import RunOutcome as RunOutcome
+from twin_master.viewer.flight import is_prepared as is_prepared
 from twin_master.viewer.server import serve as serve
 from twin_master.watch.feeds import is_broker as is_broker
 from twin_master.watch.folder import Watch as Watch

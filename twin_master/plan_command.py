@@ -186,9 +186,9 @@ def _places(scenario: "parts.Scenario") -> "tuple[parts.Float | None, list[parts
     import numpy as np
 
     files = scenario.belief.all_files()
-    structure = parts.load_structure(files[parts.MODEL_COPY]) if parts.MODEL_COPY in files else None
-    if isinstance(structure, parts.MeshDesign) and scenario.observation.role == "strain":
-        return structure.unit * np.array([part.point for part in structure.gauge]), []
+    places = parts.gauge_places(files.get(parts.MODEL_COPY))
+    if places is not None and scenario.observation.role == "strain":
+        return places, []
     file = files.get(parts.DESIGN_COPY)
     wing = parts.planform_of(None if file is None else parts.load_design(file), scenario)
     if wing is None:

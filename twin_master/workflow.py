@@ -22,8 +22,8 @@ from twin_master.assets.resolution import (
     Overrides,
     asset_source,
     believed_source,
-    given_overrides,
     resolve_scenario,
+    scenario_bytes,
 )
 from twin_master.errors import NotResumableError, said
 from twin_master.mission import loop
@@ -31,7 +31,6 @@ from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.planning import policy_file, read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
-from twin_master.network.memory import scenario_bytes
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import (
@@ -97,8 +96,8 @@ def fly(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError
         With one clear sentence; the run folder stays resumable.
     """
-    loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
-    resolved = resolve_scenario(loaded, given_overrides(overrides))
+    loaded = load_scenario(scenario)
+    resolved = resolve_scenario(loaded, overrides)
     folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
     progress = progress or SilentProgress()
     files = {}
@@ -325,7 +324,7 @@ def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -
     BindingError, InvalidDesignError, DesignFileError
         The binding or the design is wrong.
     """
-    scenario = resolve_scenario(loaded, overrides or Overrides())
+    scenario = resolve_scenario(loaded, overrides)
     watched = scenario.asset.kind == WATCHED_KIND
     source = believed_source(scenario) if watched else asset_source(scenario)
     source.check()

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -295,13 +296,13 @@ def test_what_cannot_be_resumed(tmp_path, library_file):
     resume_run(folder)
 
 
-@pytest.mark.parametrize("table", ["scenario", "scenario_file", "provenance", "inputs"])
-def test_a_damaged_configuration_is_one_sentence(whole, table):
-    config = json.loads((whole / "config.json").read_text(encoding="utf-8"))
-    for damage in (3, None, []):
-        written(whole, json.dumps({**config, table: damage}), name="config.json")
-        with pytest.raises(NotResumableError, match=f"damaged.*`{table}`.*--replace"):
-            resume_run(whole)
+def test_a_damaged_configuration_is_one_sentence(tmp_path):
+    tables = "scenario", "scenario_file", "provenance", "inputs"
+    for damaged, damage in product(tables, (3, None, [])):
+        config = {"kind": KIND, **{table: {} for table in tables}, damaged: damage}
+        written(tmp_path, json.dumps(config), name="config.json")
+        with pytest.raises(NotResumableError, match=f"damaged.*`{damaged}`.*--replace"):
+            resume_run(tmp_path)
 
 
 def test_an_error_before_the_first_turn_says_how_to_begin_anew(tmp_path, library_file, monkeypatch):

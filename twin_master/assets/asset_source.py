@@ -33,22 +33,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class InnerTruth:
-    """What an asset with damage and sensors of its own tells for scoring; never for the twin.
-
-    Attributes
-    ----------
-    state : dict of str to float
-        True value of each state factor, SI.
-    sensed : (G,)
-        What its sensors say, SI; NaN where one is lost.
-    """
-
-    state: Mapping[str, float]
-    sensed: Float
-
-
-@dataclass(frozen=True)
 class AssetReading:
     """What an asset returns for one step.
 
@@ -58,13 +42,17 @@ class AssetReading:
         Noise-free observation in its SI unit.
     monitors : dict of str to float
         Further figures that the asset reports of itself, such as a certified error bound.
-    inner : InnerTruth or None
-        What the asset tells of its own damage and sensors, where it carries them.
+    state : dict of str to float or None
+        True value of each state factor, SI, where the asset carries damage of its own: for scoring, never for
+        the twin.
+    sensed : (G,) or None
+        What its sensors say, SI, where it carries sensors of its own; NaN where one is lost.
     """
 
     values: Float
     monitors: Mapping[str, float] = field(default_factory=dict)
-    inner: InnerTruth | None = None
+    state: Mapping[str, float] | None = None
+    sensed: Float | None = None
 
 
 class Asset:

@@ -21,14 +21,13 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from reporting.toml_file import Fault, Number, Positive
 from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
-from twin_master.assets.fmu_source import FmuSection, FmuSource
+from twin_master.assets.fmu_source import FmuSection, FmuSource, Session
 from twin_master.errors import MissionInputError
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, Count, FileSection, Flag, Section, short
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.wiring import Wiring
-    from twin_master.assets.fmu_source import Session
 
 COMPONENT_FOLDER = "asset/components"
 

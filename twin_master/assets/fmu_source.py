@@ -1,9 +1,8 @@
 """An FMU as the asset of a mission: any FMU with a binding, given or packed of a model script."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal, Union
 
 import numpy as np
 from pydantic import Field
@@ -24,7 +23,6 @@ from twin_master.assets.asset_source import (
     AssetBelief,
     AssetReading,
     AssetSource,
-    InnerTruth,
     asked_table,
     read_files,
 )
@@ -43,10 +41,9 @@ from twin_master.seeds import generator
 if TYPE_CHECKING:
     from fmu_asset.coupling.system import CoupledAsset
 
-    Session = FmiAsset | CoupledAsset
-    """One FMU, or several as one, with the same face."""
 
-
+Session = Union[FmiAsset, "CoupledAsset"]
+"""One FMU, or several as one, with the same face."""
 FMU_COPY = "asset/asset.fmu"
 LARGEST_SEED = 2**31 - 1
 """Of an FMU's integer parameter."""
@@ -118,25 +115,12 @@ class ScriptSection(FmuSection):
         return ScriptSource(scenario, self)
 
 
-@dataclass(frozen=True)
-class InnerRoles:
-    """Where an asset with damage and sensors of its own tells the truth; see `[truth]` of a scenario.
+InnerRoles = tuple[Mapping[str, str], slice, slice | None]
+"""Where an asset with damage and sensors of its own tells the truth; see `[truth]` of a scenario.
 
-    Attributes
-    ----------
-    state : dict of str to str
-        Monitor by state factor.
-    observation : slice
-        The noise-free observation among those of the binding.
-    received : slice or None
-        Where the binding observes whether each sensor is received.
-    """
-
-    state: Mapping[str, str]
-    observation: slice
-    received: slice | None
-
-
+The monitor of each state factor; among the observations of the binding the noise-free one, and where it tells
+whether each sensor is received.
+"""
 _TAKEN = ("state", "sensor_status", "step", "region", "sensor")
 """What the truth of a run holds already."""
 
@@ -183,11 +167,11 @@ class FmuAsset(Asset):
         extra = {self._names[name]: value for name, value in observation.extra.items()}
         if self._inner is None:
             return AssetReading(sensed, extra)
-        state = {name: observation.extra[monitor] for name, monitor in self._inner.state.items()}
-        if self._inner.received is not None:
-            sensed = np.where(observation.values[self._inner.received] == 0.0, np.nan, sensed)
-        free = observation.values[self._inner.observation]
-        return AssetReading(free, extra, InnerTruth(state, sensed))
+        monitors, free, received = self._inner
+        state = {name: observation.extra[monitor] for name, monitor in monitors.items()}
+        if received is not None:
+            sensed = np.where(observation.values[received] == 0.0, np.nan, sensed)
+        return AssetReading(observation.values[free], extra, state, sensed)
 
     def save_state(self) -> bytes:
         """Return the state of the FMU."""
@@ -328,11 +312,8 @@ class FmuSource(AssetSource):
             raise MissionInputError(said("assets.own_damage"))
         rows = [("monitor", truth.state.values(), binding.monitor)]
         check_names("`truth.state` names the", f"the binding {binding.name}", rows)
-        return InnerRoles(
-            state=truth.state,
-            observation=self._observed(binding, truth.observation or ""),
-            received=None if truth.received is None else self._slice(binding, truth.received),
-        )
+        received = None if truth.received is None else self._slice(binding, truth.received)
+        return truth.state, self._observed(binding, truth.observation or ""), received
 
     def parameters(self) -> dict[str, float]:
         """Return the parameters of the scenario, and the numbers drawn for its seeds.

@@ -13,7 +13,7 @@ from fe.structure.tables import StructureDesign
 from fmu_asset.door.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress
-from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, InnerTruth, StatelessAsset
+from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import (
     SAME_NAMES,
     ParameterDraws,
@@ -425,7 +425,7 @@ class RecordedStructure(Asset):
         return AssetReading(
             section.observed(modal_values(model, vector, section, damping)),
             {f"standard_error_{title}": error for title, error in zip(titles, errors, strict=True)},
-            InnerTruth({}, sensed),
+            sensed=sensed,
         )
 
     def save_state(self) -> bytes:

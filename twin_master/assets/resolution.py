@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,7 @@ from twin_master.assets.asset_source import AssetSource, PairedSource
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
 from twin_master.errors import MissionInputError, said
-from twin_master.network.memory import check_scenario_fits
+from twin_master.network.transition import NUMBER, TRANSITION_COPIES, check_fits, transition_bytes
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, AssetSection, Section
@@ -73,7 +74,7 @@ def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
     return checked(Overrides, dict(given or {}), where, MissionInputError, what="`Overrides`")
 
 
-def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
+def resolve_scenario(loaded: LoadedScenario, given: Overrides | Mapping[str, Any] | None = None) -> Scenario:
     """Return the scenario with the overrides, its paths absolute.
 
     Relative paths of a scenario file start at the folder of that file.
@@ -85,6 +86,7 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     ScenarioError
         The scenario does not hold with them.
     """
+    overrides = given_overrides(given)
     table = loaded.scenario.moved(loaded.path.resolve().parent).to_dict()
     _change_asset(table, overrides)
     if overrides.library:
@@ -147,6 +149,40 @@ def _tailor(table: dict[str, Any]) -> None:
             part["design"] = CALIBRATED_DESIGN_NAME
             if part.get("kind") == "design":
                 part["kind"] = "calibration"
+
+
+_PREDICTION_COPIES = 8
+"""The table, the checked copy, the copy ordered for the likelihood, and what the quantiles are taken from."""
+_HISTORY_COPIES = 4
+"""Belief before and after the observation, its logarithm, and the smoothed one."""
+
+
+def scenario_bytes(scenario: Scenario) -> dict[str, float]:
+    """Return what the twin of a scenario keeps in memory, in words with its numbers, and its size [bytes]."""
+    states = prod(len(factor.levels) for factor in scenario.state)
+    controls, sensors = len(scenario.control), scenario.observation.count
+    steps, ahead = scenario.mission.steps, scenario.mission.prediction_steps
+    draws = 1 if scenario.calibration.source == "fixed" else scenario.calibration.draws
+    tables = sum(transition_bytes(len(factor.levels), controls) for factor in scenario.state)
+    belief = NUMBER * (states + sensors)
+    predictions = NUMBER * draws * states * controls * sensors
+    return {
+        f"the transitions of {len(scenario.state)} state factors under {controls} controls": TRANSITION_COPIES
+        * tables,
+        f"{draws} draws of {sensors} sensors in {states} states": _PREDICTION_COPIES * predictions,
+        f"the beliefs of {steps} steps and {ahead} ahead": _HISTORY_COPIES * belief * (steps + ahead),
+    }
+
+
+def check_scenario_fits(scenario: Scenario) -> None:
+    """Check that the twin of a scenario fits in memory, before anything of it is built.
+
+    Raises
+    ------
+    InvalidModelError
+        It does not.
+    """
+    check_fits(scenario_bytes(scenario), "take fewer levels, state factors, draws or steps")
 
 
 def asset_source(scenario: Scenario) -> AssetSource:

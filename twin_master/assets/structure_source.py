@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from fmu_asset.door.binding import Binding
 from reporting.files import atomic_write_text
@@ -20,9 +20,6 @@ from twin_master.assets.reduced_model import NamedStructure, RecordedStructure, 
 from twin_master.errors import MissionInputError, said
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import BeliefSection, FileSection
-
-if TYPE_CHECKING:
-    pass
 
 FLOWN_COPY, MODEL_COPY = "asset/flown/structure.toml", "asset/model/structure.toml"
 

@@ -26,7 +26,7 @@ from reporting.progress import reporter
 from scenarios import binding_files
 from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
-from twin_master.assets.resolution import Overrides, resolve_scenario
+from twin_master.assets.resolution import resolve_scenario
 from twin_master.errors import MissionInputError, said
 from twin_master.scenario.reading import LoadedScenario
 
@@ -56,7 +56,7 @@ def export_scenario(
     FmuError
         The FMUs do not fit.
     """
-    scenario = resolve_scenario(loaded, Overrides(seed=seed))
+    scenario = resolve_scenario(loaded, {"seed": seed})
     source = scenario.asset.source(scenario)
     if not isinstance(source, FmuSource):
         raise MissionInputError(said("assets.no_fmu", name=scenario.mission.name, kind=scenario.asset.kind))

@@ -29,7 +29,7 @@ class FmuTestBench(ExitStack):
 
     A weight is a tip force in the quasi-static response, and the displacement of its point of application is
     read. A release is the parameter `initial_tip_displacement` of the transient response; each sample of the
-    record is a communication step. The FMU runs in a worker process of its own unless told otherwise.
+    record is a communication step. The FMU runs in a worker process of its own.
 
     Parameters
     ----------
@@ -37,8 +37,6 @@ class FmuTestBench(ExitStack):
         The wing FMU.
     truth : DigitalState
         Its true state; the geometry is that of the FMU's wing.
-    isolated : bool
-        Whether the FMU runs in a worker process.
 
     Raises
     ------
@@ -48,9 +46,9 @@ class FmuTestBench(ExitStack):
         If the FMU cannot be flown or its parameters are out of range.
     """
 
-    def __init__(self, fmu: Path, truth: DigitalState, *, isolated: bool = True) -> None:
+    def __init__(self, fmu: Path, truth: DigitalState) -> None:
         super().__init__()
-        self._fmu, self._isolated = Path(fmu), isolated
+        self._fmu = Path(fmu)
         declared = [item.name for item in read_fmu(fmu).variables]
         regions = [name.removeprefix("health.") for name in declared if name.startswith("health.")]
         self._binding = load_binding(binding_files()[BINDING]).with_regions(regions)
@@ -83,4 +81,4 @@ class FmuTestBench(ExitStack):
         return time, SENSITIVITY * strain
 
     def _session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
-        return FmiAsset(self._fmu, binding, isolated=self._isolated, parameters=self._parameters | parameters)
+        return FmiAsset(self._fmu, binding, parameters=self._parameters | parameters)

@@ -222,8 +222,7 @@ def ensemble(scenario: str, seeds: range, overrides: Overrides | None = None, *,
 
     The calibration is drawn once, under the seed of the scenario or of the overrides, for all of them.
     """
-    loaded = load_scenario(scenario)
-    resolved = resolve_scenario(loaded, overrides or Overrides())
+    resolved = resolve_scenario(load_scenario(scenario), overrides)
     members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
     group = Group(resolved.mission.name, (resolved,), {}, members)
     mission = resolved.mission

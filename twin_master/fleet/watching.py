@@ -244,7 +244,8 @@ class FleetWatch:
         It is begun, or taken up again, where it is not watched and it is time.
         """
         key, count = f"{group.name}/{name}", 0
-        if self.asked or (key not in self.assets and not self._due(key)):
+        waiting = key in self._lost and time.monotonic() < self._lost[key].again
+        if self.asked or (key not in self.assets and waiting):
             return count
         try:
             if key not in self.assets:
@@ -306,10 +307,6 @@ class FleetWatch:
     def enough(self, asset: WatchedAsset) -> bool:
         """Return whether an asset has the turns that were wanted."""
         return self._turns is not None and asset.watch.twin.turns >= self._turns
-
-    def _due(self, key: str) -> bool:
-        """Return whether an asset was never lost, or is to be taken up again."""
-        return key not in self._lost or time.monotonic() >= self._lost[key].again
 
     def lost(self, key: str, error: Exception) -> None:
         """Say once why an asset is not watched, and give its folder free; a full disk ends all."""

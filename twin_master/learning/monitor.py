@@ -35,8 +35,7 @@ from twin_master.learning.rivals import (
     weigh_model,
     weigh_none,
 )
-from twin_master.learning.words import Words
-from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
+from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion, Words
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing

@@ -275,7 +275,6 @@ def grid_of_fmu(
     *,
     role: str | None = None,
     settling_steps: int = 0,
-    step_timeout: float | None = None,
 ) -> SamplingGrid:
     """Return the grid over the values of the inputs; controls are all their combinations.
 
@@ -314,7 +313,7 @@ def grid_of_fmu(
         load=_single("load", given["load"]),
         parameters={k: v[0] for k, v in given["parameter"].items() if k != parameter},
         settling_steps=settling_steps,
-        step_timeout=step_timeout or binding.limits.step_time or STEP_TIMEOUT,
+        step_timeout=binding.limits.step_time or STEP_TIMEOUT,
     )
 
 
@@ -346,7 +345,11 @@ def grid_of_scenario(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         The asset of the scenario cannot be prepared.
     """
-    scenario = resolve_scenario(_without_library(loaded), overrides or Overrides())
+    belief = loaded.scenario.belief
+    if isinstance(belief, LibraryBelief):  # which is to be sampled
+        plain = AssetBelief() if belief.design is None else DesignBelief(design=belief.design)
+        loaded = replace(loaded, scenario=loaded.scenario.model_copy(update={"belief": plain}))
+    scenario = resolve_scenario(loaded, overrides)
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
         raise MissionInputError(said("library.kind", scenario=scenario))
@@ -379,12 +382,3 @@ def grid_of_scenario(
         settling_steps=settling_steps,
         step_timeout=flown.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )
-
-
-def _without_library(loaded: LoadedScenario) -> LoadedScenario:
-    """Return the scenario as it is where its twin does not believe the library that is to be sampled."""
-    belief = loaded.scenario.belief
-    if not isinstance(belief, LibraryBelief):
-        return loaded
-    plain = AssetBelief() if belief.design is None else DesignBelief(design=belief.design)
-    return replace(loaded, scenario=loaded.scenario.model_copy(update={"belief": plain}))

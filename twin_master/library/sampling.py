@@ -23,7 +23,7 @@ from fmu_asset.door.session import FmiAsset
 from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.folders import lock_folder
 from reporting.json_file import parse_json
-from reporting.progress import Progress, Stage, reporter
+from reporting.progress import Stage, stage
 from reporting.provenance import hash_file
 from twin_master.assets.library_source import (
     FORMAT,
@@ -34,7 +34,7 @@ from twin_master.assets.library_source import (
 )
 from twin_master.errors import MissionInputError, check_names, said
 from twin_master.library.grid import Float, GridSampler, SamplingGrid
-from twin_master.network.memory import NUMBER, check_fits
+from twin_master.network.transition import NUMBER, check_fits
 
 PLAN_NAME, ROWS_NAME = "grid.json", "observations.npy"
 _COPIES = 3  # of what was sampled: the blocks, all of them, and the library
@@ -66,11 +66,6 @@ class SamplingOutcome:
     seconds: float
 
 
-def processor_count() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def blocks_folder(out: Path) -> Path:
     """Return where the finished blocks of a library that is being sampled are kept."""
     return out.with_name(f"{out.name}.blocks")
@@ -83,7 +78,6 @@ def sample_library(
     workers: int | None = None,
     resume: bool = False,
     replace_existing: bool = False,
-    progress: Progress | None = None,
 ) -> SamplingOutcome:
     """Ask an FMU for its observation at every point of a grid and write the library.
 
@@ -101,8 +95,6 @@ def sample_library(
         Go on with the finished blocks of an interrupted sampling of the same grid.
     replace_existing : bool
         Take the place of an existing library, and forget the blocks of an interrupted sampling.
-    progress : Progress, optional
-        Shows the blocks.
 
     Raises
     ------
@@ -116,7 +108,8 @@ def sample_library(
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    count = processor_count() if workers is None else workers
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = own if workers is None else workers
     if count < 1:
         raise MissionInputError(f"the number of workers must be at least 1, and {count} came.")
     binding = load_binding(grid.binding)
@@ -130,9 +123,9 @@ def sample_library(
         rows = _kept_rows(folder, (grid.size, sensors))
         todo = [(first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()]
         kept, begin = len(grid.blocks) - len(todo), time.perf_counter()
-        with reporter(progress).stage("Sampling the FMU", total=len(grid.blocks), unit="blocks") as stage:
-            stage.advance(kept)
-            _sample(grid, rows, todo, count, stage)
+        with stage("Sampling the FMU", total=len(grid.blocks), unit="blocks") as shown:
+            shown.advance(kept)
+            _sample(grid, rows, todo, count, shown)
         seconds = time.perf_counter() - begin
         library = ObservationLibrary(sampled_dataset(grid, binding, record, np.array(rows)))
         write_observation_library(out, library)
@@ -142,7 +135,7 @@ def sample_library(
     return SamplingOutcome(out, library, kept, len(grid.blocks), count, seconds)
 
 
-def _sample(grid: SamplingGrid, rows: Float, todo: list[tuple[int, int]], count: int, stage: Stage) -> None:
+def _sample(grid: SamplingGrid, rows: Float, todo: list[tuple[int, int]], count: int, shown: Stage) -> None:
     """Fill the rows of blocks, each thread by an FMU of its own; what is finished stays, whatever comes."""
     samplers, blocks = list[GridSampler](), iter(todo)
 
@@ -151,7 +144,7 @@ def _sample(grid: SamplingGrid, rows: Float, todo: list[tuple[int, int]], count:
             samplers.append(sampler)
             for first, last in blocks:
                 rows[first:last] = sampler.block(first, last)
-                stage.advance(1)
+                shown.advance(1)
 
     with ThreadPoolExecutor(count) as pool:
         try:

@@ -4,11 +4,13 @@ The file only grows. A line that was cut off by a kill ends without a line feed 
 that does not have its hash was changed. It is read line by line, however long it is.
 """
 
+import base64
 import io
 import json
 import math
 import os
 import time
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from hashlib import sha256
@@ -27,6 +29,16 @@ JOURNAL_NAME = "journal.jsonl"
 _DIGEST = 64
 _PIECE = 1_000_000
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
+
+
+def state_text(state: bytes) -> str:
+    """Return the state of an asset or a twin as lines hold it."""
+    return base64.b64encode(zlib.compress(state, 1)).decode("ascii")
+
+
+def state_of(text: Any) -> bytes:
+    """Return a state from its text; raises `TypeError`, `ValueError` or `zlib.error`."""
+    return zlib.decompress(base64.b64decode(text))
 
 
 def array_of(values: Any) -> Float:

@@ -3,7 +3,6 @@
 The journal of a run or a watch is read back: what was told, the twin as it was, turns to be stored.
 """
 
-import base64
 import math
 import time
 import zlib
@@ -30,6 +29,8 @@ from twin_master.mission.journal import (
     damaged,
     reading_of,
     records_backwards,
+    state_of,
+    state_text,
     turn_record,
 )
 from twin_master.mission.preparation import Knowledge
@@ -207,7 +208,7 @@ def replay(
                 kept, state = int(record["settled"]["turn"]), record["settled"]["state"]
                 # Only one before what is wanted, and before all models that are adopted behind it.
                 if all(kept < other for other in wanted):
-                    settled = kept, zlib.decompress(base64.b64decode(state))
+                    settled = kept, state_of(state)
             if turn < stands:
                 decided.setdefault(turn, record["next_control"])
             if "model" in record:
@@ -385,7 +386,7 @@ def taken_up(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> Histor
     history, _ = replay(journal.path, [BelievedModel(0, knowledge)], None)
     if history.turns:
         try:
-            plant.restore(history, zlib.decompress(base64.b64decode(state)))
+            plant.restore(history, state_of(state))
         except (TypeError, ValueError, zlib.error) as error:
             raise damaged(journal.path, begin, f"it has another layout, {error}") from error
     return history
@@ -401,7 +402,7 @@ def kept_in(journal: JournalFile, plant: Plant) -> Callable[[Turn], None]:
     def keep(turn: Turn) -> None:
         nonlocal since
         since += 1
-        state: str | None = base64.b64encode(zlib.compress(plant.save_state(), 1)).decode("ascii")
+        state: str | None = state_text(plant.save_state())
         if journal.size + len(state or "") > STATE_ALLOWANCE and len(state or "") > STATE_SHARE * since:
             state = None
         journal.append(turn_record(turn) | {"asset_state": state})

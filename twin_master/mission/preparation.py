@@ -20,16 +20,15 @@ from reporting.progress import Progress, SilentProgress
 from reporting.words import brief
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import RunFolderError, said
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
-from twin_master.learning.words import Words
 from twin_master.mission.planning import discounts, expected_plan
 from twin_master.mission.turns import Plant, Truth
 from twin_master.network.belief_planning import DecisionProblem
-from twin_master.network.estimator import Estimator, ExactFilter
+from twin_master.network.estimator import Estimator, ExactFilter, Words
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
@@ -329,8 +328,7 @@ def prepare_twin(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         With one clear sentence.
     """
-    loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
-    resolved = resolve_scenario(loaded, given_overrides(overrides))
+    resolved = resolve_scenario(load_scenario(scenario), overrides)
     return prepared_alone(resolved, asset_source(resolved), progress)
 
 

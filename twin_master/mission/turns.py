@@ -420,24 +420,20 @@ class Plant:
         control = self._scenario.control[control_index]
         if self._truth.in_asset:
             reading = self._asset.step(control.values, {})
-            state = self._told(reading)
+            if reading.state is None:
+                raise MissionInputError(said("mission.no_damage", step=self.step))
+            state = np.array([reading.state[name] for name in self._scenario.state_names])
         else:
             state = self._truth.state(self.step, self._state, previous_control_index)
             health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
             reading = self._asset.step(control.values, health)
         values = checked_values(self._scenario, reading, self.step, control.name)
-        sensed = self._truth.sense(self.step, values) if reading.inner is None else reading.inner.sensed
+        sensed = self._truth.sense(self.step, values) if reading.sensed is None else reading.sensed
         inspected = self._truth.inspected(self.step, state, control_index)
         self._state, self.step = state, self.step + 1
         monitors = {name: float(value) for name, value in reading.monitors.items()}
         happened = Happened(state, values, monitors)
         return Reading(np.concatenate((sensed, inspected)), control_index, happened=happened)
-
-    def _told(self, reading: AssetReading) -> Float:
-        """Return the true state that an asset with damage of its own tells."""
-        if reading.inner is None:
-            raise MissionInputError(said("mission.no_damage", step=self.step))
-        return np.array([reading.inner.state[name] for name in self._scenario.state_names])
 
     def save_state(self) -> bytes:
         """Return the state of the asset as bytes."""

@@ -1,4 +1,4 @@
-"""What holds the belief of a twin: one protocol, and the exact filter of the graphical model.
+"""What holds the belief of a twin, and its notices: one protocol, the exact filter of the graphical model.
 
 An estimator has no state of its own. What it carries from turn to turn are arrays that it hands out with each
 estimate and is given back for the next: a twin that keeps them can smooth over them, go back and take in what
@@ -16,6 +16,7 @@ from reporting.arrays import Float
 from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import filter_sequence, smooth
+from twin_master.scenario.schema import Scenario
 
 
 class SensorModel(Protocol):
@@ -255,3 +256,53 @@ class ExactFilter:
         size = self.model.states.size
         rows = np.array([turn.arrays["log_filtered"] for turn in carried]).reshape(-1, size)
         return smooth(self.model, [turn.control_index for turn in carried], rows)
+
+
+@dataclass(frozen=True)
+class Words:
+    """How sentences speak of turns and sensors.
+
+    Attributes
+    ----------
+    step, sensor : str
+        What one is called.
+    factor : float
+        From the values of the sensors, SI, to what is printed.
+    units : tuple of str
+        Printed unit of each sensor; none where they are empty or "1".
+    names : tuple of str
+        What each sensor is called beside its number, if anything.
+    command : str
+        What looks for the cause of an alarm; empty where nothing can.
+    """
+
+    step: str = "turn"
+    sensor: str = "gauge"
+    factor: float = 1.0
+    units: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    command: str = "uav-twin discrepancy run --from-run DIR"
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> "Words":
+        """Return how sentences speak of the turns and sensors of a scenario."""
+        observation = scenario.observation
+        more: dict[str, Any] = {"names": observation.titles} | (
+            {} if scenario.searchable else {"command": ""}
+        )
+        if observation.role == "strain" and set(observation.sensor_units) == {"1"}:
+            return cls(scenario.mission.step_name, "gauge", 1e6, ("microstrain",) * observation.count, **more)
+        sensor = "gauge" if observation.role == "strain" else "sensor"
+        return cls(scenario.mission.step_name, sensor, 1.0, observation.sensor_units, **more)
+
+    def value(self, sensor: int, *values: float) -> list[str]:
+        """Return values of a sensor as they are printed."""
+        unit = self.units[sensor] if self.units else "1"
+        return [f"{self.factor * value:.4g}{'' if unit == '1' else f' {unit}'}" for value in values]
+
+    def sensors(self, numbers: Sequence[int]) -> str:
+        """Return sensors, counted from 0, in words."""
+        names = [f"{g + 1} ({self.names[g]})" if self.names else str(g + 1) for g in numbers]
+        if len(names) == 1:
+            return f"{self.sensor} {names[0]}"
+        return f"{self.sensor}s {', '.join(names[:-1])} and {names[-1]}"

@@ -283,8 +283,3 @@ def leaving_table(table: Float, factor: float) -> Float:
     if np.any(stay < 0.0):
         raise InvalidModelError(said("network.leaving", factor=factor, leaving=1.0 - float(stay.min())))
     return np.asarray(result + np.diag(stay), dtype=np.float64)
-
-
-def deterministic_policy(control_index: ArrayLike, control_count: int) -> Float:
-    """Return the policy (S, U) that gives each state the control of its index (S,)."""
-    return np.asarray(np.eye(control_count)[np.asarray(control_index)])

@@ -29,26 +29,24 @@ class IdentifiedSensorModel(GaussianSensorModel):
     The average over the draws is that of eq. (30), "outside". Parameters are those of `GaussianSensorModel`.
     """
 
-    def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
-        """Return log p(o | D, u) for each state (S,), of a row with or without its covariance.
+    def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
+        """Return rows with or without their covariances, of which nothing passes beside the sensors."""
+        rows = np.asarray(observation, dtype=np.float64)
+        return rows, np.zeros((*rows.shape[:-1], self.state_count))
+
+    def _densities(self, observations: ArrayLike, control_index: ArrayLike, draws: int) -> Float:
+        """Return log densities (T, S, E) of each draw, or of their average where `draws` is one.
 
         Raises
         ------
         InvalidObservationError
-            The length is another one, a value is infinite, or the covariance is none.
+            The length of a row is another one, a value is infinite, or the covariance is none.
         """
-        return np.asarray(self.log_likelihood_sequence(np.asarray(observation)[None], [control_index])[0])
-
-    def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
-        """Return log p(o_t | D_t, u_t) for a sequence of such rows: (T, S)."""
-        each = self.log_density_of_draws(observations, control_index)
-        return np.asarray(logsumexp(each, axis=2, b=self.draw_weight))
-
-    def log_density_of_draws(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
-        """Return log p(o_t | D_t, u_t, e) of such rows for each draw e: (T, S, E)."""
         rows = zip(np.asarray(observations), np.asarray(control_index), strict=True)
         shape = self.state_count, self.draw_count
-        return np.array([self._of_draws(row, control) for row, control in rows]).reshape(-1, *shape)
+        each = np.array([self._of_draws(row, control) for row, control in rows]).reshape(-1, *shape)
+        average = draws == 1
+        return np.asarray(logsumexp(each, axis=2, b=self.draw_weight, keepdims=True)) if average else each
 
     def _of_draws(self, observation: Float, control_index: int) -> Float:
         row, count = np.array(observation, dtype=np.float64), self.sensor_count

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError, said
-from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.kernels import sweep
 from twin_master.network.transition import TransitionModel, expect_shape
 
@@ -73,10 +73,8 @@ class PlannedPolicy:
         Expected discounted reward from each state.
     action_value : (S, U)
         The same, if the given control is taken first.
-    control_index : (S,)
-        The control to take in each state.
     policy : (S, U)
-        The same as a row-stochastic matrix p(U | D).
+        Row-stochastic, p(U | D).
     iterations : int
         Sweeps until convergence.
     on_belief : BeliefPolicy or None
@@ -85,10 +83,14 @@ class PlannedPolicy:
 
     value: Float
     action_value: Float
-    control_index: Index
     policy: Float
     iterations: int
     on_belief: BeliefPolicy | None = None
+
+    @cached_property
+    def control_index(self) -> Index:
+        """The control to take in each state (S,): the mode of the policy, the first of equals."""
+        return np.asarray(np.argmax(self.policy, axis=1), dtype=np.int64)
 
 
 def decision(
@@ -232,9 +234,8 @@ def value_iteration(
         transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
     value, action_value, sweeps, error = _swept(transition, reward, discount, None, tolerance, max_iterations)
     best = action_value.max(axis=1, keepdims=True)
-    control_index = np.argmax(action_value >= best - 2.0 * error, axis=1).astype(np.int64)
-    policy = deterministic_policy(control_index, action_value.shape[1])
-    return PlannedPolicy(value, action_value, control_index, policy, sweeps)
+    control_index = np.argmax(action_value >= best - 2.0 * error, axis=1)
+    return PlannedPolicy(value, action_value, np.eye(action_value.shape[1])[control_index], sweeps)
 
 
 def given_policy(
@@ -247,7 +248,7 @@ def given_policy(
     transition, reward, discount
         As `value_iteration`.
     policy : (S, U)
-        p(U | D), row-stochastic; `control_index` is its mode, the first of equals.
+        p(U | D), row-stochastic.
     """
     value, action_value, sweeps, _ = _swept(transition, reward, discount, policy)
-    return PlannedPolicy(value, action_value, np.argmax(policy, axis=1).astype(np.int64), policy, sweeps)
+    return PlannedPolicy(value, action_value, policy, sweeps)

@@ -2,10 +2,11 @@
 
 A table of S states has S² entries, the tables of its factors together a few hundred. What is small is kept as
 one table, whose loops are the shortest; what is not, as the tables of the factors, each applied along its own
-axis. Distributions, stochastic matrices and the shapes of arrays are checked where they come in.
+axis. Distributions, stochastic matrices, the shapes of arrays, and whether they fit in memory, are checked
+where they come in.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from math import prod
@@ -14,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
+from reporting.memory import memory_left
 from twin_master.errors import InvalidModelError, TwinMasterError, said
 from twin_master.network.kernels import Lists
-from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""
@@ -97,8 +98,39 @@ def expect_controls(index: int | Index, count: int) -> None:
         raise InvalidModelError(f"expected control indices between 0 and {count - 1}, got {low} to {high}")
 
 
+NUMBER = 8
+"""Bytes of a number."""
+TRANSITION_COPIES = 3
+"""The tables of the controls, the array of all of them, and the checked copy."""
 JOINT_NON_ZEROS = 512
 """Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
+
+
+def check_fits(parts: Mapping[str, float], advice: str) -> None:
+    """Check that arrays fit in memory together.
+
+    Parameters
+    ----------
+    parts : dict of str to float
+        What is to be built, in words with its numbers, and its size [bytes].
+    advice : str
+        What makes it smaller.
+
+    Raises
+    ------
+    InvalidModelError
+        They do not; the sentence has all sizes.
+    """
+    needed, there = sum(parts.values()), memory_left()
+    if needed > there:
+        listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
+        sizes = [f"{size / 1e9:.3g} GB" for size in (needed, there)]
+        raise InvalidModelError(said("network.memory", listed=listed, sizes=sizes, advice=advice))
+
+
+def transition_bytes(states: int, controls: int) -> float:
+    """Return the size of one table of transitions (U, S, S) [bytes]."""
+    return float(NUMBER * controls * states * states)
 
 
 def predecessor_lists(blocks: Sequence[Float]) -> Lists:

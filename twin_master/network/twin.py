@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -28,6 +29,7 @@ from twin_master.network.inference import Predicted, predict
 from twin_master.network.planner import BeliefPolicy, decision
 from twin_master.network.transition import expect_controls
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import probability_of
 
 _LARGEST = np.float64(1e150)
 """What is carried is below this, so that what follows from it are numbers, too."""
@@ -45,11 +47,9 @@ def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[st
             given = scenario.transition.tables[control]
             tables[control] = {name: np.asarray(given[name], np.float64) for name in scenario.state_names}
         else:
-            entry = scenario.transition.probability[control]
+            probability = partial(probability_of, scenario.transition.probability, control)
             tables[control] = {
-                factor.name: worsening_table(
-                    len(factor.levels), entry[factor.name] if isinstance(entry, dict) else entry
-                )
+                factor.name: worsening_table(len(factor.levels), probability(factor.name))
                 for factor in scenario.state
             }
     if leaving != 1.0:

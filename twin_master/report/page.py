@@ -276,9 +276,12 @@ def render_page(run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, R
     blind = np.flatnonzero(lost.all(axis=1))
     whole, own = ([one for one in run.learnt if one.of_sensors == each] for each in (False, True))
     given = run.scenario.transition.probability
+    truth, parameter, another = tailored.true_value(run), run.scenario.calibration.parameter, None
+    if truth is not None and not any(learnt.name == parameter for learnt in run.learnt):
+        another = another_truth(parameter, truth, *tailored.believed(run))
     asset, model, kept = run.summary.get("asset"), run.summary.get("twin_model"), run.calibration
     told |= {
-        "figures": figures, "opening": opening_sentences(run), "another": _another_truth(run),
+        "figures": figures, "opening": opening_sentences(run), "another": another,
         "referred": any(figure["reference"] is not None for figure in run.summary.get("figures", ())),
         "share": 100.0 * lost.mean(), "ranges": lost_ranges(run),
         "blind": turn_ranges(run.first_step + blind, run.step) if len(blind) else "",
@@ -302,13 +305,6 @@ def _calibrated(kept: Mapping[str, Any]) -> list[Any]:
     return [
         kept[group][name] for group, own in zip(("state", "quantities"), names, strict=True) for name in own
     ]
-
-
-def _another_truth(run: Run) -> str | None:
-    truth, parameter = tailored.true_value(run), run.scenario.calibration.parameter
-    if truth is None or any(learnt.name == parameter for learnt in run.learnt):
-        return None
-    return another_truth(parameter, truth, *tailored.believed(run))
 
 
 def _monitors(run: Run) -> list[Sequence[str]]:

@@ -162,8 +162,9 @@ def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
             clim=(0.0, 100.0),
         )  # fmt: skip
         axes.add_collection(patches)
-        places = _gauge_places(folder, len(residual))
-        if places is not None:
+        copies = (folder / name for name in (MODEL_COPY, FLOWN_COPY))
+        places = gauge_places(next((copy for copy in copies if copy.is_file()), None))
+        if places is not None and len(places) == len(residual):
             nearest = np.argmin(np.linalg.norm(mesh.points[:, None] - places, axis=2), axis=0)
             places = (places + scale * displacement[nearest]) @ view
             _draw_gauges(figure, axes, places, residual, "gauges: standard deviations", **_RESIDUALS)
@@ -174,11 +175,10 @@ def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
     return StructurePicture(figure, largest, scale)
 
 
-def _gauge_places(folder: Path, count: int) -> Float | None:
+def gauge_places(file: Path | None) -> Float | None:
     """Return where the gauges of a structure are (G, 3) [m]; None where its file does not say it."""
-    copy = next((folder / name for name in (MODEL_COPY, FLOWN_COPY) if (folder / name).is_file()), None)
-    structure = None if copy is None else load_structure(copy)
-    if not isinstance(structure, MeshDesign) or len(structure.gauge) != count:
+    structure = None if file is None else load_structure(file)
+    if not isinstance(structure, MeshDesign):
         return None
     return structure.unit * np.array([gauge.point for gauge in structure.gauge])
 

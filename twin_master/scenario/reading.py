@@ -89,8 +89,8 @@ def find_scenario(name: str) -> Path:
     raise ScenarioError(said("scenario.unknown", name=name, shipped=", ".join(shipped)))
 
 
-def load_scenario(name_or_path: str | Path) -> LoadedScenario:
-    """Read and check a scenario by its shipped name or its path.
+def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
+    """Read and check a scenario by its shipped name or its path; one that was read stays as it is.
 
     Where the file says nothing of `notice` the twin gives notices, if it can. `config.json` of a run says
     what was flown: nothing is added to that.
@@ -101,7 +101,9 @@ def load_scenario(name_or_path: str | Path) -> LoadedScenario:
         There is no such scenario, or the file cannot be read, is not TOML, or breaks the schema; the sentence
         names file and key.
     """
-    path = find_scenario(str(name_or_path))
+    if isinstance(given, LoadedScenario):
+        return given
+    path = find_scenario(str(given))
     table = read_toml(path, ScenarioError, what="scenario")
     content_hash = hashlib.sha256(path.read_bytes()).hexdigest()
     scenario, remark = parse_scenario(table, str(path)), ""

@@ -73,6 +73,12 @@ class Transition(Section):
                 yield worst > ROW_SUM_TOLERANCE, said("scenario.table_sum", **told, worst=worst)
 
 
+def probability_of(table: Mapping[str, float | Mapping[str, float]], control: str, state: str) -> float:
+    """Return the probability of a factor of the state to worsen under a control."""
+    entry = table[control]
+    return entry[state] if isinstance(entry, Mapping) else entry
+
+
 class Span(Section):
     """Steps of a mission, the last one included."""
 

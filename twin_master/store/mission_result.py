@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Truth
 from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import probability_of
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 """What is kept of each posterior; the last two bound the central 90 % interval."""
@@ -131,16 +133,9 @@ def _true_factor(scenario: Scenario) -> Float | None:
     """Return the one factor between the true and the assumed probabilities to worsen; None without one."""
     if not scenario.truth.probability:
         return np.asarray(1.0)
-    true, assumed = (
-        np.array(
-            [
-                entry[state] if isinstance(entry := table[control], dict) else entry
-                for control in scenario.control_names
-                for state in scenario.state_names
-            ]
-        )
-        for table in (scenario.truth.probability, scenario.transition.probability)
-    )
+    names = [*product(scenario.control_names, scenario.state_names)]
+    tables = scenario.truth.probability, scenario.transition.probability
+    true, assumed = (np.array([probability_of(table, *name) for name in names]) for table in tables)
     factor = true.sum() / max(assumed.sum(), np.finfo(float).tiny)
     return np.asarray(factor) if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0) else None
 

@@ -1,12 +1,10 @@
 """From messages to readings: turns in order, gaps predicted through, late ones in their place."""
 
-import base64
 import json
 import math
 import signal
 import threading
 import time
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -19,10 +17,9 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, written
 from twin_master.errors import TwinMasterError, said
-from twin_master.learning.words import Words
-from twin_master.mission.journal import turn_record
+from twin_master.mission.journal import state_text, turn_record
 from twin_master.mission.turns import Reading, Turn
-from twin_master.network.estimator import Notice
+from twin_master.network.estimator import Notice, Words
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.message import Fed, Message, Place, Refused
@@ -178,8 +175,7 @@ class Intake:
         if turn.reading.revises is not None:
             record["control_in_force"] = concluded.control_index
         elif (concluded.turn + 1) % SNAPSHOT_TURNS == 0 and (settled := twin.settled()):
-            state = base64.b64encode(zlib.compress(settled[1], 1)).decode("ascii")
-            record["settled"] = {"turn": settled[0], "state": state}
+            record["settled"] = {"turn": settled[0], "state": state_text(settled[1])}
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         if told := [n.as_record() for n in self.notices if (n.kind, n.sensors) not in known]:
             record["notices"] = record.get("notices", []) + told

@@ -246,7 +246,7 @@ def watch(
     TwinMasterError, FiniteElementError, CalibrationError
         With one clear sentence; what was observed is kept.
     """
-    loaded = scenario if isinstance(scenario, LoadedScenario | None) else load_scenario(scenario)
+    loaded = None if scenario is None else load_scenario(scenario)
     given, progress = given_overrides(overrides), progress or SilentProgress()
     patch = None if model_patch is None or from_turn is None else (Path(model_patch), from_turn)
     if (model_patch, from_turn) != (None, None) and (patch is None or not resume):

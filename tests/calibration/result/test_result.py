@@ -129,35 +129,29 @@ def test_a_flipped_bit_never_passes(tmp_path, make_calibration):
 
 
 def test_other_files_are_told(tmp_path, make_calibration):
-    path = tmp_path / "c.nc"
-    content = result_bytes(make_calibration())
-    with xr.open_datatree(
-        save_calibration(make_calibration(), tmp_path / "whole.nc"), engine="h5netcdf"
-    ) as tree:
+    path = save_calibration(make_calibration(), tmp_path / "c.nc")
+    whole = path.read_bytes()
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
         tree.load()
     tree.attrs["design"] = str(tree.attrs["design"]).replace("1.83", "1.84")
-    foreign = xr.Dataset({"x": ("t", [1.0])})
-    older = xr.Dataset(attrs={"schema": "uav-twin wing calibration 0"})
-    for write, words in (
-        (lambda: None, "is not there; give the calibration"),
-        (lambda: path.write_text("load,displacement\n", encoding="utf-8"), "cannot be read as NetCDF"),
-        (
-            lambda: foreign.to_netcdf(path, engine="h5netcdf"),
-            "no calibration file, but 'uav-twin calibration 2'",
-        ),
-        (lambda: older.to_netcdf(path, engine="h5netcdf"), "of the schema 'uav-twin wing calibration 0'"),
-        (
-            lambda: path.write_bytes(bytes(tree.to_netcdf(engine="h5netcdf"))),
-            "content does not match its hash",
-        ),
-        (lambda: path.write_bytes(content[: int(0.999 * len(content))]), r"c\.nc .*calibrate again\.$"),
-        (lambda: path.write_bytes(content[: len(content) // 3]), r"c\.nc .*calibrate again\.$"),
+    foreign, older = (
+        xr.Dataset({"x": ("t", [1.0])}),
+        xr.Dataset(attrs={"schema": "uav-twin wing calibration 0"}),
+    )
+    for content, words in (
+        (b"load,displacement\n", "cannot be read as NetCDF"),
+        (foreign.to_netcdf(engine="h5netcdf"), "no calibration file, but 'uav-twin calibration 2'"),
+        (older.to_netcdf(engine="h5netcdf"), "of the schema 'uav-twin wing calibration 0'"),
+        (tree.to_netcdf(engine="h5netcdf"), "content does not match its hash"),
+        (whole[: int(0.999 * len(whole))], r"c\.nc .*calibrate again\.$"),
+        (whole[: len(whole) // 3], r"c\.nc .*calibrate again\.$"),
     ):
-        write()
+        path.write_bytes(bytes(content))
         with pytest.raises(CalibrationRecordError, match=words):
             load_calibration(path)
-    with pytest.raises(CalibrationRecordError, match="is no file"):
-        load_calibration(tmp_path)
+    for place, words in ((tmp_path, "is no file"), (tmp_path / "d.nc", "is not there; give the calibration")):
+        with pytest.raises(CalibrationRecordError, match=words):
+            load_calibration(place)
 
 
 @pytest.mark.parametrize(

@@ -6,22 +6,18 @@ import numpy as np
 import pytest
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from evidence.identification.targets import FITTED_LEVELS, LEVELS, fitted_states, read_targets
+from evidence.identification.targets import LEVELS, fitted_states, read_targets
 from twin_master.errors import MissionInputError
 
 RESULTS = Path("calibration") / "step3" / "massoptimizationresults.csv"
 LIBRARY = Path("library") / "UAVconfig.json"
 
 
-def test_fitted_are_40_and_80_percent_of_one_region_alone():
-    fitted = {(LEVELS[i], LEVELS[j]) for i, j in np.argwhere(fitted_states())}
-    assert fitted == {(level, 0.0) for level in FITTED_LEVELS} | {(0.0, level) for level in FITTED_LEVELS}
-    assert FITTED_LEVELS == (0.4, 0.8)
-
-
 def test_a_folder_with_both_repositories_is_read(published_folder):
     found = read_targets(published_folder)
     assert found.strain.shape == (5, 5, 24)
+    fitted = {(LEVELS[i], LEVELS[j]) for i, j in np.argwhere(fitted_states())}
+    assert fitted == {(0.4, 0.0), (0.8, 0.0), (0.0, 0.4), (0.0, 0.8)}
     assert found.fitted_row.tolist() == [number % 2 == 0 for number in range(12)]
     assert found.frequency_slope == pytest.approx([0.41, 0.32], abs=1e-6)
     assert found.all_mass_slope == pytest.approx([-0.5, -0.3], abs=1e-6)
@@ -46,7 +42,8 @@ def test_slopes_come_from_the_fitted_rows_alone(published_folder):
     assert after.all_frequency_slope.tolist() != before.all_frequency_slope.tolist()
 
 
-def test_the_published_folders(published):
+def test_the_published_folders(published_library):
+    published = read_targets(published_library.parents[1])
     assert published.strain[0, 0].argmax() == 16
     assert published.strain[:, 0, 16] * 1e6 == pytest.approx([3010, 3274, 3617, 4088, 4788], abs=1.0)
     assert published.all_frequency_at_one == pytest.approx([5.632, 28.544], rel=1e-4)

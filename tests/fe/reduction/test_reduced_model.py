@@ -17,7 +17,7 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 
 from benchmarks.study_regions import bracket, plate, tube
-from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
+from fe.reduction.fields import write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import reduced_structure
 from fe.reduction.reduced_basis import measured_errors, reduce_structure
 from fe.reduction.settings import StructureSettings
@@ -329,32 +329,26 @@ def test_what_cannot_be_reduced_is_refused(changes, cells, sentence, write_beam,
 STATE = {"young_modulus_factor": 0.95, "stiffness_loss": (0.3, 0.6), "load_factor": 3.0, "tip_force": 5.0}
 
 
-@pytest.fixture(scope="module")
-def written(coarse_fields: WingFields, coarse_operators, tmp_path_factory) -> meshio.Mesh:
-    """What two files of the same state hold, which are the same bytes, and are read as the wing's mesh."""
-    first, again = (tmp_path_factory.mktemp("vtu") / "wing.vtu" for _ in range(2))
+def test_displacement_strain_and_damage_are_those_of_the_full_one(coarse_fields, coarse_operators, tmp_path):
+    """Files of the same state are the same bytes, and are read as the wing's mesh."""
+    first, again = (tmp_path / folder / "wing.vtu" for folder in "ab")
     for path in (first, again):
+        path.parent.mkdir()
         write_wing_vtu(path, coarse_fields, coarse_fields.vector(**STATE))
         assert list(path.parent.iterdir()) == [path]
     assert first.read_bytes() == again.read_bytes()
-    mesh, wanted = read_mesh(first, 1.0, "m"), coarse_operators.wing_mesh
-    assert mesh.kind is wanted.kind
-    np.testing.assert_allclose(mesh.nodes, wanted.nodes, atol=1e-12)
-    return meshio.read(first)
-
-
-def test_displacement_strain_and_damage_are_those_of_the_full_model(written, coarse_operators):
-    full = solve_static(coarse_operators, *STATE.values())
-    wanted = coarse_operators.full_displacement(full.displacement)
-    found = written.point_data["displacement"]
-    np.testing.assert_allclose(found, wanted, atol=1e-3 * np.abs(wanted).max())
-    assert found[:, 2].max() == pytest.approx(full.output[0], rel=0.1)
-    mesh = coarse_operators.wing_mesh
-    local = np.full((1, 3), 0.5)
-    strain, data = (
-        mesh.strains(wanted, local=local)[:, 0],
-        {name: own for name, (own,) in written.cell_data.items()},
+    found, mesh = read_mesh(first, 1.0, "m"), coarse_operators.wing_mesh
+    assert found.kind is mesh.kind
+    np.testing.assert_allclose(found.nodes, mesh.nodes, atol=1e-12)
+    written, full = meshio.read(first), solve_static(coarse_operators, *STATE.values())
+    wanted, moved = (
+        coarse_operators.full_displacement(full.displacement),
+        written.point_data["displacement"],
     )
+    np.testing.assert_allclose(moved, wanted, atol=1e-3 * np.abs(wanted).max())
+    assert moved[:, 2].max() == pytest.approx(full.output[0], rel=0.1)
+    strain = mesh.strains(wanted, local=np.full((1, 3), 0.5))[:, 0]
+    data = {name: own for name, (own,) in written.cell_data.items()}
     np.testing.assert_allclose(data["strain"], strain, atol=1e-2 * np.abs(strain).max())
     np.testing.assert_array_equal(data["spanwise_strain"], -data["strain"][:, 1])
     np.testing.assert_array_equal(data["region"], mesh.region)

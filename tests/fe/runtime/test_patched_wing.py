@@ -122,10 +122,10 @@ def warm(both: Compared, coefficient: float, e: float = STATE[0], loss: Any = ST
 @pytest.mark.parametrize(
     ("change", "given"),
     [
-        *((sprung, (share,)) for share in (0.02, 0.3)),
-        *((softer, given) for given in ((5, 6, 0.5), (2, 5, 0.3), (7, 10, 0.6))),
+        (sprung, (0.3,)),
+        *((softer, given) for given in ((5, 6, 0.5), (7, 10, 0.6))),
         *((moved, given) for given in ((0.75, 0.05), (0.4, 0.2))),
-        *((warm, given) for given in ((2e-3,), (0.0, *SOUND), (0.0, 0.95, (0.6, 0.3)))),
+        *((warm, given) for given in ((2e-3,), (0.0, 0.95, (0.6, 0.3)))),
     ],
 )
 def test_a_change_of_the_structure_is_that_of_the_full_model(both, change, given):
@@ -149,7 +149,7 @@ def finer(both: Compared) -> AffineOperators:
     return assemble(both.design.changed(mesh={"span_size": 0.01}))
 
 
-@pytest.mark.parametrize(("start", "end", "loss"), [(0.2, 0.45, 0.4), (0.75, 1.15, 0.3), (0.5, 0.6, 0.5)])
+@pytest.mark.parametrize(("start", "end", "loss"), [(0.2, 0.45, 0.4), (0.5, 0.6, 0.5)])
 def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, start, end, loss):
     lines = finer.wing_mesh.span_lines
     start, end = (float(lines[np.abs(lines - place).argmin()]) for place in (start, end))

@@ -1,6 +1,5 @@
-"""Small meshes made by hand, in the node order of mesh files, and structures on them."""
+"""Structures on small meshes made by hand."""
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,42 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fe.elements.kinds import KINDS, meshio_with_wedges
-
-FloatArray = NDArray[np.float64]
-Divisions = tuple[int, int, int]
-_CORNERS = np.array(
-    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=float
-)
-_PARTS = {  # of a cube, into cells by their number of corners
-    8: [[0, 1, 2, 3, 4, 5, 6, 7]],
-    6: [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]],
-    4: [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
-}
-
-
-@pytest.fixture(scope="session")
-def box() -> Callable[[str, Divisions], tuple[FloatArray, NDArray[np.int64]]]:
-    """A maker of meshes of the unit cube: points (nn, 3) and cells (nc, k) of a kind of meshio's."""
-
-    def make(kind: str, divisions: Divisions) -> tuple[FloatArray, NDArray[np.int64]]:
-        element = KINDS[kind]
-        cubes = [np.array(place) + _CORNERS for place in itertools.product(*map(range, divisions))]
-        corners = np.array([cube[part] for cube in cubes for part in _PARTS[len(element.corners)]])
-        middles = [0.5 * (corners[:, a] + corners[:, b]) for a, b in element.edges]
-        nodes = np.concatenate([corners, *(middle[:, None] for middle in middles)], axis=1)
-        doubled = np.rint(2.0 * nodes).astype(np.int64).reshape(-1, 3)
-        points, cells = np.unique(doubled, axis=0, return_inverse=True)
-        return points / (2.0 * np.array(divisions)), cells.reshape(nodes.shape[:2])
-
-    return make
+from fe.elements.kinds import meshio_with_wedges
 
 
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[..., Path]:
     """A writer of a structure file and its mesh; returns the structure file."""
 
-    def make(points: FloatArray, kind: str, cells: Any, text: str, **sets: Any) -> Path:
+    def make(points: NDArray[np.float64], kind: str, cells: Any, text: str, **sets: Any) -> Path:
         meshio = meshio_with_wedges()
         meshio.write(tmp_path / "mesh.vtu", meshio.Mesh(points, [(kind, cells)], **sets))
         file = tmp_path / "structure.toml"

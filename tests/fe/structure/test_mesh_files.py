@@ -21,6 +21,7 @@ from fe.structure.mesh_file import read_by_meshio, read_mesh
 from reporting.json_file import parse_json
 from reporting.table_file import TableErrors, parse_table
 from reporting.toml_file import parse_toml
+from tests.meshes import box
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
@@ -64,7 +65,7 @@ def refuses(path: Path, sentence: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("file_format", ["vtu", "gmsh", "gmsh22", "abaqus", "nastran", "med"])
-def test_formats_agree(kind, file_format, box, tmp_path):
+def test_formats_agree(kind, file_format, tmp_path):
     """MED counts the nodes of a cell as seen in a mirror; its families are of several groups."""
     points, cells = box(kind, (2, 1, 1))
     ending = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp", "nastran": "bdf"}.get(file_format, file_format)
@@ -90,7 +91,7 @@ def test_formats_agree(kind, file_format, box, tmp_path):
         np.testing.assert_allclose(found.nodes, 1e-3 * points[cells], atol=1e-12)
 
 
-def test_physical_groups_of_gmsh_are_sets(box, tmp_path):
+def test_physical_groups_of_gmsh_are_sets(tmp_path):
     """An element of two groups, which version 2 writes again for each, counts once."""
     points, cells = box("tetra10", (2, 1, 1))
     faces = [[cell[n] for n in face] for cell in cells.tolist() for face in KINDS["tetra10"].face_nodes]
@@ -115,7 +116,7 @@ def test_physical_groups_of_gmsh_are_sets(box, tmp_path):
     refuses(tmp_path / "m.vtu", r"m\.vtu: 2 elements, such as 13, have the nodes of another")
 
 
-def test_arrays_of_a_vtu_that_are_sets(box, tmp_path):
+def test_arrays_of_a_vtu_that_are_sets(tmp_path):
     """As meshio writes sets, and as a mask of zeros and ones; the values keep their names."""
     points, cells = box("hexahedron", (2, 1, 1))
     root = np.flatnonzero(points[:, 0] == 0.0)
@@ -138,7 +139,7 @@ def test_arrays_of_a_vtu_that_are_sets(box, tmp_path):
     assert sets["part"].tolist() == sets["set"].tolist() == [1, 2, 3]
 
 
-def test_other_files_that_cannot_be_read_are_refused(box, tmp_path, capsys):
+def test_other_files_that_cannot_be_read_are_refused(tmp_path, capsys):
     refuses(tmp_path / "none.msh", "is not there")
     refuses(tmp_path, "is a folder; `mesh` must name it as seen")
     for name, content, words in INPUTS.refused("files"):
@@ -215,7 +216,7 @@ def test_decks_that_include_others(tmp_path):
 
 @pytest.mark.parametrize("kind", ["R", "C", "S"])
 @pytest.mark.parametrize("form", [1, 2])
-def test_grid_points_of_any_coordinate_system(kind, form, box, tmp_path):
+def test_grid_points_of_any_coordinate_system(kind, form, tmp_path):
     """The system stands on another one that is shifted and turned; its grid points come before it."""
     points, cells = box("hexahedron20", (2, 1, 1))
     axes = TURN.as_matrix().T
@@ -258,7 +259,7 @@ def test_real_numbers_and_lines_of_nastran(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["R", "C"])
-def test_nodes_of_abaqus_in_a_system_of_their_own(kind, box, tmp_path):
+def test_nodes_of_abaqus_in_a_system_of_their_own(kind, tmp_path):
     points, cells = box("tetra10", (1, 1, 1))
     axes = TURN.as_matrix().T
     system = np.concatenate((ORIGIN, ORIGIN + 2.0 * axes[0], ORIGIN + axes[1] + axes[0])).tolist()

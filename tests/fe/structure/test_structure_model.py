@@ -18,6 +18,7 @@ from fe.structure.mesh_file import memory_estimate, read_mesh
 from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
 from fe.verification.calculix_comparison import agreement, structure_deck
 from tests.calculix_decks import needs_calculix
+from tests.meshes import box
 from tests.refusals import Inputs, refused
 
 PRODUCTS = {  # of coordinates that a kind of element holds, by their powers
@@ -27,9 +28,7 @@ PRODUCTS = {  # of coordinates that a kind of element holds, by their powers
 
 
 @pytest.fixture(params=sorted(KINDS))
-def distorted(
-    request: pytest.FixtureRequest, box: Callable[..., Any], write: Callable[..., Path]
-) -> StructureMesh:
+def distorted(request: pytest.FixtureRequest, write: Callable[..., Path]) -> StructureMesh:
     """A box whose inner nodes are moved; edges stay straight."""
     points, cells = box(request.param, (2, 2, 2))
     kind = KINDS[request.param]
@@ -75,7 +74,7 @@ def test_faces_enclose_the_volume(distorted):
     assert face_areas(distorted, distorted.boundary)[1].sum() == pytest.approx(2 * (2.0 + 0.5 + 1.0))
 
 
-def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted, box):
+def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted):
     points, cells = box(distorted.kind.file_type, (1, 1, 1))
     mass = assembly.CellMesh(distorted.kind, points, cells).mass(np.arange(len(cells)), 1.0)
     power = np.array(PRODUCTS[distorted.kind.file_type])
@@ -134,7 +133,7 @@ def bent(name: str, kind: str, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def made(box, write) -> Callable[..., Structure]:
+def made(write) -> Callable[..., Structure]:
     """A maker of a structure on a mesh, with texts exchanged in its file; its sets are masks of nodes."""
 
     def make(
@@ -350,7 +349,7 @@ def test_a_fault_is_one_sentence(name, old, new, sentence, made):
         made(name, (old, new))
 
 
-def test_parts_that_turn_on_a_hinge_cannot_be_solved(box, write):
+def test_parts_that_turn_on_a_hinge_cannot_be_solved(write):
     """Two cubes share one edge only: no check of sets sees it, the factorisation does."""
     points, (cube,) = box("hexahedron", (1, 1, 1))
     places = np.concatenate((points[cube], points[cube] + (1.0, 1.0, 0.0)))

@@ -359,13 +359,13 @@ def test_strains_at_3g_are_those_of_the_library(shipped_operators, published_lib
         assert ours[state].max() == pytest.approx(theirs[state].max(), rel=0.011)
 
 
-@pytest.mark.parametrize(("yaw_spring", "place"), [(1.5e3, [1, 2]), (1e9, None)])
-def test_bending_is_found_wherever_the_lag_mode_lies(coarse_design, coarse_operators, yaw_spring, place):
-    other = assemble(coarse_design.changed(root={"yaw_spring": yaw_spring}))
-    modes, plain = (eigenmodes(wing, *STATE) for wing in (other, coarse_operators))
-    assert place in (None, modes.flapwise_bending.tolist())
-    wanted = plain.frequency[plain.flapwise_bending]
-    assert modes.frequency[modes.flapwise_bending] == pytest.approx(wanted, rel=2e-3)
+def test_bending_is_found_wherever_the_lag_mode_lies(coarse_design, coarse_operators):
+    plain = eigenmodes(coarse_operators, *STATE)
+    for yaw_spring, places in ((1.5e3, ([1, 2],)), (1e9, ([0, 1], [0, 2]))):
+        modes = eigenmodes(assemble(coarse_design.changed(root={"yaw_spring": yaw_spring})), *STATE)
+        assert modes.flapwise_bending.tolist() in places
+        wanted = plain.frequency[plain.flapwise_bending]
+        assert modes.frequency[modes.flapwise_bending] == pytest.approx(wanted, rel=2e-3)
 
 
 def test_the_wing_has_the_published_stiffness_and_frequencies(shipped_operators):

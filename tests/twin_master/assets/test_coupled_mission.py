@@ -99,18 +99,15 @@ def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder, tmp_path):
         resume(tmp_path / "run")
 
 
-def test_a_system_of_one_fmu_flies_as_the_fmu_alone(folder, direct, tmp_path):
-    """In a worker and in this process."""
-    assert rows(direct["coupled_fouling"]) == rows(direct["fouling"])
-    loaded = load_scenario(folder / "coupled_fouling.toml")
-    inside = new_run(loaded, tmp_path / "run", Overrides(in_process=True)).folder
-    assert rows(inside) == rows(direct["fouling"])
-
-
 @BOTH
-def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
-    """The FMU cannot save its state: its inputs are replayed. What is flown lies in the run folder."""
+def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
+    """Also of a system of that FMU. It cannot save its state: its inputs are replayed.
+
+    What is flown lies in the run folder.
+    """
     loaded = load_scenario(folder / f"{name}.toml")
+    inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
+    assert rows(inside) == rows(direct[name]) == rows(direct["fouling"])
     check_resumed(direct[name], loaded, tmp_path / "part", 11)
     ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
     flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from tests.twin_master.runs import changed_scenario
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.rivals import at_first, one_turn_later
-from twin_master.learning.words import Words
 from twin_master.mission.journal import line_of, turn_record
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import Reading, Turn
+from twin_master.network.estimator import Words
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.twin import TwinTurn
 from twin_master.scenario.tables import Learning, Noticing
@@ -31,7 +32,6 @@ from uav_twin import (
     GraphicalModel,
     Twin,
     WatchfulEstimator,
-    load_scenario,
     prepare_twin,
 )
 
@@ -300,11 +300,7 @@ def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
 
 
 def at_levels(name: str, between: bool) -> Knowledge:
-    loaded = load_scenario(name)
-    observation = loaded.scenario.observation.model_copy(update={"between_levels": between})
-    return prepare_twin(
-        replace(loaded, scenario=loaded.scenario.model_copy(update={"observation": observation}))
-    )
+    return prepare_twin(changed_scenario(name, {"observation": {"between_levels": between}}))
 
 
 @pytest.fixture(scope="module")

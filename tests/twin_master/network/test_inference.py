@@ -9,7 +9,6 @@ from tests.twin_master.network.decision_oracles import (
     random_model,
 )
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.inference import filter_many, predict, smooth
 from twin_master.network.twin import build_graphical_model
 from uav_twin import filter_sequence, load_scenario
@@ -91,7 +90,7 @@ def test_an_impossible_observation_names_its_step():
     np.testing.assert_array_equal(failed, [-1, 3, 3])
 
 
-POLICY = deterministic_policy([0] * 25, 2)
+POLICY = np.eye(2)[[0] * 25]
 ZEROS = np.zeros((3, 25))
 AT_1_7 = np.arange(75).reshape(3, 25) == 32
 REFUSED = [

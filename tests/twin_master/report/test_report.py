@@ -167,8 +167,8 @@ def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(run
 def test_captions_tell_the_decision_and_what_it_rests_on(run, folder, library_file, tmp_path):
     asked = run["filtered/decision_probability"][18, 1]
     sentence = "At the end of turn 18 the twin decided on 3g for the next one: the policy asks for it with "
-    captions = {figure.name: figure.caption for figure in report.report_figures(folder, 18)}
-    assert f"{sentence}probability {asked:.2f} in the state as just observed." in captions["mission_now"]
+    caption = next(report.report_figures(folder, 18)).caption
+    assert f"{sentence}probability {asked:.2f} in the state as just observed." in caption
     on_belief = BeliefPolicy(run["policy/action_value"].T, np.arange(2))  # in the place of the scenario's
     flown(library_file, tmp_path / "run", on_belief)
     told = next(report.report_figures(tmp_path / "run", 18)).caption

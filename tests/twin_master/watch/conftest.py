@@ -1,14 +1,15 @@
 """A wing and its watches, made once."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from reporting.progress import SilentProgress
+from tests.twin_master.runs import flight_of
 from tests.twin_master.watch.watches import begun, decided, watchful, write_csv
-from twin_master.mission.loop import fly
 from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.feeds import CsvFeed
@@ -19,14 +20,10 @@ from twin_master.watch.opening import begun_watch
 @pytest.fixture(scope="session")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
     """`paper_level_turns` of a real wing: without what flies and what really happens."""
-    kept, skipping = [], False
-    for line in load_scenario("paper_level_turns").path.read_text(encoding="utf-8").splitlines():
-        if line.startswith("["):
-            skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
-        if not skipping:
-            kept.append(line)
+    text = load_scenario("paper_level_turns").path.read_text(encoding="utf-8")
+    tables = re.compile(r"^\[+(asset|truth|reference)\b.*?(?=^\[|\Z)", re.MULTILINE | re.DOTALL)
     path = tmp_path_factory.mktemp("scenario") / "my_wing.toml"
-    path.write_text("\n".join(kept) + "\n\n[watch]\nlag = 12\n", encoding="utf-8")
+    path.write_text(f"{tables.sub('', text)}\n[watch]\nlag = 12\n", encoding="utf-8")
     return load_scenario(path)
 
 
@@ -34,8 +31,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
 def mission(base: Watch) -> History:
     """The paper's mission, flown by the model that the watch believes."""
     knowledge = replace(base.models[0].knowledge, scenario=load_scenario("paper_level_turns").scenario)
-    plant = knowledge.plant(knowledge.truth(knowledge.scenario.mission.seed), base._source.open())
-    return fly(knowledge.scenario, knowledge.twin(), plant)
+    return flight_of(knowledge, base._source, seed=knowledge.scenario.mission.seed)
 
 
 @pytest.fixture(scope="session")

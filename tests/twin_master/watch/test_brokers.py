@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,13 +15,13 @@ from reporting.progress import SilentProgress
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, wait_until
+from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, broker_of
+from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.mqtt import MqttFeed
+from twin_master.watch.mqtt import MqttFeed, Topic
 from twin_master.watch.opening import flown
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -125,6 +126,26 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
 
+def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watch, plain):
+    ran(watch, CsvFeed(plain, watch.scenario), 3)
+    published, sent = watch.folder / "published", list[Told]()
+    published.write_text("0" * 20)
+
+    def send(_topic: str, decision: Told, _by: Topic) -> int:
+        sent.append(decision)
+        return len(sent)
+
+    topic = Topic(SimpleNamespace(behind={}, room=True, send=send), TOPIC, watch.scenario, str)
+    topic.begun(watch)
+    topic.publish()
+    topic.answered(1, None)
+    first, *_ = records(watch.folder / JOURNAL_NAME)
+    assert int(published.read_text()) == first[2]
+    topic.go_back()  # as where the broker is lost
+    topic.publish()
+    assert [decision["turn"] for decision in sent] == [0, 1, 2, 1, 2]
+
+
 def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     scenario, base, watch, broker, tmp_path, monkeypatch
 ):
@@ -148,7 +169,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     (watch.folder / "published").write_text("0" * 20)
     watched(watch, 4)  # nothing more is wanted, and what was not published is
     wait_until(lambda: len([one for one in heard if "control" in one]) >= 4)
-    assert {one["turn"] for one in heard if "control" in one} == {0, 1, 2, 3}
+    assert {one["turn"] for one in heard if one.get("told_again")} == {0, 1, 2, 3}
     feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 4))
     with pytest.raises(ZeroDivisionError), closing(feed):
         watch.run(feed, lambda decision: decision["turn"] // 0)

@@ -116,7 +116,6 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
         noticing.run(CsvFeed(recorded, noticing.scenario), str, patched=(folder / "patch.json", 21))
     given = (folder / "patch.json", 15)
     counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, turns=25, patched=given)
-    assert noticing.last_decision()["turn"] == 24
     noticing.store(counts, report=False)
     run = open_run(noticing.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
@@ -158,12 +157,14 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         assert sum("searched for the cause" in text for text in notices) == 2
 
 
-def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence(noticing, recorded):
+def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence_and_is_no_decision(noticing, recorded):
     notice = {"kind": "verdict", "sentence": "It is so.", "sensors": []}
     with noticing.begun(CsvFeed(recorded, noticing.scenario)):
         noticing.write(verdict={"tried": False, "to_turn": 0, "notice": notice})
         noticing.is_quiet = True
         kinds = [[told["kind"] for told in next(noticing.decisions())["notices"]] for _ in range(2)]
+        noticing.write(verdict={"tried": False, "to_turn": 1, "notice": notice})
+        assert noticing.last_decision()["turn"] == 1
     assert kinds == [["verdict", "heard"], []]
 
 

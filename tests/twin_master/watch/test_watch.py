@@ -67,9 +67,7 @@ def told(whole: Path) -> list[dict[str, Any]]:
     return decisions
 
 
-def test_a_recorded_mission_is_watched_as_it_was_flown_and_read_up_to_a_turn(
-    base, mission, whole, told, tmp_path
-):
+def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, told, tmp_path):
     run = uav_twin.open_run(whole)
     for group, name, found in (
         ("observed", "strain", mission.observed),
