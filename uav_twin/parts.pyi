@@ -103,7 +103,7 @@ from fmu_asset.archive.declared import describe_fmu as describe_fmu
 from fmu_asset.archive.fmu_file import inspect_fmu as inspect_fmu
 from fmu_asset.archive.fmu_file import read_fmu as read_fmu
 from fmu_asset.check import check_fmu as check_fmu
-from fmu_asset.coupling.system import CoupledAsset as CoupledAsset
+from fmu_asset.coupling.asset import CoupledAsset as CoupledAsset
 from fmu_asset.coupling.system import system_description as system_description
 from fmu_asset.door.binding import Binding as Binding
 from fmu_asset.door.binding import load_binding as load_binding

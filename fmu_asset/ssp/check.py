@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import SystemStructure
-from fmu_asset.coupling.system import CoupledAsset, system_description
+from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring, loop_sentence
 from fmu_asset.door.experiment import whole_binding
 from fmu_asset.door.units import IDENTITY, between

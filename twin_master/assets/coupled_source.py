@@ -158,7 +158,7 @@ class SeveralSource(FmuSource):
         self, binding: Binding, parameters: Mapping[str, float], wiring: "Wiring | None" = None
     ) -> "Session":
         """Join the system as it is flown, or another one."""
-        from fmu_asset.coupling.system import CoupledAsset
+        from fmu_asset.coupling.asset import CoupledAsset
 
         keys = ("algorithm", "iterations", "tolerance", "isolated", "step_timeout")
         said = {key: getattr(self.section, key) for key in keys}

@@ -39,7 +39,7 @@ from twin_master.scenario.section import AssetSection, Flag, Name
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:
-    from fmu_asset.coupling.system import CoupledAsset
+    from fmu_asset.coupling.asset import CoupledAsset
 
 
 Session = Union[FmiAsset, "CoupledAsset"]

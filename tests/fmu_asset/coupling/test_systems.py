@@ -13,9 +13,9 @@ from scipy.linalg import expm
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from fmu_asset import errors
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
 from fmu_asset.coupling.structure import expand_connection as expand
-from fmu_asset.coupling.system import CoupledAsset
 from fmu_asset.coupling.wiring import Link, Wiring, algebraic_loops, schedule, strong_components
 from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
 from tests.fmu_asset.door.kinds import BINDINGS

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmu_asset.coupling.system import CoupledAsset
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.door.layout import Observation
 from fmu_asset.door.life import SavedState
 from fmu_asset.door.session import FmiAsset

@@ -12,8 +12,8 @@ import pytest
 
 from fmu_asset import errors
 from fmu_asset.check import check_fmu
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
-from fmu_asset.coupling.system import CoupledAsset
 from fmu_asset.door import session
 from fmu_asset.door.session import FmiAsset
 from tests.fmu_asset.door.kinds import BINDINGS, BINDINGS_FOLDER, HOSTILE, INPUTS, KINDS

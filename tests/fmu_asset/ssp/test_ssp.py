@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmu_asset.archive.declared import UnitInfo
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
@@ -25,7 +26,6 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
     expand_connection,
 )
-from fmu_asset.coupling.system import CoupledAsset
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import CouplingError, SspError

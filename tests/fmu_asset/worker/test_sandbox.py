@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from fmu_asset import errors
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
-from fmu_asset.coupling.system import CoupledAsset
 from fmu_asset.door import placement
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.folders import remove_folder
