@@ -53,12 +53,12 @@ def run(
     )
     told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report}
     if seeds is not None:
-        chosen = _alone(scenario, resume is not None or seed is not None or view or policy is not None)
-        fleet, engine = (
-            parts.ensemble(chosen, parts.seed_range(seeds), overrides),
-            engine_of(workers, cluster),
+        if scenario is None or resume is not None or seed is not None or view or policy is not None:
+            raise typer.BadParameter(said("fleet.seeds"), param_hint="--seeds")
+        fleet = parts.ensemble(scenario, parts.seed_range(seeds), overrides)
+        fly_and_show(
+            fleet, out, engine_of(workers, cluster), replace=replace, report=not no_report, json=json
         )
-        fly_and_show(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
     if workers is not None or cluster is not None:
         given = "--workers" if cluster is None else "--cluster"
@@ -79,13 +79,6 @@ def run(
             terminal.print_json(_record(outcome))
         else:
             show_outcome(outcome)
-
-
-def _alone(scenario: str | None, beside: bool) -> str:
-    """Return the scenario of an ensemble; refuse what is for one mission."""
-    if scenario is None or beside:
-        raise typer.BadParameter(said("fleet.seeds"), param_hint="--seeds")
-    return scenario
 
 
 def _flown(scenario: str | None, with_scenario: str | None) -> tuple[str | None, Path | None]:

@@ -51,9 +51,8 @@ def _knowledge(
     scenario: str, seed: int | None, calibration: Path | None, candidates: str | None = None
 ) -> "tuple[parts.Knowledge, tuple[parts.Float | None, list[parts.Float]]]":
     """Return what the twin knows before any plan on the belief, and where its gauges are, see `_places`."""
-    resolved = parts.resolve_scenario(
-        parts.load_scenario(scenario), parts.Overrides(seed=seed, calibration=calibration)
-    )
+    given = {"seed": seed, "calibration": calibration}
+    resolved = parts.resolve_scenario(parts.load_scenario(scenario), given)
     parts.believed_source(resolved).check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:

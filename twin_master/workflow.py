@@ -211,9 +211,14 @@ def _known(
 ) -> Knowledge:
     """Return what the twin knows before its flight, and keep it."""
     knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
-    _tell_of_another_truth(knowledge, progress)
-    record, origin = knowledge.draws.record or {}, source.origin
-    told = calibrated_with(record, origin.asset, origin.model, config["inputs"])
+    draws, origin = knowledge.draws, source.origin
+    truth = scenario.asset.true_parameters.get(draws.name)
+    # The true asset of the scenario may not be the one that the calibration file describes.
+    if scenario.calibration.source == "file" and truth is not None:
+        sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
+        if sentence is not None:
+            progress.note(said("mission.truth", sentence=sentence, name=draws.name))
+    told = calibrated_with(draws.record or {}, origin.asset, origin.model, config["inputs"])
     if told is not None:
         progress.note(told)
     keep_knowledge(folder, knowledge)
@@ -223,17 +228,6 @@ def _known(
         compiling.turn(np.full(scenario.observation.count, np.nan), 0)
     compiling.smoothed()
     return knowledge
-
-
-def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
-    """Say so where the true asset of the scenario is not the one that the calibration file describes."""
-    draws, scenario = knowledge.draws, knowledge.scenario
-    truth = scenario.asset.true_parameters.get(draws.name)
-    if scenario.calibration.source != "file" or truth is None:
-        return
-    sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
-    if sentence is not None:
-        progress.note(said("mission.truth", sentence=sentence, name=draws.name))
 
 
 @contextmanager
@@ -309,7 +303,9 @@ def _report(folder: Path) -> None:
     write_report(folder)
 
 
-def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -> dict[str, Any]:
+def check_scenario(
+    loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Return what a scenario is with the overrides, once everything that it names was looked at.
 
     Beside what it flies and believes, in words, these are the sizes of the twin: `levels` of each factor,

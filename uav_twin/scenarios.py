@@ -26,10 +26,8 @@ def list_scenarios() -> None:
 
 def check(file: str, *, calibration: Path | None = None, json: bool = False) -> None:
     """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
-    loaded = parts.load_scenario(file)
-    answer(
-        "scenario check", parts.check_scenario(loaded, parts.Overrides(calibration=calibration)), json=json
-    )
+    record = parts.check_scenario(parts.load_scenario(file), {"calibration": calibration})
+    answer("scenario check", record, json=json)
 
 
 def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:

@@ -30,42 +30,33 @@ DRIVEN_RIVALS = ("coulomb_friction", "quadratic_damping", "load_cell")
 RIVALS = ("coulomb_friction", "structural_damping", "quadratic_damping", "clock_error")
 
 
-def write_rig(text, folder, campaign_folder):
-    """Write what a page gives into a folder and run its script; return the folder."""
-    (folder / campaign_folder).mkdir()
-    (script,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    campaign, model = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+def write_rig(page, folder, campaign):
+    """Write what a page gives into a folder and run its script; return its text."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    script, *cells = re.findall(r"```(?:{code-cell} )?python\n(.*?)```", text, re.DOTALL)
+    written = [cell.removeprefix("%%writefile ").split("\n", 1) for cell in cells if cell.startswith("%%w")]
+    if not cells:  # no notebook, whose script makes the folder
+        (folder / campaign).mkdir()
+        names = f"{campaign}/campaign.toml", "model.toml"
+        written = zip(names, re.findall(r"```toml\n(.*?)```", text, re.DOTALL), strict=True)
     (folder / "make_tables.py").write_text(script, encoding="utf-8")
-    (folder / campaign_folder / "campaign.toml").write_text(campaign, encoding="utf-8")
-    (folder / "model.toml").write_text(model, encoding="utf-8")
     subprocess.run([sys.executable, "make_tables.py"], cwd=folder, check=True)
-    return folder
-
-
-def write_notebook_rig(text, folder):
-    """Make the tables of the notebook and write its files into a folder, which is returned."""
-    tables, *cells = re.findall(r"```{code-cell} python\n(.*?)```", text, re.DOTALL)
-    (folder / "make_tables.py").write_text(tables, encoding="utf-8")
-    subprocess.run([sys.executable, "make_tables.py"], cwd=folder, check=True)
-    for cell in cells:
-        first, _, rest = cell.partition("\n")
-        if first.startswith("%%writefile "):
-            (folder / first.split()[1]).write_text(rest, encoding="utf-8")
-    return folder
+    for name, content in written:
+        (folder / name).write_text(content, encoding="utf-8")
+    return text
 
 
 def test_with_the_port_friction_is_named_in_the_size_that_was_hidden(tmp_path):
     """What the notebook gives, its tables made."""
-    text = (DOCS / "tutorials" / "name_an_effect.md").read_text(encoding="utf-8")
-    found = named(write_notebook_rig(text, tmp_path), "my_rig", *RIVALS)
+    write_rig("tutorials/name_an_effect.md", tmp_path, "my_rig")
+    found = named(tmp_path, "my_rig", *RIVALS)
     # The corner of the script's friction is rounded off, that of the law is not.
     assert found == ("coulomb_friction", "slide", pytest.approx(0.16, rel=3e-3))
 
 
 def test_friction_of_the_cart_is_named_in_the_size_shown_and_not_the_offset(tmp_path):
     """Its tables begin as they are shown side by side, and jitter."""
-    text = (DOCS / "cart_in_ten_minutes.md").read_text(encoding="utf-8")
-    folder = write_rig(text, tmp_path, "my_cart")
+    folder, text = tmp_path, write_rig("cart_in_ten_minutes.md", tmp_path, "my_cart")
     shown = re.search(r"my_cart/rest.csv +my_cart/ride_1.csv\n(.*?)```", text, re.DOTALL)
     columns = zip(*(line.split() for line in shown.group(1).splitlines()), strict=True)
     for name, lines in zip(("rest", "ride_1"), columns, strict=True):

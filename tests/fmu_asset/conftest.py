@@ -79,25 +79,3 @@ def binding() -> Binding:
 @pytest.fixture(scope="session")
 def spring_binding() -> Binding:
     return load_binding(Path(__file__).parent / "door" / "bindings" / "spring_mass.toml")
-
-
-OUTPUTS = '<Outputs><Unknown index="3"{}/><Unknown index="4"{}/>'
-
-
-def _linear(name: str, *dependencies: str) -> Any:
-    """Return a fixture of `linear2` that declares on which of its inputs, 1 and 2, its outputs depend."""
-
-    def made(foreign_fmu: Any) -> Path:
-        told = OUTPUTS.format(*(f' dependencies="{inputs}"' for inputs in dependencies))
-        return foreign_fmu.changed("linear2", name, (OUTPUTS.format("", ""), told))
-
-    return pytest.fixture(scope="session")(made)
-
-
-state_fmu, crossed_fmu = _linear("state", "", ""), _linear("crossed", "1", "2")
-
-
-@pytest.fixture(scope="session")
-def linear_fmu(foreign_fmu: Any) -> Path:
-    """The same, which does not say it: each output depends on all inputs."""
-    return foreign_fmu("linear2")

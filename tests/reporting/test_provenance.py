@@ -5,6 +5,7 @@ import math
 import pickle
 import socket
 from dataclasses import dataclass
+from http import HTTPStatus
 
 import numpy as np
 import pytest
@@ -71,6 +72,7 @@ def test_a_record_is_plain_data_of_json():
     own = {"inner": [], "words": ["x"], "values": None}
     expected = {"value": None, "inner": [{"value": 0.1} | own, {"value": 2} | own], "words": ["x"]}
     assert json.loads(json.dumps(plain(record), allow_nan=False)) == expected | {"values": [0.1, 2.0]}
+    assert plain({7: HTTPStatus.NOT_FOUND}) == {"7": 404}
 
 
 def test_the_least_recently_used_are_forgotten_where_there_is_no_room():

@@ -58,11 +58,11 @@ def json_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
 
 def mappings(scenario: Scenario, messages: Iterable[Mapping[str, Any]]) -> Feed:
     """Return the feed of messages of a program; arrays of numbers may stand where JSON has lists."""
-    return Feed(fed(scenario, (json.dumps(message, default=_plain).encode() for message in messages)))
 
+    def plain(value: Any) -> Any:
+        return np.asarray(value).tolist()
 
-def _plain(value: Any) -> Any:
-    return np.asarray(value).tolist()
+    return Feed(fed(scenario, (json.dumps(message, default=plain).encode() for message in messages)))
 
 
 def shown(line: bytes | Refused) -> str:

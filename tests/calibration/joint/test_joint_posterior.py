@@ -66,15 +66,13 @@ def line_table():
     return WingTable(LIMITS, coefficient, curve)
 
 
-@pytest.fixture(scope="module")
-def tables():
-    return line_table()
+TABLES = line_table()
 
 
-def test_enumeration_finds_mean_deviation_and_evidence(tables):
+def test_enumeration_finds_mean_deviation_and_evidence():
     # Damping priors far from zero, so that alpha and beta are Gaussians in closed form at each point.
     prior = wing_priors(VALIDITY, damping_alpha=(2.0, 0.3), damping_beta=(8e-4, 1e-4))
-    found = asked(tables, priors=prior, count=20_000)
+    found = asked(TABLES, priors=prior, count=20_000)
     axes = np.linspace(0.95, 1.07, 31), np.linspace(0.09, 0.24, 61), np.linspace(0.466, 0.478, 25)
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)  # e, servo, weighed total
     quantities = grid - np.array([0.0, 0.0, 2.0]) * grid[:, 1:2]
@@ -115,8 +113,8 @@ def test_enumeration_finds_mean_deviation_and_evidence(tables):
     np.testing.assert_allclose(found.std(axis=0), deviation, rtol=0.02)
 
 
-def test_the_same_seed_draws_the_same_bytes(tables):
-    one, two, other = (asked(tables, seed=seed, count=200) for seed in (3, 3, 4))
+def test_the_same_seed_draws_the_same_bytes():
+    one, two, other = (asked(TABLES, seed=seed, count=200) for seed in (3, 3, 4))
     assert one.tobytes() == two.tobytes()
     assert not np.array_equal(one, other)
     assert one.shape == (200, 5)
@@ -143,7 +141,7 @@ def test_every_measurement_gives_a_posterior_or_a_clear_refusal(first, ratio, ze
     values = np.array([first, first * ratio, zeta, 0.05])
     modal = modal_readings(values, values * [error, error, 0.2, 0.2])
     try:
-        found = asked(line_table(), modal, total_mass=weighed(total, 1e-3), count=100)
+        found = asked(TABLES, modal, total_mass=weighed(total, 1e-3), count=100)
     except CalibrationError as refusal:
         if "contradict" not in str(refusal) and "negative Rayleigh" not in str(refusal):
             raise
@@ -173,16 +171,16 @@ OVERDAMPED = modal_readings((5.6492, 29.9699, 0.01, 0.3), (0.06, 0.3, 1e-4, 1e-3
                 model_error=(0.0, 0.0)),
     ],
 )  # fmt: skip
-def test_refusals(tables, changed, kind, sentence):
+def test_refusals(changed, kind, sentence):
     with pytest.raises(kind, match=sentence):
-        asked(tables, **changed)
+        asked(TABLES, **changed)
 
 
-def test_readings_and_states_that_cannot_be(tables):
+def test_readings_and_states_that_cannot_be():
     with pytest.raises(ExperimentDataError, match=r"damping_ratio_1 .* without any uncertainty"):
         modes(damping_ratio_1=0.0)
     with pytest.raises(OutsideValidityError, match=r"mass of each servo is 0\.4 kg, .* 0\.05 to 0\.3 kg"):
-        tables.frequency([[1.0, 0.4, 0.1]])
+        TABLES.frequency([[1.0, 0.4, 0.1]])
 
 
 def test_any_model_is_inferred():

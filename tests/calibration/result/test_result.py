@@ -154,19 +154,14 @@ def test_other_files_are_told(tmp_path, make_calibration):
             load_calibration(place)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"asset": ""}, "1 to 80 printable"),
-        ({"asset": "a\nb"}, "1 to 80 printable"),
-        ({"asset": "x" * 81}, "1 to 80 printable"),
+def test_what_is_no_calibration(make_calibration):
+    for change, message in (
+        *(({"asset": name}, "1 to 80 printable") for name in ("", "a\nb", "x" * 81)),
         ({"samples": np.full((3, 11), np.nan)}, "finite ones"),
         ({"prior_samples": np.ones((0, 11))}, "finite ones"),
-    ],
-)
-def test_what_is_no_calibration(change, message, make_calibration):
-    with pytest.raises(CalibrationRecordError, match=message):
-        replace(make_calibration(), **change)
+    ):
+        with pytest.raises(CalibrationRecordError, match=message):
+            replace(make_calibration(), **change)
     for asked in ({"procedure": "Paper"}, {"seed": -1}, {"seed": 2**63}):
         with pytest.raises(CalibrationRecordError, match="'joint' or 'paper' and the seed"):
             calibrate(**asked)

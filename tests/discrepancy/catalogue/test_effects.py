@@ -310,7 +310,9 @@ def test_what_a_campaign_cannot_carry_is_not_offered(setting):
     free = {name: replace(channel, gain_deviation=np.inf) for name, channel in given.channels.items()}
     assert "gauge_gain" not in names_available(setting, channels=free)
     # a model that carries nothing still has sensors
-    bare = names_available(setting, model=OutputsOnly())
+    bare, closed = names_available(setting, model=OutputsOnly()), replace(setting, model=OutputsOnly())
+    assert "has no port where an internal force can act" in by_name("coulomb_friction").unavailable(closed)
+    assert "cannot carry the primitive 'point_mass'" in by_name("point_mass").unavailable(closed)
     assert {"gauge_gain", "gauge_zero_drift", "thermal_strain", "clock_error", "mains_hum"} <= bare
     assert bare.isdisjoint({"point_mass", "coulomb_friction", "cubic_stiffness", "load_place", "washout"})
 

@@ -324,16 +324,9 @@ W = Channel("w", Quantity.DISPLACEMENT, "x")
 def repeats(rows, used=None):
     """Return a static trial for each row of readings."""
     force, used = np.arange(float(rows.shape[1])), np.ones(rows.shape, dtype=bool) if used is None else used
+    common = ("w",), 0.0 * force
     return [
-        Trial.plain(
-            str(k),
-            TrialKind.STATIC,
-            ("w",),
-            0.0 * force,
-            force=force,
-            values=row[:, None],
-            used=mark[:, None],
-        )
+        Trial.plain(str(k), TrialKind.STATIC, *common, force=force, values=row[:, None], used=mark[:, None])
         for k, (row, mark) in enumerate(zip(rows, used, strict=True))
     ]
 

@@ -58,11 +58,9 @@ def choice_of(law, *priors):
 def campaign_of(*rows, force=FORCE, noise=NOISE, freedom=np.inf, output="y", **parameters):
     """Return static readings in metres under forces, one row of values for each trial."""
     channel = Channel("y", Quantity.DISPLACEMENT, output, NoiseRecord(noise, freedom))
+    usual = TrialKind.STATIC, ("y",), np.arange(len(force))
     trials = tuple(
-        Trial.plain(
-            f"t{k}", TrialKind.STATIC, ("y",), np.arange(len(force)), force=force, values=row[:, None]
-        )
-        for k, row in enumerate(rows)
+        Trial.plain(f"t{k}", *usual, force=force, values=row[:, None]) for k, row in enumerate(rows)
     )
     return Campaign("bench", {"y": channel}, trials, None, parameters, "0" * 64)
 

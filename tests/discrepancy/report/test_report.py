@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
+from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import TrialKind
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.judgement.conclusion import named_effects, probability_text
@@ -249,16 +250,6 @@ def test_numbers_formulas_and_lists_as_they_are_written():
     assert listing(["a", "b", "c"]) == "a, b and c"
 
 
-TANK = """
-format = 1
-name = "Tank"
-capacity = 2.0
-conductance_part = [{ name = "outlet", matrix = 0.1 }]
-output = [{ name = "level", vector = 1.0, quantity = "level" }]
-port = [{ name = "outlet", vector = 1.0 }]
-"""
-
-
 @given(st.floats(-1e6, 1e6), st.floats(1e-9, 1e3))
 def test_rounding_keeps_values_within_a_twentieth_of_their_spread(value, spread):
     text = rounded(value, spread).replace("\N{MINUS SIGN}", "-")
@@ -307,32 +298,26 @@ def test_gauges_lie_where_the_design_has_them():
 
 
 @pytest.mark.parametrize(
-    ("make", "primitive", "text"),
+    ("kind", "primitive", "text"),
     [
-        *(
-            (None, *row)
-            for row in (
-                (PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
-                (PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
-                (PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3 N at 0.01 m"),
-                (PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
-                (SensorGain("displacement", 0.02), ""),
-                (SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
-                (SensorDrift("leaf_strain", 0.002, 10.0), ""),
-                (PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N or N m"),
-            )
-        ),
-        (lambda: model_of(TANK), PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0),
-         "flow 0.500 m/s times capacity at 2 m"),
-        (lambda: model_of(TANK), Overflow("outlet", 0.5, 1.5, 3.0, 2.0),
-         "flow 0.500 m/s times capacity, level 3 m"),
-        (WingModel.of_design, PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
-        (WingModel.of_design, PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
+        ("rig", PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
+        ("rig", PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
+        ("rig", PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3 N at 0.01 m"),
+        ("rig", PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
+        ("rig", SensorGain("displacement", 0.02), ""),
+        ("rig", SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
+        ("rig", SensorDrift("leaf_strain", 0.002, 10.0), ""),
+        ("rig", PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N or N m"),
+        ("tank", PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0), "flow 0.500 m/s times capacity at 2 m"),
+        ("tank", Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3 m"),
+        ("wing", PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
+        ("wing", PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
     ],
-)  # fmt: skip
-def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, make, primitive, text):
+)
+def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, kind, primitive, text):
     patch = ModelPatch((primitive,))
-    model = make() if make else drag.model
+    others = {"tank": lambda: tank_setting().model, "wing": WingModel.of_design}
+    model = others.get(kind, lambda: drag.model)()
     found = si_sizes(patch, primitive_intervals(patch), model, drag.campaign)
     assert re.sub(r"(\d\.\d*?)0+(?= )", r"\1", found) == re.sub(r"(\d\.\d*?)0+(?= )", r"\1", text)
 

@@ -176,7 +176,7 @@ def jacobian(moving: Slave) -> np.ndarray:
     return np.array([moving.derivative([*RATES, *SEEN], {known: 1.0}) for known in [*STATES, *LOADS]]).T
 
 
-def test_fmpy_moves_all_kinds_alike(ours) -> None:
+def test_fmpy_moves_both_interfaces_alike(ours) -> None:
     """By CVODE as in co-simulation: loads jump and health grows on the way; compared where nothing jumps."""
     start = {"load_factor": 1.0, "initial_tip_displacement": 0.05, "damping.alpha": 1.0, "damping.beta": 1e-4}
     times, losses, factors = (0.0, 0.1, 0.1, 0.2, 0.2, 1.0), (0, 0, 0, 0, 0.4, 0.4), (1, 1, 2, 2, 2, 2)
@@ -184,7 +184,7 @@ def test_fmpy_moves_all_kinds_alike(ours) -> None:
     course = np.array([*zip(times, losses, factors, strict=True)], dtype=columns)
     given = {"stop_time": 0.4, "output_interval": 0.005, "output": SEEN, "input": course}
     moving = {"start_values": start | {"response": 2}, "step_size": 0.005}
-    compiled, python = (simulate_fmu(ours(kind), **given, **moving) for kind in ("compiled", "python"))
+    compiled = simulate_fmu(ours("compiled"), **given, **moving)
     exchanged = simulate_fmu(ours("exchange"), **given, start_values=start, relative_tolerance=1e-10)
     smooth = ~np.isin(np.round(compiled["time"], 6), [0.1, 0.2])
     assert np.ptp(compiled["tip_displacement"]) > 0.05
@@ -193,7 +193,6 @@ def test_fmpy_moves_all_kinds_alike(ours) -> None:
             np.interp(compiled["time"], exchanged["time"], exchanged[name]),
             np.abs(compiled[name]).max(),
         )
-        np.testing.assert_allclose(python[name], compiled[name], rtol=0, atol=1e-12 * largest)
         np.testing.assert_allclose(shown[smooth], compiled[name][smooth], rtol=0, atol=1e-6 * largest)
 
 

@@ -1,6 +1,6 @@
 """Systems of FMUs by name, and the recursion of linear ones, in matrices: what coupling must do."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +29,21 @@ def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
     return Component(name, fmu, settings, substeps)
 
 
-def coupled(name: str, fmu: Callable[[str], Path], substeps: int = 1) -> SystemStructure:
-    """Return a system, its FMUs by the names of fixtures."""
+OUTPUTS = '<Outputs><Unknown index="3"{}/><Unknown index="4"{}/>'
+
+
+def coupled(name: str, foreign_fmu: Any, substeps: int = 1) -> SystemStructure:
+    """Return a system of `linear2.c`, which is told on which of its inputs, 1 and 2, each output depends."""
     components = []
     for part, told in SYSTEMS[name]["parts"].items():
-        values = {"fmu": "linear_fmu", **told}
-        components.append(linear(part, fmu(values.pop("fmu")), substeps, **values))
+        inputs, fmu = told.get("inputs"), foreign_fmu("linear2")
+        if inputs:
+            outputs = OUTPUTS.format(*(f' dependencies="{numbers}"' for numbers in inputs))
+            fmu = foreign_fmu.changed(
+                "linear2", "_".join(("linear", *inputs)), (OUTPUTS.format("", ""), outputs)
+            )
+        values = {key: value for key, value in told.items() if key != "inputs"}
+        components.append(linear(part, fmu, substeps, **values))
     return system(components, SYSTEMS[name]["links"])
 
 

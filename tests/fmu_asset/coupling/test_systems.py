@@ -30,13 +30,13 @@ JACOBI = {"algorithm": "jacobi"}
 
 
 @pytest.mark.parametrize(("name", "order", "delayed", "options"), SYSTEMS["flights"])
-def test_a_system_does_what_its_recursion_says(request, name, order, delayed, options) -> None:
+def test_a_system_does_what_its_recursion_says(foreign_fmu, name, order, delayed, options) -> None:
     """In the order that follows from dependencies; settled, each has the others' values of the step's end.
 
     With inputs held, an exact component comes to the same place in one step and in four.
     """
     given, parts, pushes = dict(options), order.split(), [0.7, -1.0, 0.0, 2.0, 0.5]
-    structure = coupled(name, request.getfixturevalue, given.pop("substeps", 1)).delayed(delayed)
+    structure = coupled(name, foreign_fmu, given.pop("substeps", 1)).delayed(delayed)
     inputs = ["push"] if any(connector.kind == "input" for connector in structure.connectors) else []
     ends = [f"{part}.y{number}" for part in parts for number in (1, 2)]
     binding = watch(*ends, inputs=inputs, step_size=0.1)
@@ -53,8 +53,8 @@ def test_a_system_does_what_its_recursion_says(request, name, order, delayed, op
     )
 
 
-def test_an_algebraic_loop_is_reported(request) -> None:
-    loop = coupled("loop", request.getfixturevalue)
+def test_an_algebraic_loop_is_reported(foreign_fmu) -> None:
+    loop = coupled("loop", foreign_fmu)
     with pytest.raises(errors.AlgebraicLoopError) as caught:
         CoupledAsset(loop, watch("left.y1"))
     assert "left.y1 -> right.u1 -> right.y1 -> left.u1" in str(caught.value)
@@ -63,25 +63,25 @@ def test_an_algebraic_loop_is_reported(request) -> None:
     words = r"ends at left\.u2.*connections end at right\.u1, left\.u1"
     with pytest.raises(errors.CouplingError, match=words):
         loop.delayed(["left.u2"])
-    with CoupledAsset(coupled("circle", request.getfixturevalue), watch("left.y2"), isolated=False) as asset:
+    with CoupledAsset(coupled("circle", foreign_fmu), watch("left.y2"), isolated=False) as asset:
         assert asset.schedule.loops == ()
         assert [str(link.source) for link in asset.schedule.held] == ["right.y1"]
 
 
-def test_iterations_that_do_not_settle_or_cannot_be_made(request, spring_mass, linear_fmu) -> None:
+def test_iterations_that_do_not_settle_or_cannot_be_made(foreign_fmu, spring_mass) -> None:
     words = r"left, right did not settle in 8 iterations.*still changes by"
-    stiff = coupled("stiff", request.getfixturevalue)
+    stiff = coupled("stiff", foreign_fmu)
     asset = CoupledAsset(stiff, watch("left.y1"), iterations=8, isolated=False)
     with asset, pytest.raises(errors.IterationError, match=words):
         asset.step()
-    parts = [Component("spring", spring_mass), linear("law", linear_fmu, d=np.eye(2))]
+    parts = [Component("spring", spring_mass), linear("law", foreign_fmu("linear2"), d=np.eye(2))]
     joined = system(parts, [("spring.position", "law.u1"), ("law.y1", "spring.force")])
     with pytest.raises(errors.CouplingError, match="component 'spring' cannot save and restore its state"):
         CoupledAsset(joined, watch("law.y1"), iterations=3)
 
 
-def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(request) -> None:
-    structure, push = coupled("oscillator", request.getfixturevalue), {"push": ("push", "1", -1.0, 2.0)}
+def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(foreign_fmu) -> None:
+    structure, push = coupled("oscillator", foreign_fmu), {"push": ("push", "1", -1.0, 2.0)}
     ranged = bound(1.0, {"y": ("first.y1", "1")}, control=push)
     with CoupledAsset(structure, ranged, isolated=False) as asset:
         before = asset.step({"push": 2.0}).values
@@ -114,8 +114,8 @@ def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
         other.restore_state(state)
 
 
-def test_what_an_fmu_does_wrong_names_its_component(spring_mass, linear_fmu) -> None:
-    law = linear("law", linear_fmu, d=np.eye(2))
+def test_what_an_fmu_does_wrong_names_its_component(spring_mass, foreign_fmu) -> None:
+    law = linear("law", foreign_fmu("linear2"), d=np.eye(2))
     joined = system([Component("spring", spring_mass), law], [("spring.position", "law.u1")])
     binding = bound(0.1, {"y": ("law.y1", "1")}, load={"misbehaviour": ("spring.misbehaviour", "1")})
     for behaviour, kind, words in (

@@ -22,9 +22,7 @@ Bits = list[tuple[bytes, bytes, float]]
 
 
 @pytest.fixture
-def open_asset(
-    request: pytest.FixtureRequest, ours: OurFmus, foreign_fmu: Any, scratch: Path
-) -> Iterator[Open]:
+def open_asset(ours: OurFmus, foreign_fmu: Any, scratch: Path) -> Iterator[Open]:
     """Open an asset of a kind; of all of them nothing is left behind."""
 
     def opened(kind: Kind, **options: Any) -> FmiAsset:
@@ -33,9 +31,7 @@ def open_asset(
             return CoupledAsset(of_ours(ours), kind.binding, **given)
         if kind.file.startswith("oscillator"):
             algorithm = {"algorithm": "jacobi"} if kind.file.endswith("jacobi") else {}
-            return CoupledAsset(
-                coupled("oscillator", request.getfixturevalue), kind.binding, **algorithm, **given
-            )
+            return CoupledAsset(coupled("oscillator", foreign_fmu), kind.binding, **algorithm, **given)
         file = ours(kind.file) if kind.file in NAMES else foreign_fmu(kind.file)
         return FmiAsset(file, kind.binding, **given)
 

@@ -31,7 +31,7 @@ from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts, binding_files
 from tests.command_line import said
 from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python, tables
-from tests.fmu_asset.ours import REGIONS, STRUCTURES
+from tests.fmu_asset.ours import STRUCTURES
 
 REFUSED, DECLARED = tables(__file__), tables(__file__, "declared")
 BIN = Path(sys.executable).parent
@@ -174,28 +174,19 @@ def test_what_is_declared_of_variables(ours, name) -> None:
         assert told == {k: float(v) if isinstance(told[k], float) else v for k, v in seen.items()}
 
 
-def test_units_faces_and_regions_are_declared(ours) -> None:
+def test_the_compiled_one_declares_the_same_and_all_of_its_sources(ours) -> None:
     description, compiled = (read_model_description(str(ours(name))) for name in ("python", "compiled"))
     assert description.variableNamingConvention == "structured"
-    assert all(v.unit is not None for v in description.modelVariables if v.type == "Real")
     factors = {u.name: {d.name: float(d.factor) for d in u.displayUnits} for u in description.unitDefinitions}
     assert factors["1"]["microstrain"] == 1e6
-    # The compiled one declares the same, and of its sources all.
     told = "name", "valueReference", "type", "causality", "unit", "displayUnit", "min", "max", "start"
     facts = [[*map(attrgetter(*told), each.modelVariables)] for each in (description, compiled)]
     assert facts[0] == facts[1]
-    face = compiled.coSimulation
-    can = "canGetAndSetFMUstate", "canSerializeFMUstate", "canHandleVariableCommunicationStepSize"
-    assert all(getattr(each, name) for each in (description.coSimulation, face) for name in can)
-    assert not face.needsExecutionTool
-    assert not face.canBeInstantiatedOnlyOncePerProcess
+    for each in (description, compiled):
+        assert each.coSimulation.canHandleVariableCommunicationStepSize
+        assert not each.coSimulation.canBeInstantiatedOnlyOncePerProcess
     listed = set(compiled.buildConfigurations[0].sourceFileSets[0].sourceFiles)
     assert listed == {n.removeprefix("sources/") for n in members(ours("compiled")) if n.endswith(".c")}
-    for name in ("regions", "compiled_regions"):
-        declared = {item.name: item for item in read_fmu(ours(name)).variables}
-        health = [each for each in declared if each.startswith("health.")]
-        assert health == [f"health.{region}" for region in REGIONS]
-        assert declared["tip_force"].reference == 4
     text = members(ours("source3_beam"))[DESCRIPTION].decode()
     assert all(f'<Float64 name="{name}" ' in text for name in ("strain", "health"))
 

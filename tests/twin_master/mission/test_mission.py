@@ -32,23 +32,25 @@ def paper(library_file: Path) -> Known:
     return of_library("paper_level_turns", library_file, 1)
 
 
+def part(known: Known, folder: Path, config_hash: str = "abc", kind: type[Plant] = Plant) -> History:
+    """Fly a mission, or the rest of one."""
+    knowledge, source = known
+    plant = kind(knowledge.scenario, knowledge.truth(3), source.open())
+    with JournalFile(folder, config_hash) as file:
+        before = taken_up(file, knowledge, plant)
+        return fly(knowledge.scenario, before.twin, plant, kept_in(file, plant), history=before)
+
+
 @pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"])
 def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
-    knowledge, source = of_library(name, library_file)
-
-    def part() -> History:
-        plant = knowledge.plant(knowledge.truth(3), source.open())
-        with JournalFile(tmp_path, "abc") as file:
-            before = taken_up(file, knowledge, plant)
-            return fly(knowledge.scenario, before.twin, plant, kept_in(file, plant), history=before)
-
-    whole = part()
+    known = of_library(name, library_file)
+    whole = part(known, tmp_path)
     assert len(journal(tmp_path)) == 50
     content = (tmp_path / JOURNAL_NAME).read_bytes()
     for turns in (1, 17, 50):
         kept = content.splitlines(keepends=True)[: turns + 1]
         (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
-        rest = part()
+        rest = part(known, tmp_path)
         assert rest.resumed_at == turns
         assert (tmp_path / JOURNAL_NAME).read_bytes() == content
         assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
@@ -160,41 +162,29 @@ class Heavy(Plant):
         assert asset_state == self.save_state()
 
 
-@pytest.fixture(scope="module")
-def known(library_file: Path) -> Known:
-    return of_library("level_turns", library_file)
-
-
-def flown(known: Known, folder: Path, turns: int, config_hash: str = "abc") -> History:
-    """Fly a mission, or the rest of one, up to a turn."""
-    knowledge, source = known
-    plant = Heavy(knowledge.scenario, knowledge.truth(3), source.open())
-    with JournalFile(folder, config_hash) as file:
-        history = loop.taken_up(file, knowledge, plant)
-        history.resumed_at = history.twin.turns
-        keep = loop.kept_in(file, plant)
-        flight = loop.operate(history.twin, plant, keep, history.add)
-        while history.twin.turns < turns:
-            next(flight)
-    return history
+@pytest.fixture(scope="module", params=[4])
+def known(request: pytest.FixtureRequest, library_file: Path) -> Known:
+    """Of a mission of four turns, or of another number."""
+    mission = load_scenario("level_turns").scenario.mission.model_copy(update={"steps": request.param})
+    return of_library("level_turns", library_file, mission=mission)
 
 
 def test_a_line_cut_off_anywhere_is_flown_again(known, tmp_path):
-    flown(known, tmp_path, 4)
+    part(known, tmp_path)
     whole = (tmp_path / JOURNAL_NAME).read_bytes()
     ends = [n + 1 for n, byte in enumerate(whole) if byte == ord("\n")]
     for cut in [0, 1, ends[0] - 1, ends[0], ends[0] + 70, ends[1] - 1, ends[1], ends[3] + 1, ends[4] - 1]:
         (tmp_path / JOURNAL_NAME).write_bytes(whole[:cut])
-        assert flown(known, tmp_path, 4).resumed_at == sum(end <= cut for end in ends[1:])
+        assert part(known, tmp_path).resumed_at == sum(end <= cut for end in ends[1:])
         assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
 
 
 def test_a_changed_or_foreign_journal_is_refused(known, tmp_path):
-    flown(known, tmp_path, 3)
+    part(known, tmp_path)
     path = tmp_path / JOURNAL_NAME
     whole = path.read_bytes()
     with pytest.raises(NotResumableError, match="another configuration"):
-        flown(known, tmp_path, 3, "other")
+        part(known, tmp_path, "other")
     lines = whole.splitlines(keepends=True)
     strain = str(journal(tmp_path)[0]["observed"][5]).encode()
     for damaged, line in (
@@ -202,7 +192,7 @@ def test_a_changed_or_foreign_journal_is_refused(known, tmp_path):
         (lines[0] + lines[2] + lines[1], 2),
         (lines[0] + lines[1] + lines[3], 3),
         (lines[0] + lines[2] + lines[3], 2),
-        (whole[:-2] + b"\n", 4),
+        (whole[:-2] + b"\n", 5),
         (lines[0] + lines[1].replace(b"monitors", b"monit\rrs") + lines[2], 2),
         (b"no checkpoint\n" + whole, 1),
         (b"no checkpoint", 1),
@@ -210,26 +200,27 @@ def test_a_changed_or_foreign_journal_is_refused(known, tmp_path):
     ):
         path.write_bytes(damaged)
         with pytest.raises(NotResumableError, match=rf"line {line} of .*changed or is damaged.*--replace"):
-            flown(known, tmp_path, 3)
+            part(known, tmp_path)
 
 
 def test_a_journal_that_decided_otherwise_in_any_turn_is_refused(known, tmp_path):
-    flown(known, tmp_path, 4)
+    part(known, tmp_path)
     lines = (tmp_path / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
     for turn, record in enumerate(journal(tmp_path)):
         other = line_of(record | {"next_control": 1 - record["next_control"]})
         (tmp_path / JOURNAL_NAME).write_bytes(b"".join([*lines[: turn + 1], other, *lines[turn + 2 :]]))
         with pytest.raises(NotResumableError, match=f"decided otherwise after turn {turn} .*--replace"):
-            flown(known, tmp_path, 4)
+            part(known, tmp_path)
 
 
+@pytest.mark.parametrize("known", [12], indirect=True)
 def test_large_states_are_kept_less_often_and_their_turns_flown_again(known, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "STATE_ALLOWANCE", 5000)
     monkeypatch.setattr(loop, "STATE_SHARE", 50)
-    flown(known, tmp_path, 12)
+    part(known, tmp_path, kind=Heavy)
     whole, kept = (tmp_path / JOURNAL_NAME).read_bytes(), [n["asset_state"] for n in journal(tmp_path)]
     last = max(number for number, state in enumerate(kept) if state is not None)
     assert [state is None for state in kept[-6:]].count(True) == 4
     assert last < 11
-    assert flown(known, tmp_path, 12).resumed_at == last + 1
+    assert part(known, tmp_path, kind=Heavy).resumed_at == last + 1
     assert (tmp_path / JOURNAL_NAME).read_bytes() == whole

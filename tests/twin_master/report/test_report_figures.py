@@ -130,13 +130,9 @@ def test_states_of_another_number_of_factors_show_their_marginals(run, count):
     levels = [np.array([0.0, 0.5])] * count
     coordinates = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, count)
     probability = np.random.default_rng(1).dirichlet(np.ones(2**count), 50)
-    state = [
-        {"name": f"a{k}", "title": "", "unit": "1", "levels": [0.0, 0.5], "prior": [1.0, 0.0]}
-        for k in range(count)
-    ]
-    scenario = run.scenario.model_copy(
-        update={"state": tuple(type(run.scenario.state[0]).model_validate(table) for table in state)}
-    )
+    each = ({"name": f"a{k}", "unit": "1", "levels": (0.0, 0.5), "prior": (1.0, 0.0)} for k in range(count))
+    state = tuple(run.scenario.state[0].model_copy(update=changes) for changes in each)
+    scenario = run.scenario.model_copy(update={"state": state})
     groups = {
         "observed": run.tree["observed"].to_dataset(),
         "filtered": xr.Dataset({"probability": (("step", "state"), probability)}),

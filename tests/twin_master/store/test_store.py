@@ -162,12 +162,9 @@ def test_rms_error_of_a_certain_belief():
     np.testing.assert_allclose(error, expected)
 
 
-@pytest.fixture(scope="module", params=["level_turns", "failing_gauges", "growing_damage"])
-def each(request: pytest.FixtureRequest, library_file: Path) -> MissionResult:
-    return flown(request.param, library_file)
-
-
-def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(each):
+@pytest.mark.parametrize("name", ["level_turns", "failing_gauges", "growing_damage"])
+def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name, library_file):
+    each = flown(name, library_file)
     turns = []
     for turn in each.flight.turns:
         happened = turn.reading.happened._replace(monitors={"strain_error_bound": 2e-6})

@@ -25,17 +25,18 @@ from twin_master.watch.mqtt import MqttFeed, Topic
 from twin_master.watch.opening import flown
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
-needs_mosquitto = pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
 TOPIC, DECISION = "wing/7", "wing/7/decision"
 Told = dict[str, Any]
 
 
 @pytest.fixture
-def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+def broker(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Mosquitto]:
     if shutil.which("mosquitto") is None:
         pytest.skip("no mosquitto")
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    broker = Mosquitto(tmp_path)
+    broker = Mosquitto(tmp_path, tls=getattr(request, "param", False))
     yield broker
     broker.stop()
 
@@ -81,12 +82,10 @@ def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, 
     return client, heard
 
 
-@needs_mosquitto
-@pytest.mark.parametrize("tls", [False, True])
-def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, tmp_path, tls, monkeypatch):
-    broker, turns = Mosquitto(tmp_path, tls=tls), len(mission.observed)
-    secure = f"mqtts://wing@localhost:{broker.port}/{TOPIC}"
-    where = broker_of(secure, broker.authority) if tls else where_of(broker)
+@pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
+def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, broker, monkeypatch):
+    secure, turns = f"mqtts://wing@localhost:{broker.port}/{TOPIC}", len(mission.observed)
+    where = broker_of(secure, broker.authority) if broker.tls else where_of(broker)
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")
     with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
         watch.run(MqttFeed(where, watch, str), str)
@@ -108,14 +107,13 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
         publisher.publish(TOPIC, b"x" * 3_000_000, qos=0)
         publisher.publish(TOPIC, json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which turn?
         send(15, 19)
-        if not tls:
+        if not broker.tls:
             broker.again()
             wait_until(publisher.is_connected)
         send(20, turns)
     wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
     publisher.disconnect()
     listener.disconnect()
-    broker.stop()
     last, expected = (journal(folder)[-1] for folder in (watch.folder, whole))
     assert last["filtered"] == expected["filtered"]
     counts = last["intake"]["counts"]
