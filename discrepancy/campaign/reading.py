@@ -1,6 +1,6 @@
 """Reading a campaign: a folder with `campaign.toml` and tables in, a checked `Campaign` in SI units out."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from math import inf
 from pathlib import Path, PurePosixPath
@@ -11,7 +11,6 @@ from discrepancy.campaign import schema
 from discrepancy.campaign.noise import noise_model, pre_trigger_record, repeat_record
 from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.records import (
-    EVEN,
     USUAL_REGIONS,
     BoolArray,
     Campaign,
@@ -24,10 +23,8 @@ from discrepancy.campaign.records import (
     Start,
     Trial,
     TrialKind,
-    even_grid,
-    is_even,
-    nearly_even,
 )
+from discrepancy.campaign.sampling import check_sampling, nearly_even, spacing_sentence
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.provenance import hash_file, hash_record
@@ -41,9 +38,6 @@ TABLE_ERRORS = TableErrors(layout=CampaignFileError, value=CampaignDataError)
 """What a table of a campaign raises."""
 LATE = 1.5
 """Intervals after a release from rest within which its first sample is."""
-LEAST_SAMPLES = 8
-"""Fewest samples of a dynamic record."""
-_EXACT = 1e-9
 _REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
 
 
@@ -422,67 +416,3 @@ def _not_whitened(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) ->
             trials_there = f"{counted(len(where), 'trial')} {', '.join(map(repr, where))}"
             found.append(said("remarks.not_whitened", channel=name, trials=trials_there))
     return found
-
-
-# ---------------------------------------------------------------- stamps
-
-
-def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str) -> FloatArray:
-    """Return the times of a record: on the even grid where they are even as printed, else as they came.
-
-    Times may be printed with few decimals: half a unit of the last one is allowed in addition, and the times
-    are then put on the even grid through first and last. Times that are even to 1e-9 stay as they are.
-
-    Parameters
-    ----------
-    time : (N,) ndarray
-        [s].
-    cells : sequence of str
-        The same as printed.
-    user, file : str
-        Whose they are, for error messages.
-
-    Raises
-    ------
-    CampaignDataError
-        Too few samples, or a time that does not increase.
-    """
-    count = len(time)
-    if count < LEAST_SAMPLES:
-        samples = counted(count, "sample")
-        raise CampaignDataError(
-            said("campaign.few_samples", file=file, samples=samples, user=user, least=LEAST_SAMPLES)
-        )
-    steps = np.diff(time)
-    back = int(np.argmin(steps))
-    if steps[back] <= 0.0:
-        told = {"at": back + 1, "time": cells[back], "then": cells[back + 1]}
-        raise CampaignDataError(said("campaign.time_goes_back", file=file, user=user, **told))
-    # Trailing zeros may be dropped in print, so the finest cell says how many decimals there are.
-    rounding = min(_last_digit(cell) for cell in cells)  # twice half of it
-    even, off = even_grid(time)
-    interval = (time[-1] - time[0]) / (count - 1)
-    return even if _EXACT < off <= EVEN + rounding / interval else time
-
-
-def _last_digit(cell: str) -> float:
-    """Return the value of one unit of the last printed decimal."""
-    mantissa, _, exponent = cell.strip().lower().partition("e")
-    decimals = len(mantissa.partition(".")[2])
-    return 10.0 ** (int(exponent or 0) - decimals)
-
-
-def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
-    """Return what a reader has to know of uneven stamps, by trial; None where all are even."""
-    uneven = {name: time for name, time in times.items() if not is_even(time)}
-    if not uneven:
-        return None
-    steps = np.concatenate([np.diff(time) for time in uneven.values()])
-    usual = float(np.median(steps))
-    names = f"trial{'s' * (len(uneven) > 1)} {', '.join(map(repr, uneven))}"
-    text = said("remarks.uneven", trials=names, least=steps.min(), most=steps.max(), usual=usual)
-    if steps.max() > 1.5 * usual:
-        name, time = max(uneven.items(), key=lambda item: float(np.diff(item[1]).max()))
-        at = float(time[int(np.argmax(np.diff(time)))])
-        text += said("remarks.widest_gap", most=steps.max(), at=at, trial=name)
-    return text

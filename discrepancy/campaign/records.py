@@ -15,40 +15,13 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from discrepancy.campaign.protocol import IN_FILES, NOT_IN_FILES, Deviation, Event, InFiles, Release
+from discrepancy.campaign.sampling import nearly_even
 from reporting.toml_file import Name, NotNegative, Number, Positive
 from reporting.words import brief
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
-EVEN = 1e-3
-"""Largest departure of a sample from the even grid, as a share of the interval."""
-ALIKE = 0.1
-"""Largest departure of a step, as a share of the interval, at which a filter of even samples holds."""
-
-
-def even_grid(time: FloatArray) -> tuple[FloatArray, float]:
-    """Return the even grid (N,) through first and last of times (N,); how far off they are [intervals]."""
-    interval = (time[-1] - time[0]) / max(len(time) - 1, 1)
-    grid: FloatArray = time[0] + interval * np.arange(len(time))
-    return grid, float(np.max(np.abs(time - grid))) / abs(interval or 1.0)
-
-
-def is_even(time: FloatArray) -> bool:
-    """Whether samples lie on an even grid to a thousandth of the interval."""
-    return even_grid(time)[1] <= EVEN
-
-
-def nearly_even(time: FloatArray) -> bool:
-    """Whether every step is within a tenth of the interval, so that a filter of even samples still holds."""
-    steps = np.diff(time)
-    return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0)) if len(steps) else True
-
-
-def digit_of(values: FloatArray) -> float:
-    """Return the least difference of two readings (N,) that differ; 0 where all are alike."""
-    distinct = np.unique(values)
-    return float(np.diff(distinct).min()) if len(distinct) > 1 else 0.0
 
 
 class Quantity(StrEnum):

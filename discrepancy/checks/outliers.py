@@ -9,7 +9,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import maximum_filter1d
 
 from discrepancy.campaign.noise import repeated
-from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial, digit_of, is_even
+from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
+from discrepancy.campaign.sampling import digit_of, is_even
 from discrepancy.errors import said
 
 LARGEST_SHARE = 0.03

@@ -21,8 +21,8 @@ from discrepancy.campaign.records import (
     IntArray,
     NoiseRecord,
     Trial,
-    digit_of,
 )
+from discrepancy.campaign.sampling import digit_of
 from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
 

@@ -200,8 +200,7 @@ class PortedSystem:
 Outputs = tuple[tuple[str, Quantity], ...]
 """Outputs, and the quantity wanted of each."""
 ACROSS = ".transverse", ".shear"
-"""What follows the name of a strain in those across its gauge's direction: strain, and engineering shear
-strain."""
+"""What follows the name of a strain in those across its gauge's direction: strain, engineering shear."""
 NO_PATCH = ModelPatch()
 
 
@@ -288,10 +287,7 @@ class Model(ABC):
 
     @abstractmethod
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial under a patch that holds what is added, see `respond`.
-
-        The model has the outputs and carries the patch.
-        """
+        """Return what `respond` does, of a patch that holds what is added; outputs and patch are checked."""
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a trial; empty: it is never unknown."""
@@ -315,10 +311,7 @@ class Model(ABC):
         return forces
 
     def port_units(self, port: str) -> tuple[str, str]:
-        """Return the units of a force at a port and of what it acts on: `MOVES`, `TURNS`, or of a state.
-
-        Both where the model does not say it.
-        """
+        """Return the units of a force at a port and of what it acts on, `EITHER` if it does not say."""
         return EITHER
 
     def check(self, trial: Trial) -> None:
@@ -406,7 +399,6 @@ class Model(ABC):
 
         if self._kept is None:
             return answer()[1]
-
         key = (id(trial), outputs, patch.primitives, conditions.key)
         return self._kept.get(key, answer)[1]
 

@@ -22,8 +22,8 @@ from discrepancy.campaign.records import (
     Start,
     Trial,
     TrialKind,
-    is_even,
 )
+from discrepancy.campaign.sampling import is_even
 from discrepancy.campaign.schema import INPUT_COLUMNS
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignFileError, DiscrepancyError

@@ -1,0 +1,104 @@
+"""Sampling in time: strictly increasing stamps, even to a thousandth of the interval or as they came."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.errors import CampaignDataError, said
+from reporting.words import counted
+
+FloatArray = NDArray[np.float64]
+
+EVEN = 1e-3
+"""Largest departure of a sample from the even grid, as a share of the interval."""
+LEAST_SAMPLES = 8
+"""Fewest samples of a dynamic record."""
+_EXACT = 1e-9
+ALIKE = 0.1
+"""Largest departure of a step, as a share of the interval, at which a filter of even samples holds."""
+
+
+def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str) -> FloatArray:
+    """Return the times of a record: on the even grid where they are even as printed, else as they came.
+
+    Times may be printed with few decimals: half a unit of the last one is allowed in addition, and the times
+    are then put on the even grid through first and last. Times that are even to 1e-9 stay as they are.
+
+    Parameters
+    ----------
+    time : (N,) ndarray
+        [s].
+    cells : sequence of str
+        The same as printed.
+    user, file : str
+        Whose they are, for error messages.
+
+    Raises
+    ------
+    CampaignDataError
+        Too few samples, or a time that does not increase.
+    """
+    count = len(time)
+    if count < LEAST_SAMPLES:
+        samples = counted(count, "sample")
+        raise CampaignDataError(
+            said("campaign.few_samples", file=file, samples=samples, user=user, least=LEAST_SAMPLES)
+        )
+    steps = np.diff(time)
+    back = int(np.argmin(steps))
+    if steps[back] <= 0.0:
+        told = {"at": back + 1, "time": cells[back], "then": cells[back + 1]}
+        raise CampaignDataError(said("campaign.time_goes_back", file=file, user=user, **told))
+    # Trailing zeros may be dropped in print, so the finest cell says how many decimals there are.
+    rounding = min(_last_digit(cell) for cell in cells)  # twice half of it
+    even, off = even_grid(time)
+    interval = (time[-1] - time[0]) / (count - 1)
+    return even if _EXACT < off <= EVEN + rounding / interval else time
+
+
+def even_grid(time: FloatArray) -> tuple[FloatArray, float]:
+    """Return the even grid (N,) through first and last of times (N,); how far off they are [intervals]."""
+    interval = (time[-1] - time[0]) / max(len(time) - 1, 1)
+    grid: FloatArray = time[0] + interval * np.arange(len(time))
+    return grid, float(np.max(np.abs(time - grid))) / abs(interval or 1.0)
+
+
+def is_even(time: FloatArray) -> bool:
+    """Whether samples lie on an even grid to a thousandth of the interval."""
+    return even_grid(time)[1] <= EVEN
+
+
+def nearly_even(time: FloatArray) -> bool:
+    """Whether every step is within a tenth of the interval, so that a filter of even samples still holds."""
+    steps = np.diff(time)
+    return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0)) if len(steps) else True
+
+
+def digit_of(values: FloatArray) -> float:
+    """Return the least difference of two readings (N,) that differ; 0 where all are alike."""
+    distinct = np.unique(values)
+    return float(np.diff(distinct).min()) if len(distinct) > 1 else 0.0
+
+
+def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
+    """Return what a reader has to know of uneven stamps, by trial; None where all are even."""
+    uneven = {name: time for name, time in times.items() if not is_even(time)}
+    if not uneven:
+        return None
+    steps = np.concatenate([np.diff(time) for time in uneven.values()])
+    usual = float(np.median(steps))
+    names = f"trial{'s' * (len(uneven) > 1)} {', '.join(map(repr, uneven))}"
+    text = said("remarks.uneven", trials=names, least=steps.min(), most=steps.max(), usual=usual)
+    if steps.max() > 1.5 * usual:
+        name, time = max(uneven.items(), key=lambda item: float(np.diff(item[1]).max()))
+        at = float(time[int(np.argmax(np.diff(time)))])
+        text += said("remarks.widest_gap", most=steps.max(), at=at, trial=name)
+    return text
+
+
+def _last_digit(cell: str) -> float:
+    """Return the value of one unit of the last printed decimal."""
+    mantissa, _, exponent = cell.strip().lower().partition("e")
+    decimals = len(mantissa.partition(".")[2])
+    return 10.0 ** (int(exponent or 0) - decimals)
