@@ -19,28 +19,6 @@ NOISE = 2.0
 INTERVAL = 0.01
 
 
-def sensitivity(jacobian: FloatArray, covariance: FloatArray, noise_deviation: FloatArray) -> FloatArray:
-    """Return S = J L / s0 with L L^T the posterior covariance, so that S S^T holds the leverages.
-
-    Parameters
-    ----------
-    jacobian : (N, C, P) ndarray
-        Derivatives of the predictions of one trial by all fitted parameters [channel's unit].
-    covariance : (P, P) ndarray
-        Posterior covariance of the parameters at the scale of the noise records.
-    noise_deviation : (C,) ndarray
-        s0 [channel's unit].
-
-    Returns
-    -------
-    (N, C, P) ndarray
-        Dimensionless.
-    """
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return np.asarray((jacobian @ root) / noise_deviation[:, np.newaxis])
-
-
 class Bench:
     """Linear-Gaussian fits of a wing-like structure with four gauges, exact by construction.
 
@@ -99,12 +77,14 @@ class Bench:
         precision = (J / size).T @ (J / size) / s0**2 + 1e-12 / s0**2 * np.eye(J.shape[1])
         covariance = np.linalg.inv(precision) / np.outer(size, size)
         shift = covariance @ (J.T @ e) / s0**2
+        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        root = vectors * np.sqrt(np.clip(values, 0.0, None))
         items = []
         for trial, off, rate, jacobian in zip(self.trials, error, self.rates, self.jacobians, strict=True):
             if trial.held_out:  # its own amplitudes are known exactly: only shared parameters are uncertain
                 jacobian = jacobian.copy()
                 jacobian[:, :, 4:-1] = 0.0
-            S = sensitivity(jacobian, covariance, noise)
+            S = (jacobian @ root) / noise[:, np.newaxis]  # S S^T holds the leverages
             leverage = np.sum(S**2, axis=2)
             change = jacobian @ shift
             items.append(

@@ -105,10 +105,8 @@ def test_lines_are_not_found_in_noise(coefficients, count, records):
         (INTERVAL, 1000, 60.0, 0.5, 60.0),
         (INTERVAL, 1000, 100.0, 1.0, 400.0),  # above half the rate: it shows at 100 Hz
         # a record of 8 s resolves 0.125 Hz, and 400 Hz may be off by 0.4 Hz
-        *(
-            (1e-3, 8000, 400.0 * (1.0 + share * MAINS_DEVIATION), 2.0, 400.0)
-            for share in (-0.8, -0.2, 0.5, 1.0)
-        ),
+        (1e-3, 8000, 400.0 * (1.0 - 0.2 * MAINS_DEVIATION), 2.0, 400.0),
+        (1e-3, 8000, 400.0 * (1.0 + MAINS_DEVIATION), 2.0, 400.0),
     ],
 )
 def test_lines_are_found_where_they_are_and_taken_out(interval, count, shown, size, line):

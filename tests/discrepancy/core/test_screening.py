@@ -106,10 +106,6 @@ def test_noise_unknown_to_the_record_counts_by_what_is_left():
     [
         (inf, ("static",), 0, 0.0),
         (30.0, ("static",), 0, 0.0),
-        *(
-            pytest.param(*row, 60, 0.0, marks=pytest.mark.long)  # between the two above and the one below
-            for row in ((inf, ("ringdown",)), (30.0, ("ringdown",)), (200.0, ("static", "ringdown")))
-        ),
         (20.0, ("static", "ringdown"), 60, 0.0),
         (200.0, ("ringdown",), 120, 0.0),  # long enough for whiteness
         (inf, ("ringdown",), 80, 0.5),  # a third more variance, spread evenly

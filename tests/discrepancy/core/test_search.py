@@ -9,8 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from discrepancy.campaign.records import NoiseRecord
+from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Prior
-from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import attempt, fit
@@ -88,11 +88,8 @@ def test_what_a_model_can_follow_only_while_it_is_small(problem):
     assert _distance(screen, last, [last]) == pytest.approx(0.0, abs=1e-5 * last.size)
 
 
-def test_a_search_tells_what_could_not_be_fitted_and_goes_on(tmp_path):
-    file = tmp_path / "mine.toml"
-    file.write_text(Inputs(__file__).text("explosive.toml"), encoding="utf-8")
-    catalogue = load_catalogue([file], installed=False)
-    effects = [effect_by_identifier(key, catalogue) for key in ("quadratic_damping", "explosive")]
+def test_a_search_tells_what_could_not_be_fitted_and_goes_on():
+    effects = [*kit.chosen("quadratic_damping"), *effects_of_file(Inputs(__file__).folder / "explosive.toml")]
     campaign, model = measured("quadratic_damping", 0.02)
     verdict = investigate(campaign, model, effects, thorough=False).verdict
     assert verdict.kind is VerdictKind.NAMED

@@ -234,9 +234,8 @@ def test_friction_that_begins_with_an_event_is_named_with_it(campaign):
     assert not any(name.startswith(("clock_error", "point_mass", "high_pass")) for name in names)
 
 
-def test_a_moment_that_is_a_parameter_is_found_within_one_percent(campaign, tmp_path):
-    (tmp_path / "own.toml").write_text(Inputs(__file__).text("late_friction.toml"), encoding="utf-8")
-    (effect,) = effects_of_file(tmp_path / "own.toml")
+def test_a_moment_that_is_a_parameter_is_found_within_one_percent(campaign):
+    (effect,) = effects_of_file(Inputs(__file__).folder / "late_friction.toml")
     problem = kit.problem_of(replace(campaign, trials=campaign.trials[:1], events=()), MODEL)
     term = Term(effect, "slide")
     candidate = Candidate((term,))

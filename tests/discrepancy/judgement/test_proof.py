@@ -62,6 +62,10 @@ def test_scores_of_a_right_model():
         assert found.rms["g1"] == pytest.approx(2.0, rel=0.1)
         wide = [replace(item, predictive_deviation=1.5 * item.predictive_deviation) for item in part.trials]
         assert scores(replace(part, trials=tuple(wide))).pit_p_value < 1e-6
+        again = [replace(item, residual=np.repeat(item.residual[::8], 8, axis=0)) for item in part.trials]
+        assert (
+            scores(replace(part, trials=tuple(again))).pit_p_value > 0.01
+        )  # what repeats itself counts once
 
 
 def test_a_closed_gap_is_one_and_an_open_gap_zero():

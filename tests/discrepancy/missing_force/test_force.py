@@ -1,5 +1,6 @@
 """The missing force of simulated rigs: where it is, how large, and what a law is of it."""
 
+import shutil
 from contextlib import closing
 from dataclasses import replace
 
@@ -33,9 +34,6 @@ from tests.refusals import Inputs
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
 """Campaigns: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow, free play."""
-INPUTS = Inputs(__file__)
-DRIVE = INPUTS.text("drive.toml")
-DRIVEN = INPUTS.text("driven.toml")
 
 
 def share_of(missing):
@@ -63,8 +61,8 @@ def write_drive(folder):
     values = np.array(rows) + np.random.default_rng(3).standard_normal((len(time), 2)) * (0.05, 2e-6)
     table = np.column_stack((time, values))
     np.savetxt(folder / "run.csv", table, "%.9g", ",", header="time,force,position", comments="")
-    (folder / "model.toml").write_text(DRIVE, "utf-8")
-    (folder / "campaign.toml").write_text(DRIVEN, "utf-8")
+    for name, file in (("drive", "model"), ("driven", "campaign")):
+        shutil.copy(Inputs(__file__).folder / f"{name}.toml", folder / f"{file}.toml")
 
 
 def read(folder):

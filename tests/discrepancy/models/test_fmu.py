@@ -34,6 +34,7 @@ GIVEN: dict[str, Any] = {"parameters": np.array([1.02, 0.9])}
 OUTPUTS = (("displacement", Quantity.DISPLACEMENT), ("leaf_strain", Quantity.STRAIN))
 BOTH = (*OUTPUTS, ("displacement", Quantity.VELOCITY))
 LAWS = laws("slide", STIFFNESS, AMPLITUDE, SPEED)
+LUMPED = LumpedModel.load("single_mass_rig")
 
 
 def trial(kind: TrialKind, time: Any = 300, **said: Any) -> Trial:
@@ -71,11 +72,6 @@ def rig(make) -> FmuModel:
 @pytest.fixture(scope="module")
 def stepped(make) -> FmuModel:
     return make(("isolated = false", "isolated = false\nsuperposition = false"))
-
-
-@pytest.fixture(scope="module")
-def lumped() -> LumpedModel:
-    return LumpedModel.load("single_mass_rig")
 
 
 def share(model: Model, exact: Model, what: Trial, *items: Primitive, n: int = 1, **given: Any) -> float:
@@ -129,21 +125,19 @@ MOVED = {
         *((*MOVED[n], {}, 1e-11 if n == "shaken" else 2e-4) for n in MOVED),
     ],
 )  # fmt: skip
-def test_rest_and_motion_are_those_of_the_lumped_model(
-    rig, lumped, what: Trial, items, given, largest
-) -> None:
-    assert share(rig, lumped, what, *items, **given) < largest
+def test_rest_and_motion_are_those_of_the_lumped_model(rig, what: Trial, items, given, largest) -> None:
+    assert share(rig, LUMPED, what, *items, **given) < largest
     if what.is_dynamic:
-        assert share(rig, lumped, what, *items, **given, n=4) < 1.5e-5
+        assert share(rig, LUMPED, what, *items, **given, n=4) < 1.5e-5
 
 
 @pytest.mark.parametrize("name", MOVED)
-def test_an_fmu_that_is_stepped_converges_to_the_lumped_model(stepped, lumped, name: str) -> None:
+def test_an_fmu_that_is_stepped_converges_to_the_lumped_model(stepped, name: str) -> None:
     """Second order; the root of the speed has no derivative at its turns."""
     what, items = MOVED[name]
     short = replace(what, time=what.time[:100], force=what.force[:100])
     given: dict[str, Any] = {"clock": (0.0, -0.03), "outputs": BOTH} if what is RINGDOWN else {}
-    coarse, fine = (share(stepped, lumped, short, *items, **given, n=n) for n in (1, 4))
+    coarse, fine = (share(stepped, LUMPED, short, *items, **given, n=n) for n in (1, 4))
     derived = tuple(("displacement", quantity) for quantity in Quantity.DISPLACEMENT.moving)
     moved = stepped.respond(short, derived, ModelPatch(items), Conditions(**GIVEN))
     np.testing.assert_array_equal(moved.rates[:, 1], moved.values[:, 2])

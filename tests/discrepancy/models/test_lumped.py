@@ -223,17 +223,3 @@ def test_a_matrix_may_be_given_by_parts_alone(name: str, whole: str, parts: str)
     )
     for kind in ("mass", "stiffness", "capacity", "conductance"):
         np.testing.assert_array_equal(one[kind], other[kind])
-
-
-@pytest.mark.parametrize("damping", ["ratios", "matrix"])
-@pytest.mark.parametrize(("matrix", "vector"), [("{}", "{}"), ("[{}]", "[{}]"), ("[[{}]]", "[{}]")])
-def test_with_one_unknown_a_number_is_a_matrix_and_a_vector(damping: str, matrix: str, vector: str) -> None:
-    text = INPUTS.text("one_mass.toml").replace("KIND", damping)
-    for word, value in {"MASS": 2.0, "STIFFNESS": 800.0, "RATIO": 0.01, "BOLT": 0.1, "SPRING": 25}.items():
-        form = vector if word == "RATIO" and damping == "ratios" else matrix
-        text = text.replace(word, form.format(value))
-    rig, pulled = model_of(text.replace("ROW", vector.format(1.0))), static([1.65], load_place="mass")
-    found = seen(rig, pulled, {"x": Quantity.DISPLACEMENT})
-    assert found[0, 0] == pytest.approx(1.65 / 825.0, rel=1e-12)
-    frequency = rig.system(State(())).angular_frequency
-    assert frequency == pytest.approx([np.sqrt(825.0 / 2.1)], rel=1e-12)

@@ -77,6 +77,11 @@ def test_tanks_begin_settled_and_stay_so(offset: float) -> None:
     what = trial(uneven(20, 4.0), pump(np.full(20, 2.0)), begins=Start.SETTLED)
     found = seen(rig("tanks"), what, LOWER, offset=(offset,) if offset else ())
     np.testing.assert_allclose(found[:, 0], (2.0 + offset) * 0.5 / 0.08, rtol=1e-10)
+    # a force at a state, at rest
+    said = {"kind": TrialKind.STATIC, "begins": Start.SETTLED, "load_place": "pump"}
+    still = trial(np.arange(3.0), force=np.array([0.0, 2.0, -1.0]), **said)
+    pressed = seen(rig("tanks", (', quantity = "voltage"', "")), still, LOWER)
+    np.testing.assert_allclose(pressed[:, 0], still.force * 0.5 / 0.08, rtol=1e-10)
 
 
 def test_a_motor_couples_displacements_and_states() -> None:

@@ -16,13 +16,11 @@ from discrepancy.models.structures import WingModel
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import entry
 from fe.runtime import patch
-from fe.runtime.motion import STATION_PORTS
 from fe.runtime.patch import (
     LocalStiffnessLoss,
     ModelPatch,
     PointMass,
     PowerDamping,
-    PowerStiffness,
     RootCompliance,
 )
 from fe.runtime.patch_arrays import PatchArrays
@@ -110,22 +108,6 @@ def test_each_row_has_its_own_health_and_temperature(wing: Wing) -> None:
     for row, n in enumerate(warm.load_factor):
         u = wing.static(wing.lift(n), loss=health[row], warm=1.0 - 1e-3 * warm.temperature[row])
         assert values[row] == pytest.approx(wing.rows() @ u, rel=1e-9)
-
-
-def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(wing: Wing) -> None:
-    stiffness, *_ = wing.matrices()
-    rows, share = np.stack([wing.wing.port_rows[port] for port in STATION_PORTS]), wing.wing.planform[1]
-    values = wing.seen(STATIC, PowerStiffness("planform", 60.0, 3.0, 0, 0.02))
-    for level, force in enumerate(STATIC.force):
-        u = np.linalg.solve(stiffness, force * wing.tip)
-        for _ in range(60):  # Newton's method
-            moved = rows @ u / 0.02
-            residual = stiffness @ u - force * wing.tip + (60.0 * share * moved**3) @ rows
-            tangent = stiffness + (rows.T * (180.0 * share * moved**2 / 0.02)) @ rows
-            u = u - np.linalg.solve(tangent, residual)
-        assert values[level] == pytest.approx(wing.rows() @ u, rel=1e-6, abs=1e-12)
-    plain = wing.seen(STATIC)
-    assert np.abs(values - plain).max() > 0.05 * np.abs(plain).max()
 
 
 def test_hysteresis_remembers_the_path_also_while_the_structure_warms(wing: Wing) -> None:

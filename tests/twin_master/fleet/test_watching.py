@@ -323,6 +323,8 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
             evidence = group["log_evidence"].values[row, turn]
             late = row == 2 and turn in (2, 3)  # written down before the late message came
             assert late or evidence == np.float32(last[turn]["log_evidence"])
+            seen = np.array(last[turn]["observed"], np.float32)
+            assert late or np.array_equal(group["observed"].values[row, turn], seen, equal_nan=True)
     assert group_figures(group)["flown"] == 3
     assert "early fallback" not in group_figures(group)
     learnt = learn_from_fleet(outcome.folder, tmp_path / "learnt.toml")
