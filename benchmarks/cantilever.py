@@ -14,10 +14,9 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.models.acting import Acting, Course, Load, Shown, release_of
-from discrepancy.models.interface import ACROSS, Conditions, Model, Outputs, Response
+from discrepancy.models.interface import ACROSS, Conditions, Model, Outputs, PortScale, Response, Scales
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import motion_of
-from discrepancy.models.scales import PortScale, Scales
 from discrepancy.models.sensing import observe
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import (

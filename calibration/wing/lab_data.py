@@ -12,7 +12,7 @@ from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_recor
 from calibration.dynamics.trials import Fits, fit_trials, refine_by_extremes
 from calibration.errors import ExperimentDataError, ExperimentFileError, said
 from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths, published_lengths, read_lengths
-from calibration.joint.measurement import PUBLISHED_MODES, measured_modes
+from calibration.joint.posterior import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed
 from calibration.lab_folder import lab_place, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results

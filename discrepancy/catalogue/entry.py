@@ -9,8 +9,7 @@ from pydantic import ConfigDict, Field, Strict
 from scipy.special import ndtr, ndtri
 
 from discrepancy.campaign.records import Campaign, TrialKind
-from discrepancy.models.interface import Model
-from discrepancy.models.scales import Scales
+from discrepancy.models.interface import Model, Scales
 from fe.runtime.patch import ModelPatch
 
 NINETY = 1.6448536269514722

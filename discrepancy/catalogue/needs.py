@@ -11,8 +11,7 @@ from pydantic import Field
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import SENTENCES, said
-from discrepancy.models.interface import ACROSS
-from discrepancy.models.scales import PortScale
+from discrepancy.models.interface import ACROSS, PortScale
 from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
 

@@ -12,9 +12,16 @@ from discrepancy.models.acting import Course, LoadChange, divided, place_among, 
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Sampled
 from discrepancy.models.fmu_system import Case
-from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
+from discrepancy.models.interface import (
+    NO_PATCH,
+    Conditions,
+    Outputs,
+    PortedSystem,
+    PortScale,
+    Response,
+    Scales,
+)
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.scales import PortScale, Scales
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 from fmu_asset.door.runs import State

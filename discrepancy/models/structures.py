@@ -15,9 +15,8 @@ from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError, said
 from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
-from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Outputs, Place
+from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Outputs, Place, PortScale
 from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes

@@ -19,11 +19,12 @@ from discrepancy.models.interface import (
     Outputs,
     Place,
     PortedSystem,
+    PortScale,
     Response,
+    Scales,
 )
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of
-from discrepancy.models.scales import PortScale, Scales
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
-from calibration.joint.measurement import PUBLISHED_MODES
+from calibration.joint.posterior import PUBLISHED_MODES
 from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.figures import calibration_figure
 from calibration.paper.load_test import (

@@ -13,8 +13,13 @@ from scipy import stats
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError
-from calibration.joint.measurement import PUBLISHED_MODES, measured_modes, modal_readings
-from calibration.joint.posterior import infer, joint_posterior
+from calibration.joint.posterior import (
+    PUBLISHED_MODES,
+    infer,
+    joint_posterior,
+    measured_modes,
+    modal_readings,
+)
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, weighed, wing_priors
 from calibration.result.record import STATE, ParameterPrior, prior_samples
 from calibration.static.errors_in_variables import exact_posterior

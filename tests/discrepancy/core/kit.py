@@ -14,9 +14,8 @@ from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import Conditions, Model, Response
+from discrepancy.models.interface import Conditions, Model, PortScale, Response, Scales
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.scales import PortScale, Scales
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch, RunOffset, SensorDrift
 from tests.discrepancy.rigs import chosen, hiding, setting_of

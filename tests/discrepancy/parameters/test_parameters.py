@@ -18,8 +18,7 @@ from calibration.static.posterior import stiffness_curve_of
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
-from discrepancy.models.interface import Model, Response
-from discrepancy.models.scales import Scales
+from discrepancy.models.interface import Model, Response, Scales
 from discrepancy.parameters.calibration import calibrate_parameters
 from fe.reduction.model_cache import reduced_model
 from tests.discrepancy.core import kit

@@ -120,6 +120,15 @@ def test_the_lifting_line_of_an_infinitely_slender_wing_follows_its_chord():
     assert shape == pytest.approx(shape.mean(), rel=0.01)
 
 
+def test_the_lifting_line_has_the_induced_drag_of_glauerts_table():
+    """Glauert 1926, four terms: beyond an ellipse's, of rectangular wings by aspect ratio over slope."""
+    angle, order = (np.arange(400) + 0.5) * np.pi / 800.0, np.arange(1, 20, 2)
+    for ratio, beyond in ((0.75, 0.034), (1.0, 0.049), (1.25, 0.063), (1.5, 0.076), (1.75, 0.088)):
+        plan = Planform(semi_span=np.pi * ratio, root_chord=1.0, tip_chord=1.0, straight_chord_line=0.25)
+        shares = np.sin(np.outer(order, angle)) @ lifting_line(plan, terms=4)(np.cos(angle))
+        assert order[1:] @ (shares[1:] / shares[0]) ** 2 == pytest.approx(beyond, abs=5e-4)
+
+
 def test_the_section_has_its_thickness_at_three_tenths_of_the_chord():
     assert four_digit_half_thickness(0.3, 0.125) == pytest.approx(0.0625, rel=2e-3)
     xi = np.linspace(0.02, 0.98, 40)
