@@ -1,6 +1,7 @@
 """A watch over a real broker."""
 
 import json
+import random
 import shutil
 import threading
 from collections.abc import Iterator
@@ -122,6 +123,37 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
     assert 1 <= counts["rejected"] < 1010  # a broker may lose or repeat some
     assert {decision["turn"] for decision in heard} == set(range(turns))
     assert all(decision["probability"] >= 0.5 for decision in heard)
+
+
+@pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
+def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(watch, broker, kills):
+    turns, chance, where = 60 * kills, random.Random(kills), where_of(broker)
+    listener, heard = heard_at(broker, "listener")
+
+    def run(turns: int, note: Any = str) -> None:
+        feed = MqttFeed(where, watch, note)
+        watch.run(feed, str, turns=turns)
+        feed.close()
+
+    run(1, lambda _note: publish(listener, *range(turns)))  # all but the first wait at the broker
+    listener.disconnect()
+    listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
+    met = 0
+
+    def next_end() -> int:
+        lines = chance.randrange(40) if met < kills else 2 * turns
+        return (watch.folder / JOURNAL_NAME).stat().st_size + 2000 * lines
+
+    while killed_at(watch, next_end(), lambda: run(turns)):
+        met += 1
+    assert met == kills
+    listener = broker.client("listener", heard)
+    wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
+    listener.disconnect()
+    assert [line["turn"] for line in journal(watch.folder)] == list(range(turns))
+    assert {decision["turn"] for decision in heard} == set(range(turns))
+    assert len([decision for decision in heard if decision.get("told_again")]) >= kills
+    assert len(heard) < turns + 100 * kills
 
 
 def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watch, plain):
