@@ -31,7 +31,7 @@ def archive_of(path: Path, contents: Mapping[str, str | bytes]) -> Path:
     """Write an archive; the inverse of `members`."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in contents.items():
-            archive.writestr(name, content)
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)  # equal each time
     return path
 
 
