@@ -155,7 +155,6 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
 
 
 def _is_ours(error: Exception) -> bool:
-
     # The system's own refusals (a folder without permission, a full disk) are no defect of the program.
     ours = parts.FmuError, parts.FiniteElementError, parts.CalibrationError, ReportingError
     return isinstance(error, (OSError, TwinMasterError, *ours))
