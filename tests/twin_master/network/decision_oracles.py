@@ -1,5 +1,6 @@
-"""Independent answers for tests of inference: arbitrary precision, variable elimination."""
+"""Independent answers for tests of inference: enumeration, arbitrary precision, variable elimination."""
 
+import itertools
 import logging
 import warnings
 from decimal import Decimal, localcontext
@@ -24,6 +25,32 @@ def random_model(rng, shape=(2, 2), zeros=0.4, product=False):
     prior[rng.integers(size)] += 0.1
     space = StateSpace(tuple(Factor(f"f{i}", tuple(map(float, range(n)))) for i, n in enumerate(shape)))
     return GraphicalModel(space, ("u0", "u1"), prior / prior.sum(), TransitionModel(tuple(tables)))
+
+
+def enumerate_trajectories(model, control, log_likelihood):
+    """Filtered, smoothed and log evidence by summing over every joint trajectory."""
+    steps, size = log_likelihood.shape
+    matrix = model.transition.matrix
+    likelihood = np.exp(log_likelihood)
+    filtered, evidence = np.zeros((steps, size)), np.zeros(steps)
+    forecast, smoothed = np.zeros((steps, size)), np.zeros((steps, size))
+    for length in range(1, steps + 1):
+        for path in itertools.product(range(size), repeat=length):
+            joint = model.prior[path[0]]
+            for t in range(1, length):
+                joint *= matrix[control[t - 1], path[t - 1], path[t]]
+            for t in range(length - 1):
+                joint *= likelihood[t, path[t]]
+            forecast[length - 1, path[-1]] += joint
+            joint *= likelihood[length - 1, path[-1]]
+            filtered[length - 1, path[-1]] += joint
+            evidence[length - 1] += joint
+            if length == steps:
+                for t in range(steps):
+                    smoothed[t, path[t]] += joint
+    forecast /= forecast.sum(axis=1, keepdims=True)
+    log_evidence = np.diff(np.log(evidence), prepend=0.0)
+    return forecast, filtered / evidence[:, None], smoothed / evidence[-1], log_evidence
 
 
 def precise_forward_backward(model, control, log_likelihood, digits=40):

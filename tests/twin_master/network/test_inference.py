@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from tests.twin_master.network.decision_oracles import (
     eliminate_variables,
+    enumerate_trajectories,
     precise_forward_backward,
     random_model,
 )
@@ -22,6 +23,26 @@ MODEL = build_graphical_model(load_scenario("level_turns").scenario)
 def infer(model, control, log_likelihood):
     filtered = filter_sequence(model, control, log_likelihood)
     return filtered, smooth(model, control, filtered.log_filtered)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_filter_smoother_and_evidence_equal_enumeration(seed):
+    """Transitions with zeros, products too; steps that show nothing, or rule states out; every trajectory."""
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, (2, 2) if seed % 2 else (5,), 0.4 * (seed != 3), product=seed % 4 == 1)
+    steps = 5
+    control = rng.integers(0, 2, steps)
+    log_likelihood = rng.normal(size=(steps, model.states.size)) * 4
+    log_likelihood[rng.random(steps) < 0.3] = 0.0
+    if seed == 3:  # whose transitions have no zeros
+        log_likelihood[0, 1] = log_likelihood[2, 1:] = -np.inf
+    filtered, smoothed = infer(model, control, log_likelihood)
+    oracle = enumerate_trajectories(model, control, log_likelihood)
+    np.testing.assert_allclose(filtered.forecast, oracle[0], **EXACT)
+    np.testing.assert_allclose(filtered.filtered, oracle[1], **EXACT)
+    np.testing.assert_allclose(smoothed, oracle[2], **EXACT)
+    np.testing.assert_allclose(filtered.log_evidence, oracle[3], rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(np.exp(filtered.log_filtered) == 0, oracle[1] == 0)
 
 
 @pytest.mark.parametrize("product", [False, True])
