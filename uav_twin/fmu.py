@@ -170,7 +170,7 @@ def simulate(
         if inputs is None:
             history = parts.fly(asset, planned)
         else:
-            history = parts.fly_histories(asset, parts.read_histories(inputs, asset.binding))
+            history = parts.fly_histories(asset, *parts.read_histories(inputs, asset.binding))
         _finish(asset, history, file, out, plot)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
-from numpy.typing import NDArray
 
 from calibration.dynamics.figures import ring_down_figure
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence, average
@@ -40,6 +39,7 @@ from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import reduced_model, wing_fields
 from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
+from reporting.arrays import Float
 from reporting.figures import LEVELS, panels, publication_style
 from reporting.page import Page, Words
 from reporting.progress import Progress, reporter, stage
@@ -106,8 +106,6 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
 def _percent(value: float) -> str:
     return f"{100.0 * value:+.1f} %".replace("-", "−")
 
-
-Float = NDArray[np.float64]
 
 SAMPLE_COUNT = 1000
 """Samples of the joint posterior that a calibration keeps."""

@@ -7,7 +7,6 @@ algebraic loop. A circle of components alone is none: somewhere on it stands a s
 beginning of the step can be used.
 """
 
-import difflib
 import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -291,8 +290,7 @@ class Wiring:
         declared = self.declared[end.component]
         variable = declared.variable(end.variable)
         if variable is None:
-            near = difflib.get_close_matches(end.variable, [v.name for v in declared.variables], 1, 0.6)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
+            hint = declared.hint(end.variable)
             raise CouplingError(said("coupling.no_variable", end=end, declared=declared, hint=hint))
         return variable
 
