@@ -15,11 +15,10 @@ from calibration.errors import CalibrationRecordError, said
 from calibration.geometry import Lengths, tailored_design
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import QUANTITIES, tabulate_wing, wing_priors
-from calibration.paper.figures import calibration_figure
+from calibration.paper.figures import WORDS as TABLE_1
+from calibration.paper.figures import TableRow, calibration_figure, table_1, write_table_1
 from calibration.paper.load_test import StaticCalibration, calibrate_static, push_forward
 from calibration.paper.procedure import fit_masses
-from calibration.paper.table_1 import WORDS as TABLE_1
-from calibration.paper.table_1 import TableRow, table_1, write_table_1
 from calibration.result.figures import corner_figure, drawn_parameters
 from calibration.result.file import FILE_NAME, save_calibration
 from calibration.result.folder import (

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from itertools import accumulate, pairwise
-from typing import Any, Literal, Self, cast
+from typing import Literal, Self, cast
 
 import numpy as np
 
@@ -70,19 +70,14 @@ class Taps:
 
     def __init__(self, ports: Iterable[ConnectedVariable], place: Mapping[Endpoint, int]) -> None:
         wanted = list(ports)
-        self._index = np.array([place[port.end] for port in wanted], dtype=np.intp)
-        self._delayed = np.flatnonzero([port.delayed for port in wanted])
+        self._index = np.array([place[port.end] + port.delayed * len(place) for port in wanted], np.intp)
         scales = np.array([port.conversion for port in wanted]).reshape(-1, 2)
         self._scale = None if (scales == IDENTITY).all() else (scales[:, 0], scales[:, 1])
 
     def of(self, now: FloatArray, before: FloatArray) -> FloatArray:
         """Return the values, from all outputs of this moment and of the beginning of the step."""
-        values = now[self._index]
-        if self._delayed.size:
-            values[self._delayed] = before[self._index[self._delayed]]
-        if self._scale is not None:
-            values = self._scale[0] * values + self._scale[1]
-        return values
+        values = np.concatenate((now, before))[self._index]
+        return values if self._scale is None else self._scale[0] * values + self._scale[1]
 
 
 @contextmanager
@@ -424,17 +419,3 @@ class CoupledAsset(FmiAsset):
             for name, asset in cast("CoupledFmus", self._housing).assets.items()
             for status, text in asset.log
         )
-
-    def describe(self) -> dict[str, Any]:
-        """Return the system as plain records for a listing."""
-        plan = self.schedule
-        return {
-            "system": self._wiring.structure.name,
-            "components": {c.name: str(c.fmu) for c in self._wiring.structure.components},
-            "order": list(plan.order),
-            "linear": [name for name, part in self._parts.items() if part.linear],
-            "held": [f"{link.source} -> {link.target}" for link in plan.held],
-            "loops": [" -> ".join(str(end) for end in loop) for loop in plan.loops],
-            "binding": self.binding.name,
-            "step_size": self._interval,
-        }
