@@ -18,7 +18,6 @@ from fmu_asset.door.placement import Housing, ResetTrial, Start
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import (
-    AlgebraicLoopError,
     BindingError,
     CouplingError,
     FmuEndedError,
@@ -351,9 +350,8 @@ class CoupledAsset(FmiAsset):
     Raises
     ------
     CouplingError
-        If the system cannot be joined.
-    AlgebraicLoopError
-        If it has an algebraic loop, and the algorithm is Gauss-Seidel without iterations.
+        If the system cannot be joined, or has an algebraic loop, and the algorithm is Gauss-Seidel without
+        iterations.
     BindingError
         If the binding does not fit.
     FmuFileError, FmuUnsupportedError
@@ -381,7 +379,7 @@ class CoupledAsset(FmiAsset):
             raise BindingError(said("coupling.decimation", binding=binding))
         jacobi, plan = algorithm == "jacobi", wiring.schedule
         if plan.loops and iterations == 1 and not jacobi:  # Jacobi delays every connection
-            raise AlgebraicLoopError(loop_sentence(plan.loops))
+            raise CouplingError(loop_sentence(plan.loops))
         system = system_description(wiring, wiring_hash(wiring, binding, algorithm, iterations, tolerance))
         # Lines are drawn at the components.
         exchange = Exchange(system, binding.with_header(interpolation="zero-order"))
