@@ -12,7 +12,7 @@ import math
 import struct
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, partialmethod
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -197,19 +197,8 @@ class Slave:
 
     # ------------------------------------------------------------------ values
 
-    def set_real(self, vrs: Sequence[int], values: Sequence[float]) -> None:
-        """Set inputs and tunable parameters at any time, others before the end of initialisation."""
-        self._set("Real", vrs, values)
-
-    def set_integer(self, vrs: Sequence[int], values: Sequence[int]) -> None:
-        """Set integers and enumerations, as `set_real`."""
-        self._set("Integer", vrs, values)
-
-    def set_boolean(self, vrs: Sequence[int], values: Sequence[bool]) -> None:
-        """Set Booleans, as `set_real`."""
-        self._set("Boolean", vrs, values)
-
     def _set(self, kind: str, vrs: Sequence[int], values: Sequence[float]) -> None:
+        """Set inputs and tunable parameters at any time, others before the end of initialisation."""
         for vr, value in zip(vrs, values, strict=True):
             row = self._table[vr] if 0 <= vr < len(self._table) else None
             if row is None or row.causality == "output" or row.kind not in _KINDS[kind]:
@@ -223,6 +212,10 @@ class Slave:
             else:
                 self._values[vr] = float(value)
                 self._stale = True
+
+    set_real = partialmethod(_set, "Real")
+    set_integer = partialmethod(_set, "Integer")  # enumerations, too
+    set_boolean = partialmethod(_set, "Boolean")
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
         """Return values; some outputs are computed when they are asked for."""
