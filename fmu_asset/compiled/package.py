@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from importlib.metadata import distribution
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -94,7 +95,8 @@ def pack_arrays(arrays: Mapping[str, FloatArray]) -> bytes:
     return content + struct.pack("<I", zlib.crc32(content))
 
 
-STATES = ("modal_displacement", "modal_velocity")
+STATES = {"modal_displacement": "Coordinate", "modal_velocity": "Rate of the coordinate"}
+"""What the states of model exchange are of each mode."""
 
 
 def exchange_table(
@@ -124,13 +126,11 @@ def exchange_table(
         elif row.name == "response":
             row = replace(row, start=float(TRANSIENT))
         rows.append(row)
-    states = [f"{name}[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
-    rates = [f"der({name})[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
-    for name in (*states, *(rates if arrays else (f"der({state})" for state in states))):
-        what = "Coordinate" if "displacement" in name else "Rate of the coordinate"
-        text = f"{what} of mode {name.partition('[')[2].partition(']')[0]}, mass-normalised"
-        text = f"Derivative of: {text}" if name.startswith("der(") else text
-        rows.append(FmuVariable(name, len(rows), "Real", "local", "continuous", text))
+    derivative = "der({})[{}]" if arrays else "der({}[{}])"
+    for form, before in (("{}[{}]", ""), (derivative, "Derivative of: ")):
+        for (name, what), mode in product(STATES.items(), range(1, mode_count + 1)):
+            text = f"{before}{what} of mode {mode}, mass-normalised"
+            rows.append(FmuVariable(form.format(name, mode), len(rows), "Real", "local", "continuous", text))
     return tuple(rows)
 
 

@@ -275,8 +275,6 @@ class CoupledFmus(Housing):
 
     def _fed(self, part: Part, now: FloatArray, before: FloatArray) -> dict[str, float]:
         """Return what the inputs of a component are fed, by their names."""
-        if not part.fed:
-            return {}
         return dict(zip(part.fed, self._taps[part.name].of(now, before).tolist(), strict=True))
 
     def _draw(self, part: Part, fed: dict[str, float], source: FloatArray) -> dict[str, float]:
