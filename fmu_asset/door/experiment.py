@@ -296,7 +296,7 @@ def fly_histories(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHisto
         As `FmiAsset.simulate`.
     """
     if asset.binding.binding.interpolation == "zero-order":
-        return asset.simulate(**roles, steps=steps)
+        return asset.simulate(**roles, steps=steps, progress=None)
     if steps < 2:
         raise FmuInputError(said("inputs.one_row"))
     first = {role: {name: v[0] for name, v in table.items()} for role, table in roles.items()}
@@ -307,7 +307,7 @@ def fly_histories(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHisto
 
 def from_here(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
     """Return this moment and what comes out of the steps after it."""
-    first, then = asset.observe(), asset.simulate(**roles, steps=steps)
+    first, then = asset.observe(), asset.simulate(**roles, steps=steps, progress=None)
     return ObservationHistory(
         np.concatenate(([first.time], then.time)),
         np.vstack((first.values, then.values)),
