@@ -16,7 +16,7 @@ from fmu_asset import errors
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
 from fmu_asset.coupling.structure import expand_connection as expand
-from fmu_asset.coupling.wiring import Link, Wiring, algebraic_loops, schedule, strong_components
+from fmu_asset.coupling.wiring import Wiring, algebraic_loops, schedule, strong_components
 from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
 from tests.fmu_asset.door.kinds import BINDINGS
 from tests.fmu_asset.making import bound, changed, system, tables, watch
@@ -301,7 +301,7 @@ through = st.fixed_dictionaries(
 @given(links_strategy, through)
 def test_the_order_by_enumeration(pairs, feedthrough) -> None:
     """Where some order puts every component after all that it depends on directly, ours is such an order."""
-    links = [Link(Endpoint(a, x), Endpoint(b, u)) for a, x, b, u in pairs]
+    links = [Connection(Endpoint(a, x), Endpoint(b, u)) for a, x, b, u in pairs]
     plan = schedule(NAMES, links, feedthrough)
     assert sorted(plan.order) == sorted(NAMES)
     assert plan.order == tuple(name for group in plan.groups for name in group)
@@ -324,7 +324,7 @@ def test_the_order_by_enumeration(pairs, feedthrough) -> None:
 @given(links_strategy, through)
 def test_algebraic_loops_by_enumeration(pairs, feedthrough) -> None:
     """A shortest one for each class of variables that depend on each other."""
-    links = [Link(Endpoint(a, x), Endpoint(b, u)) for a, x, b, u in pairs]
+    links = [Connection(Endpoint(a, x), Endpoint(b, u)) for a, x, b, u in pairs]
     graph: dict[Endpoint, set[Endpoint]] = {Endpoint(name, end): set() for name in NAMES for end in "xyuv"}
     for link in links:
         graph[link.source].add(link.target)
@@ -349,7 +349,7 @@ def test_algebraic_loops_by_enumeration(pairs, feedthrough) -> None:
 
 
 def test_equal_cases_keep_the_order_that_was_written() -> None:
-    joined = [Link(Endpoint("b", "x"), Endpoint("a", "u"))]
+    joined = [Connection(Endpoint("b", "x"), Endpoint("a", "u"))]
     assert schedule(("c", "a", "b"), joined, {key: {} for key in "cab"}).order == ("c", "b", "a")
 
 
