@@ -98,9 +98,7 @@ def algebraic_loops(
     links: Sequence[Connection], feedthrough: Feedthrough
 ) -> tuple[tuple[Endpoint, ...], ...]:
     """Return one shortest circle of variables for each set of variables that depend on each other."""
-    graph: dict[Endpoint, set[Endpoint]] = {
-        end: set() for link in links for end in (link.source, link.target)
-    }
+    graph = {end: set[Endpoint]() for link in links for end in (link.source, link.target)}
     for link in links:
         graph[link.source].add(link.target)
     for name, outputs in feedthrough.items():
