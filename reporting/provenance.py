@@ -15,7 +15,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
-from reporting.record_json import plain
+from reporting.json_file import plain
 
 STACK = (
     "uav-twin", "numpy", "scipy", "scikit-fem", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf",

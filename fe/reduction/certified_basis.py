@@ -21,8 +21,7 @@ from fe.sentences import said
 from reporting.progress import Stage
 from reporting.words import counted
 
-from .settings import StructureSettings
-from .terms import ReductionTerms, State
+from .terms import ReductionTerms, State, StructureSettings
 
 OUTPUTS_TOGETHER = 8
 """Outputs whose dual solutions are judged at once."""

@@ -23,8 +23,7 @@ from fe.structure.affine import AffineStructure, natural_frequencies, static_res
 from reporting.progress import Progress, Stage, reporter
 
 from .certified_basis import TOGETHER, StaticReduction, fewest_directions
-from .settings import StructureSettings
-from .terms import ModalState, ReductionTerms, State
+from .terms import ModalState, ReductionTerms, State, StructureSettings
 
 START_ITERATIONS = 4
 FURTHER_MODES = 2

@@ -26,8 +26,10 @@ def region_names(count: int) -> tuple[str, ...]:
 WING = "uav_wing"
 """Name of the reduced model of a wing."""
 
-LIFT, TIP_FORCE = 0, 1
-"""Numbers of the loads of a wing."""
+TIP_FORCE = 1
+"""Number of the load near the tip among those of a wing; the first is the lift."""
+STANDARD_GRAVITY = 9.80665
+"""[m/s^2]."""
 
 
 def wing_names(regions: tuple[str, ...]) -> tuple[str, ...]:

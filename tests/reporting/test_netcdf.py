@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from reporting import netcdf
 from reporting.errors import DamagedFileError
-from reporting.groups import Group, Variable, write_groups
-from reporting.netcdf import read_groups
+from reporting.netcdf import Group, Variable, read_groups, write_groups
 from tests.refusals import refused
 
 SIZES = {"step": 4, "sensor": 3, "state": 2, "empty": 0}

@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from discrepancy.catalogue.library import load_catalogue
-from reporting.console_table import broken, console_table
 from reporting.progress import Progress, RichProgress, SilentProgress
+from reporting.terminal import broken, console_table
 
 
 def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:

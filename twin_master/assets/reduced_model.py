@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fe.reduction.settings import StructureSettings
+from fe.reduction.terms import StructureSettings
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.structure.tables import StructureDesign
 from fmu_asset.door.binding import Binding

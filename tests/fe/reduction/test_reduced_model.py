@@ -17,18 +17,16 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 
 from benchmarks.study_regions import bracket, plate, tube
-from fe.reduction.fields import write_modes_vtu, write_wing_vtu
-from fe.reduction.model_cache import reduced_structure
+from fe.reduction.model_cache import reduced_structure, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import measured_errors, reduce_structure
-from fe.reduction.settings import StructureSettings
-from fe.reduction.terms import ReductionTerms
+from fe.reduction.terms import ReductionTerms, StructureSettings
 from fe.runtime.errors import FiniteElementError, OutsideModelError
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, affine_sum, natural_frequencies, static_response
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import load_and_assemble
-from fe.wing.responses import eigenmodes, solve_static
+from fe.wing.operators import eigenmodes, solve_static
 from reporting.errors import FileNotWrittenError
 from tests.fe.springs import ROUGH, SETTINGS, reduced_springs, rough_springs, springs
 from tests.refusals import Inputs, refused
