@@ -23,6 +23,7 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.wing_rows import PatchArrays
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import assemble_structure, write_vtu
+from fe.structure.tables import StructureSettings
 from fe.wing.design import WingDesign, load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting.files import atomic_write_bytes
@@ -30,7 +31,6 @@ from reporting.progress import Progress, reporter
 from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
-from .terms import StructureSettings
 
 if TYPE_CHECKING:
     from .reduced_basis import Reduction

@@ -1,7 +1,6 @@
-"""Offline: a structure as its reduction sees it, where it is looked at, how well its reduction is to hold."""
+"""Offline: a structure as its reduction sees it, where it is looked at, and how a reduced model is judged."""
 
 import itertools
-from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy import sparse
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.structure.affine import AffineStructure, affine_sum
-from fe.structure.tables import ReductionLimits, StructureDesign
 
 MOST_GRID_REGIONS = 3
 """Regions up to which the states that are looked at form a full grid; with more, they are chosen."""
@@ -28,34 +26,6 @@ SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
 CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
 """States inside the box on the training set, beside corners; of more regions than a grid would take."""
-
-
-@dataclass(frozen=True)
-class StructureSettings:
-    """How well the reduced model of a structure is to hold; where, and both limits, its design says.
-
-    Attributes
-    ----------
-    bound_tolerance : float
-        The certified bound wanted everywhere on the training set, for each load alone, of strains relative to
-        the largest strain and of displacements relative to the largest of them.
-    most_snapshots : int
-        Limit of the greedy search.
-    mode_count : int
-        Modes that the reduced model returns.
-    ranges : dict of str to (float, float)
-        Least and largest value where it is to hold elsewhere than the design says, by name.
-    """
-
-    bound_tolerance: float = ReductionLimits().tolerance
-    most_snapshots: int = ReductionLimits().most_solutions
-    mode_count: int = 6
-    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, design: StructureDesign) -> "StructureSettings":
-        """Return what the table `[reduction]` of a structure file says."""
-        return cls(design.reduction.tolerance, design.reduction.most_solutions)
 
 
 def loss_at(ends: FloatArray, share: FloatArray) -> FloatArray:

@@ -33,10 +33,10 @@ from fe.reduction.model_cache import (
     reduced_model,
     wing_fields,
 )
-from fe.reduction.terms import StructureSettings
 from fe.runtime import arrays as array_records
 from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
+from fe.structure.tables import StructureSettings
 from fe.wing.design import WingDesign
 from tests.refusals import Inputs, refused
 

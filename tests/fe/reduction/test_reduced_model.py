@@ -19,7 +19,7 @@ from pymor.reductors.coercive import CoerciveRBReductor
 from benchmarks.study_regions import bracket, plate, tube
 from fe.reduction.model_cache import reduced_structure, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import measured_errors, reduce_structure
-from fe.reduction.terms import ReductionTerms, StructureSettings
+from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, OutsideModelError
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, affine_sum, natural_frequencies, static_response
@@ -309,7 +309,7 @@ def test_six_regions_by_default(tmp_path, make):
 
 def test_the_file_says_how_well_and_the_structure_stays_the_same(plate_file, tmp_path):
     design, other = load_structure(plate_file), tmp_path / "plate.toml"
-    assert StructureSettings.of(design).bound_tolerance == pytest.approx(5e-3)
+    assert design.reduction.tolerance == pytest.approx(5e-3)
     other.write_text(plate_file.read_text(encoding="utf-8").replace("5e-3", "1e-2"), encoding="utf-8")
     assert tomllib.loads(other.read_text(encoding="utf-8"))["reduction"] == {"tolerance": 1e-2}
     folder = plate_file.parent
