@@ -140,11 +140,8 @@ class DigitalState:
     @property
     def values(self) -> dict[str, float]:
         """Factor and masses by the names of `wing_names`."""
-        return {
-            "young_modulus_factor": self.young_modulus_factor,
-            "servo_mass": self.servo_mass,
-            "pitot_mass": self.pitot_mass,
-        }
+        names = ("young_modulus_factor", "servo_mass", "pitot_mass")
+        return {name: getattr(self, name) for name in names}
 
     def __post_init__(self) -> None:
         _require("young_modulus_factor", self.young_modulus_factor, positive=True)

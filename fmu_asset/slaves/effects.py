@@ -244,6 +244,7 @@ class Effects:
 
     def integrator(self, vector: FloatArray, damping: tuple[float, float], acting: Acting) -> ModalIntegrator:
         """Return the wing for patches in time, the last one where nothing changed."""
+        assert self.wing is not None
         key = (vector[:-2].tobytes(), damping, acting.values)
         if self._last is None or self._last[0] != key:
             made = ModalIntegrator(self.wing, vector, *damping, acting.patch, acting.temperature)
