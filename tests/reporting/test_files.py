@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 from reporting import files, netcdf
 from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
-from reporting.groups import Group, Variable, write_groups
-from reporting.netcdf import read_groups
+from reporting.netcdf import Group, Variable, read_groups, write_groups
 from tests.refusals import refused
 
 

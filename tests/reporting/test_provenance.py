@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from reporting import provenance
+from reporting.json_file import plain
 from reporting.memory import Memory
-from reporting.record_json import plain
 
 
 def test_a_record_names_versions_and_sources_and_no_machine():

@@ -6,8 +6,8 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from reporting.console_table import broken, console_table
 from reporting.progress import Progress, RichProgress, SilentProgress
+from reporting.terminal import broken, console_table
 
 
 def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:
