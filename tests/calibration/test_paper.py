@@ -9,13 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
+from calibration.errors import ExperimentDataError, PosteriorError
 from calibration.joint.posterior import PUBLISHED_MODES
-from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
-from calibration.paper.figures import calibration_figure
+from calibration.joint.wing_table import TOTAL_MASS, weighed
 from calibration.paper.load_test import (
     calibrate_static,
-    normal_reference_bandwidth,
     particle_filter,
 )
 from calibration.paper.procedure import fit_masses, read_published_results
@@ -70,11 +68,6 @@ def test_kernel_densities_are_those_of_the_ratio_and_of_the_particles():
     assert deviation == pytest.approx(filtered.standard_deviation, rel=0.01)
 
 
-def test_the_bandwidth_is_the_robust_normal_reference_rule():
-    samples = np.array([1.0, 2.0, 3.0, 4.0, 100.0])  # median 3, median deviation 1
-    assert normal_reference_bandwidth(samples) == pytest.approx(1.0 / 0.6745 * (4.0 / 15.0) ** 0.2)
-
-
 @pytest.mark.parametrize(
     ("change", "count", "prior", "words"),
     [
@@ -116,17 +109,6 @@ def test_step_2_of_the_paper():
     assert [*calibrate_static(line, particle_count=20_000).alternatives] == ["flat in load", "ratio"]
 
 
-def test_other_curves_and_a_single_pair_will_do():
-    """The same stiffness from another curve: e differs, what was measured does not."""
-    curve = stiffness_curve_of(lambda e: 1.0 / (1.0 / (640.0 * e + 100.0) + 1.0 / 8500.0), (0.9, 1.1))
-    calibrated = calibrate_static(curve, seed=1, particle_count=COUNT)
-    assert calibrated.tip_stiffness_exact.mean == pytest.approx(681.6, abs=2.0)
-    one = dataclasses.replace(DATA, load=DATA.load[:1], displacement=DATA.displacement[:1], run=DATA.run[:1])
-    calibrated = calibrate_static(data=one, particle_count=COUNT)
-    assert 0.02 < calibrated.exact.standard_deviation < 0.0256
-    assert len(calibration_figure(calibrated).axes) == 3
-
-
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
 READ = (weighed(), *PUBLISHED_MODES)
 
@@ -163,24 +145,6 @@ def test_the_authors_table_gives_their_figures(reference):
     assert deviation[1:3] == pytest.approx([0.0039, 0.0077], abs=5e-5)
     assert mean[3] == pytest.approx(1.030, abs=5e-4)
     assert mean[4] == pytest.approx(7.66e-4, abs=5e-7)
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("wing")
-def test_our_wing_on_the_published_targets(reference):
-    from fe.reduction.model_cache import reduced_model
-
-    authors = read_published_results(reference)
-    wing = tabulate_wing(reduced_model())
-    ours = fit_masses(wing.frequency, authors.samples[:, 0], wing.validity, READ)
-    mean, deviation = ours.samples.mean(axis=0), ours.samples.std(axis=0, ddof=1)
-    assert mean[1] == pytest.approx(authors.samples[:, 1].mean(), abs=1e-3)
-    assert deviation[1] == pytest.approx(0.0039, abs=2e-4)
-    assert mean[3] == pytest.approx(1.030, rel=0.01)
-    assert mean[4] == pytest.approx(7.66e-4, rel=0.01)
-    assert ours.frequency[:, 0] == pytest.approx(np.full(100, 5.6492), rel=1e-6)
-    with pytest.raises(OutsideValidityError, match=r"modulus of the skin, e is 1\.5"):
-        fit_masses(wing.frequency, np.array([1.0, 1.5]), wing.validity, READ)
 
 
 @pytest.mark.parametrize(("changed", "words"), Inputs(__file__).refused("masses"))

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.errors import CalibrationRecordError
-from calibration.result.figures import corner_figure
 from calibration.result.file import load_calibration, result_bytes, save_calibration
 from calibration.result.record import Calibration
 from calibration.wing.calibrate import calibrate
@@ -72,14 +71,6 @@ def test_figures_that_follow_one_another_have_no_information(make_calibration):
     assert result.information == pytest.approx(2.0 * (0.5 * (1.0 / 9.0 - 1.0) + np.log(3.0)), rel=0.05)
     line = np.column_stack([result.samples[:, 0], 1.0 - 2.0 * result.samples[:, 0]])
     assert replace(result, samples=line).information is None
-
-
-def test_panels_show_what_lies_between_the_quantiles_and_a_margin():
-    samples = np.random.default_rng(0).normal((3.0, -20.0), (1.0, 2.0), (500, 2))
-    figure = corner_figure(("a", "b"), [("drawn", samples)])
-    ends = np.quantile(samples, [0.002, 0.998], axis=0)
-    wanted = (ends + 0.06 * np.diff(ends, axis=0) * [[-1.0], [1.0]]).T
-    np.testing.assert_allclose([figure.axes[n].get_xlim() for n in (0, 3)], wanted)
 
 
 def test_the_file_gives_back_everything_in_the_layout_of_arviz(tmp_path, make_calibration):

@@ -16,7 +16,6 @@ from calibration.static.posterior import (
     TABLE_TOLERANCE,
     GaussianPrior,
     ScalarPosterior,
-    child_seed,
     stiffness_curve_of,
     stiffness_line,
 )
@@ -65,12 +64,6 @@ def test_samples_repeat_bit_for_bit_and_follow_the_density():
     assert abs(samples.mean() - 1.0) < 2e-4
 
 
-def test_seeds_of_purposes_do_not_depend_on_how_often_they_are_asked_for():
-    root = np.random.SeedSequence(9, spawn_key=(3,))
-    states = [child_seed(root, purpose).generate_state(4).tolist() for purpose in (0, 1, 0)]
-    assert states[0] == states[2] != states[1]
-
-
 # ---------------------------------------------------------------- stiffness curves
 
 
@@ -102,12 +95,8 @@ def test_a_table_meets_its_model_within_the_stated_error():
     for end in RANGE:
         below, at, above = curve.stiffness([end - 1e-6, end, end + 1e-6])
         assert at - below == pytest.approx(above - at, rel=1e-3)
-
-
-@given(factor=st.floats(0.3, 1.9))
-def test_the_inverse_inverts_also_beyond_the_table(factor):
-    curve = stiffness_curve_of(Springs().tip_stiffness, RANGE)
-    assert float(curve.young_modulus_factor(curve.stiffness(factor))) == pytest.approx(factor, abs=1e-7)
+    anywhere = np.linspace(0.3, 1.9, 33)
+    assert curve.young_modulus_factor(curve.stiffness(anywhere)) == pytest.approx(anywhere, abs=1e-7)
 
 
 def test_a_rough_curve_is_refused():

@@ -1,7 +1,6 @@
 """Laws at a joint whose flexibility the modes leave out, against a general integrator of all of it."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from discrepancy.campaign.protocol import Release
-from discrepancy.models.acting import Acting, Course, Load, Shown
+from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of
 from fe.runtime.motion import laws_of
@@ -57,12 +56,6 @@ def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
 
 
 LAWS = laws("joint", ROOT, A, 15.0 * A)
-
-
-def test_what_held_the_joint_fades_with_the_lag_of_its_damping() -> None:
-    """Three modes leave it out; the fourth, which is next to overdamped beyond measure, is exact."""
-    few, exact = (values(ringdown(BETA, time=EARLY, row=ROWS[1], modes=n), ROWS) for n in (3, 4))
-    assert few == pytest.approx(exact, rel=1e-5)
 
 
 def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ...]) -> float:
@@ -151,22 +144,3 @@ def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray,
     assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
     assert fine[0] < 1e-3 * 0.02
     assert np.all(usual < np.array([0.03, 0.08]) * effect + 1e-3 * np.array([0.02, A]))
-
-
-@pytest.mark.parametrize("name", ["crack", "micro-slip", "bouc-wen", "cubic"])
-def test_without_lag_the_order_is_two(name: str) -> None:
-    one, two, fine = (values(ringdown(0.0, *LAWS[name], refinement=n)) for n in (1, 2, 16))
-    assert np.mean((one - fine) ** 2) > 9.0 * np.mean((two - fine) ** 2)
-
-
-@pytest.mark.parametrize("name", ["cubic", "crack", "play", "micro-slip", "bouc-wen"])
-def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
-    system = chain(3, 1e-3)
-    system = replace(system, damping=system.damping + 4.0 * system.mass)
-    acts = laws_of(ModelPatch(LAWS[name]), list(system.ports))
-    time = np.linspace(0.0, 90.0, 3001)
-    force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
-    along = np.array([1.0, 0.0, 0.0, 1.0])  # at the joint too
-    moved = values(motion_of(system, Acting(time, time, [Load(along, Course(time, force))]), acts), ROWS)
-    still = system.static(np.outer(force, along), acts)[0] @ ROWS.T
-    assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())

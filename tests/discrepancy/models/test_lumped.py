@@ -15,11 +15,11 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.models.system_model import State
 from fe.runtime import patch as patches
-from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
-from tests.discrepancy.asking import FloatArray, integrated, seen
+from fe.runtime.patch import MicroSlip, PowerDamping, Primitive
+from tests.discrepancy.asking import seen
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import model_of
-from tests.fe.runtime.stepping import exact, force_of, second_order, states_of
+from tests.fe.runtime.stepping import second_order
 from tests.refusals import Inputs
 
 pytestmark = pytest.mark.xdist_group("compiling")
@@ -61,6 +61,7 @@ def shown(model: LumpedModel, what: Trial, *items: Any, outputs: Any = DISPLACEM
 
 SCALED = 1.1 * (STIFFNESS - 0.2 * 2200.0 * np.outer(JOINT, JOINT))
 ROOT = np.linalg.inv(STIFFNESS) + 3e-4 * np.outer([0.2, 0.4, 0.6], [0.2, 0.4, 0.6])
+TWO_GAINS = patches.LoadGain(0.2, 0.5), patches.LoadGain(0.1, 0.0)  # one upon the other
 WARM, SOFTER = np.array([0.0, 10.0, 0.0, -20.0]), patches.ModulusTemperature(2e-3)
 
 
@@ -71,6 +72,7 @@ WARM, SOFTER = np.array([0.0, 10.0, 0.0, -20.0]), patches.ModulusTemperature(2e-
         ((), [1.0], [np.linalg.solve(SCALED, [0, 0, 1])], {"parameters": np.array([1.1, 0.8, 2.0])}),
         ((patches.RootCompliance(3e-4),), [2.0], [2.0 * ROOT[:, 2]], {}),  # in series
         ((patches.LoadGain(0.05, 0.5),), [0.0, 4.0], np.outer([0.0, 4.7], END), {}),
+        (TWO_GAINS, [0.0, 4.0], np.outer([0.0, 5.83], END), {}),
         ((patches.LoadPlace(-0.05, 0.0),), [3.0], [np.linalg.solve(STIFFNESS, [0, 0.75, 2.25])], {}),
         ((patches.PointMass(0.3, 0.55),), [1.0], [END], {}),
         ((SOFTER,), [1.0] * 4, np.outer(1.0 / (1 - 2e-3 * WARM), END), {"temperature": WARM}),
@@ -83,64 +85,7 @@ def test_static_rows_are_those_of_the_matrices(chain, items, force, wanted, said
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
-@pytest.mark.parametrize(
-    "law",
-    [
-        PowerStiffness("joint", 3.0, 3.0, 0, 2e-3),
-        FreePlay("joint", 1000.0, 5e-4),
-        MicroSlip("joint", 0.8, 1500.0, -0.4),
-        BoucWen("joint", 1000.0, 8e-4, 2.0),
-    ],
-)
-def test_static_rows_with_a_joint_are_in_equilibrium(chain, law: Primitive) -> None:
-    force = np.array([0.0, 2.0, 5.0, 2.0, -4.0])
-    u = shown(chain, static(list(force)), law)
-    pull = u @ STIFFNESS - np.outer(force, [0, 0, 1])  # what the joint must give: -row F
-    np.testing.assert_allclose(pull[:, 0], 0.0, atol=1e-9)
-    np.testing.assert_allclose(pull[:, 1], -pull[:, 2], atol=1e-9)
-    internal = -pull[:, 2]
-    if not states_of(law):
-        wanted = [force_of(law, x, 0.0, np.zeros(0)) for x in u @ JOINT]
-        np.testing.assert_allclose(internal, wanted, atol=1e-8)
-    else:  # softer on first loading, and not the same on the way back
-        assert internal[2] < internal[1] < 0.0
-        assert abs(u[3, 2]) > abs(u[1, 2])
-
-
 # ---------------------------------------------------------------- motion
-
-
-@pytest.mark.parametrize(
-    ("law", "tolerance"),
-    [
-        (PowerStiffness("joint", 0.0, 3.0, 0, 2e-3), 1e-7),
-        (PowerStiffness("joint", 0.3, 3.0, 0, 2e-3), 5e-4),
-        (PowerDamping("joint", 0.5, 2.0, 0.0, 0.1, 1.0), 5e-4),
-        (PowerStiffness("joint", -0.4, 1.0, -1, 2e-3), 5e-4),
-    ],
-)
-def test_a_ringdown_is_its_equation(chain: LumpedModel, law: Primitive, tolerance: float) -> None:
-    """The full equations, by a general integrator."""
-    what = ringdown()
-    values = shown(chain, what, law, outputs=(*DISPLACEMENTS.items(), VELOCITY, ACCELERATION))
-    start = values[0, :3]
-
-    def acceleration(u: FloatArray, v: FloatArray) -> FloatArray:
-        internal = JOINT * force_of(law, float(JOINT @ u), float(JOINT @ v), np.zeros(0))
-        return (-STIFFNESS @ u - VISCOUS @ v - internal) / np.diag(MASS)
-
-    # released from equilibrium under a force at the end only
-    np.testing.assert_allclose(acceleration(start, np.zeros(3))[:2], 0.0, atol=1e-8)
-    assert start[2] == pytest.approx(0.02)
-    wanted = integrated(
-        lambda t, y: np.concatenate((y[3:], acceleration(y[:3], y[3:]))), what.time,
-        np.concatenate((start, np.zeros(3))), atol=1e-13, max_step=2e-3,
-    )  # fmt: skip
-    u, v = wanted[:, :3], wanted[:, 3:]
-    np.testing.assert_allclose(values[:, :3], u, atol=0.02 * tolerance)
-    np.testing.assert_allclose(values[:, 3], v[:, 2], atol=0.5 * 2.0 * tolerance)
-    of_end = np.array([acceleration(*pair)[2] for pair in zip(u, v, strict=True)])
-    np.testing.assert_allclose(values[:, 4], of_end, atol=4.0 * tolerance * np.max(np.abs(of_end)))
 
 
 def test_a_record_that_begins_under_load_begins_at_rest(chain: LumpedModel) -> None:
@@ -192,27 +137,8 @@ def test_closed_form_and_stepped_ringdown_agree_for_any_damping(ratios: Any, clo
 
 # ---------------------------------------------------------------- at uneven stamps
 
-SEEN = (("x1", Quantity.DISPLACEMENT), VELOCITY, ACCELERATION)
-
-
-def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
-    time = 0.02 * (np.arange(200) + 0.9 * np.random.default_rng(1).uniform(-0.5, 0.5, 200))
-    time = np.delete(time - time[0], slice(66, 73))  # and a gap
-    force = np.append(0.0, np.random.default_rng(2).normal(size=len(time) - 1))
-    into = np.append(np.zeros(5), 1.0 / MASS[2, 2])[:, None]
-    found = exact(MOTION, into, time, force[:, None])
-    acceleration = found @ MOTION[5] + force * into[5]
-    expected = np.stack([found[:, 0], found[:, 5], acceleration], axis=1)
-    measured = shown(chain, trial(TrialKind.FORCED, time, force=force), outputs=SEEN)
-    np.testing.assert_allclose(measured, expected, atol=1e-9 * np.abs(expected).max())
-
 
 # ---------------------------------------------------------------- what it says of itself
-
-
-def test_the_default_place_of_a_load_is_the_one_input() -> None:
-    model, what = LumpedModel.load("single_mass_rig"), static([1974.0], load_place="tip_load")
-    assert shown(model, what, outputs={"displacement": Quantity.DISPLACEMENT}) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("name", "whole", "parts"), INPUTS.table("parts.toml")["row"])

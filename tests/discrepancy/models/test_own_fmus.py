@@ -17,7 +17,7 @@ from discrepancy.models.fmu import FmuModel
 from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.models.system_model import SystemModel
 from fe.reduction.reduced_basis import reduce_structure
-from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, RootCompliance
+from fe.runtime.patch import ModelPatch, PointMass, PowerStiffness, RootCompliance
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
@@ -25,7 +25,7 @@ from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures.rig import rig_text
-from tests.discrepancy.asking import FloatArray, campaign, seen, trial
+from tests.discrepancy.asking import FloatArray, seen, trial
 from tests.discrepancy.rigs import INPUTS
 from tests.fmu_asset.ours import wing_arrays, wing_model
 
@@ -172,7 +172,6 @@ def test_a_structure_without_a_force_is_refused(write_beam, tmp_path: Path) -> N
 # ---------------------------------------------------------------- the wing
 
 LOADS = record(TrialKind.STATIC, 5, 0.002, force=np.linspace(-10.0, 10.0, 5))
-FLIGHT = record(TrialKind.FLIGHT, 3, 0.002, load_factor=np.array([1.0, 2.0, 3.0]))
 RINGDOWN = record(TrialKind.RINGDOWN, 400, 0.002, release=Release(0.01))
 
 
@@ -190,14 +189,6 @@ def wing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
     model.close()
 
 
-@pytest.mark.parametrize(("what", "tolerance"), [(LOADS, 3e-3), (FLIGHT, 3e-3), (RINGDOWN, 1e-4)])
-@pytest.mark.parametrize("state", [{}, {"health": np.array([[0.2, 0.3]])}])
-def test_it_is_the_wing(wing: Pair, what: Trial, tolerance: float, state: dict[str, Any]) -> None:
-    assert wing.share(what, **state) < tolerance
-    # With an effect of no size both are the same wing, where it rests in the same basis.
-    assert wing.share(what, PointMass(1e-9, 0.9), **state) < (1e-4 if what.is_dynamic else 1e-8)
-
-
 @pytest.mark.parametrize("item", [PointMass(0.3, 0.9), RootCompliance(3e-4)])
 def test_effects_that_the_fmu_carries_are_used(wing: Pair, item: Any) -> None:
     assert all(model.supports(type(item)) for model in wing[:2])
@@ -207,15 +198,3 @@ def test_effects_that_the_fmu_carries_are_used(wing: Pair, item: Any) -> None:
     assert wing.share(LOADS, item) < 1e-8
     with pytest.raises(ModelError, match=f"two primitives '{item.kind}'"):
         wing.both(LOADS, item, item)
-
-
-@pytest.mark.long
-def test_scales_and_a_law_at_the_tip(wing: Pair) -> None:
-    exact, mine = (model.scales(campaign(RINGDOWN)) for model in wing[:2])
-    for name in ("tip_stiffness", "modal_mass", "angular_frequency"):
-        assert getattr(mine, name) == pytest.approx(getattr(exact, name), rel=1e-3), name
-    stiffness = exact.ports["tip"].stiffness
-    assert mine.ports["tip"].stiffness == pytest.approx(stiffness, rel=1e-3)
-    # without a velocity output: that of the FMU's ports as a linear system is taken
-    law = PowerDamping("tip", 0.05 * stiffness * 0.01, 2.0, 0.0, exact.angular_frequency * 0.01, 1.0)
-    assert wing.share(RINGDOWN, law) < 3e-3

@@ -11,6 +11,7 @@ from scipy.linalg import eigh
 from calibration.result.file import save_calibration
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
+from discrepancy.catalogue.effect_file import loss_integral
 from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.structures import WingModel
 from fe.reduction.built_once import cache_folder
@@ -26,7 +27,8 @@ from fe.runtime.patch import (
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import load_design
-from tests.discrepancy.asking import FloatArray, integrated, trial
+from tests.discrepancy.asking import FloatArray, campaign, integrated, trial
+from tests.discrepancy.rigs import chosen, setting_of
 
 OUTPUTS = (
     *((f"strain[{gauge}]", Quantity.STRAIN) for gauge in (1, 9, 21)),
@@ -167,6 +169,32 @@ def test_drag_over_the_planform_is_the_integral_over_the_area(wing: Wing) -> Non
 
     assert off(drag) < 2e-3
     assert off(0.0) > 0.1
+
+
+@pytest.mark.parametrize(("velocity", "displacement"), [(1.4, 0.0), (2.0, 0.6)])
+def test_effects_over_the_planform_are_as_large_as_they_say_of_the_first_mode(
+    wing: Wing, velocity: float, displacement: float
+) -> None:
+    """With every station of the mesh: 2 pi zeta k A^2 in a cycle, and a share of the spring's force."""
+    square, shapes, _ = wing.modes(count=1)
+    share, motion = wing.arrays.station_weights, wing.arrays.line_rows[2] @ shapes[:, 0]
+    mean = float(share @ motion)
+    stiffness, frequency, motion = float(square[0]) / mean**2, float(np.sqrt(square[0])), motion / mean
+    setting = setting_of(campaign(RING), wing.model)
+    drag, spring = chosen("quadratic_damping", "cubic_stiffness")
+    assert (drag.places(setting), spring.places(setting)) == (("planform",), ("tip", "planform"))
+    shape = {"velocity_exponent": velocity, "displacement_exponent": displacement}
+    (force,) = drag.patch(setting, {"equivalent_damping_ratio": 0.01, **shape}, "planform")
+    size = setting.scales.ports["planform"].displacement
+    moved = np.abs(motion) * size
+    at_place = share * force.coefficient * (moved * frequency / force.reference_velocity) ** velocity
+    at_place *= (moved / force.reference_displacement) ** displacement
+    loss = float(at_place @ moved) * 2.0 * loss_integral(velocity, displacement)
+    assert loss == pytest.approx(2.0 * np.pi * 0.01 * stiffness * size**2, rel=1e-2)
+    (force,) = spring.patch(setting, {"stiffening": 0.2}, "planform")
+    size = setting.scales.ports["planform"].largest_displacement
+    at_place = share * force.coefficient * (motion * size / force.reference_displacement) ** 3
+    assert float(at_place @ motion) == pytest.approx(0.2 * stiffness * size, rel=1e-2)
 
 
 def test_the_posterior_of_a_calibration_is_the_prior(
