@@ -5,14 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import amplitude_dependence, fit_trials
-from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError
+from calibration.errors import ExperimentDataError, OutsideValidityError
 from calibration.joint.posterior import (
     PUBLISHED_MODES,
     joint_posterior,
@@ -119,26 +117,6 @@ def test_the_same_seed_draws_the_same_bytes():
 
 
 SHARP = modes(frequency_1=0.001, frequency_2=0.03)
-
-
-@settings(max_examples=15, deadline=None)
-@given(
-    first=st.floats(5.0, 6.5), ratio=st.floats(4.5, 5.6), zeta=st.floats(0.005, 0.1),
-    error=st.floats(1e-4, 0.2), total=st.floats(0.2, 0.7),
-)  # fmt: skip
-def test_every_measurement_gives_a_posterior_or_a_clear_refusal(first, ratio, zeta, error, total):
-    values = np.array([first, first * ratio, zeta, 0.05])
-    modal = modal_readings(values, values * [error, error, 0.2, 0.2])
-    try:
-        found = asked(TABLES, modal, total_mass=weighed(total, 1e-3), count=100)
-    except CalibrationError as refusal:
-        if "contradict" not in str(refusal) and "negative Rayleigh" not in str(refusal):
-            raise
-        return
-    assert np.all(np.isfinite(found))
-    assert np.all((found[:, :3] >= LIMITS[:, 0]) & (found[:, :3] <= LIMITS[:, 1]))
-    assert np.all(found[:, 3:] >= 0.0)
-    assert abs(np.mean(2.0 * found[:, 1] + found[:, 2]) - total) < 5e-3
 
 
 SOFT = replace(STATIC, displacement=STATIC.displacement * 0.7)

@@ -101,24 +101,6 @@ def test_the_file_gives_back_everything_in_the_layout_of_arviz(tmp_path, make_ca
                 assert {"units", "long_name"} <= set(variable.attrs)
 
 
-def test_a_flipped_bit_never_passes(tmp_path, make_calibration):
-    """A flip is refused, or lies in bytes that mean nothing; it never gives another calibration."""
-    content = result_bytes(make_calibration())
-    refused = 0
-    for place in np.random.default_rng(3).integers(0, len(content), 15).tolist():
-        damaged = bytearray(content)
-        damaged[place] ^= 0x10
-        path = tmp_path / "c.nc"
-        path.write_bytes(damaged)
-        try:
-            found = load_calibration(path)
-        except CalibrationRecordError:
-            refused += 1
-        else:
-            assert result_bytes(found) == content, place
-    assert refused > 5
-
-
 def test_other_files_are_told(tmp_path, make_calibration):
     path = save_calibration(make_calibration(), tmp_path / "c.nc")
     whole = path.read_bytes()
