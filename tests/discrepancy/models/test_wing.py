@@ -32,9 +32,8 @@ from fe.runtime.patch import (
     PowerStiffness,
     RootCompliance,
 )
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.transient import ModalIntegrator
-from fe.runtime.wing_rows import strain_gauge
+from fe.runtime.wing_rows import PatchArrays, strain_gauge
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import load_design
