@@ -84,10 +84,7 @@ def test_derivatives_by_all_unknowns_of_the_closed_form(at_rest, noise):
         ("coulomb_friction", "joint", 0.1, False),  # sticking ends at a sample or the next: not smooth
         ("quadratic_damping", "end", TOLERANCE, False),
         ("quadratic_damping", "end", 0.06, True),
-        ("cubic_stiffness", "joint", TOLERANCE, False),
-        ("point_mass", "", TOLERANCE, False),
         ("root_compliance", "", TOLERANCE, False),
-        ("gauge_gain", "g1", TOLERANCE, False),
         ("clock_error", "", TOLERANCE, False),
     ],
 )
@@ -223,10 +220,9 @@ def test_evidence_with_unknown_variance_against_quadrature(freedom):
 # ---------------------------------------------------------------- far from the truth
 
 
-@pytest.mark.parametrize("share", [0.01, 0.03])
-def test_fits_reach_the_optimum_from_next_to_no_effect(share):
+def test_fits_reach_the_optimum_from_next_to_no_effect():
     """The frequency has to move by many widths of the likelihood, and nuisances hold it back at first."""
-    values = {"compliance_share": share}
+    values = {"compliance_share": 0.03}
     problem = kit.BENCH.problem(4, kit.BENCH.patch("root_compliance", values))
     (effect,) = kit.chosen("root_compliance")
     candidate = Candidate((Term(effect),))

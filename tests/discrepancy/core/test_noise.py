@@ -4,8 +4,6 @@ from math import comb, inf
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
@@ -13,7 +11,6 @@ from scipy.signal import lfilter
 from discrepancy.campaign.noise import (
     MAINS_DEVIATION,
     NoiseModel,
-    aliased,
     autoregression,
     noise_model,
     without_lines,
@@ -118,16 +115,6 @@ def test_lines_are_found_where_they_are_and_taken_out(interval, count, shown, si
     assert ljung_box(rest)[1] > 1e-3
 
 
-@given(st.floats(0.0, 1e3), st.floats(1e-4, 1e-1))
-def test_aliases_agree_at_the_samples(frequency, interval):
-    shown = aliased(frequency, interval)
-    assert 0.0 <= shown <= 0.5 / interval * (1.0 + 1e-9)
-    time = interval * np.arange(6)
-    np.testing.assert_allclose(
-        np.cos(2.0 * np.pi * frequency * time), np.cos(2.0 * np.pi * shown * time), atol=1e-5
-    )
-
-
 @pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])
 def test_whitening_is_that_of_the_whole_covariance(coefficients):
     """Sum of squares of whitened samples = x' C^-1 x with the Toeplitz covariance of the process."""
@@ -142,14 +129,6 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients):
 
 
 # ---------------------------------------------------------------- statistics of residuals
-
-
-def test_periodogram_of_a_cosine_and_of_white_noise():
-    count = 101
-    series = np.cos(2.0 * np.pi * 7 * np.arange(count) / count)
-    np.testing.assert_allclose(periodogram(series), count / 4 * (np.arange(1, 51) == 7), atol=1e-10)
-    noise = np.random.default_rng(0).standard_normal((4000, 64))
-    assert np.mean([periodogram(row) for row in noise]) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("count", [64, 301])

@@ -59,7 +59,8 @@ def test_change_is_the_projected_one(screened):
         assert float(vector[one] * screen.sign @ vector[other]) == pytest.approx(product, rel=1e-6)
 
 
-def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
+def test_pairs_and_gains_are_those_of_fits(screened):
+    """For linear effects with wide priors the screen is the fit; one change alone is no pair."""
     problem, none, screen, terms, changes = screened
     ((misfit, first, second),) = pairs(changes, screen.sign)
     found = kit.fitted(problem, *terms)
@@ -68,11 +69,6 @@ def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
     np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
     same = replace(changes[0], term=terms[1])
     assert pairs([changes[0], changes[0]], screen.sign) == pairs([changes[0], same], screen.sign) == []
-
-
-def test_gain_is_what_a_fit_achieves(screened):
-    """For a linear effect with a wide prior the screen is the fit."""
-    problem, none, _, terms, changes = screened
     for term, change in zip(terms, changes, strict=True):
         found = kit.fitted(problem, term)
         prior = 0.5 * float(found.point.effect @ found.point.effect)
