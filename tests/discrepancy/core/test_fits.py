@@ -1,18 +1,29 @@
-"""Fits against dense linear algebra: columns of the Jacobian, evidence, posterior, leverage."""
+"""Fits against dense linear algebra: Jacobian, evidence, posterior, leverage; and from far off."""
 
 from dataclasses import replace
 from math import inf, log, pi
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.errors import FitError
+from discrepancy.catalogue.effect_file import effects_of_file
+from discrepancy.catalogue.entry import Prior
+from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.fitting import fit, upper_factor
+from discrepancy.fits.fitting import attempt, fit, upper_factor
 from discrepancy.fits.predictive import residual_set
+from discrepancy.fits.screening import Screen
+from discrepancy.judgement.separability import _distance
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import investigate
+from fe.runtime.patch import ModelPatch, PowerStiffness
+from tests.discrepancy.rigs import measured
+from tests.refusals import Inputs
 
 from . import kit
 
@@ -256,3 +267,75 @@ def test_a_curvature_that_is_none_is_refused():
     for wrong in (np.nan, np.inf, -1.0):
         with pytest.raises(FitError, match=r"not finite|singular"):
             upper_factor(np.diag([1.0, wrong]))
+
+
+# ---------------------------------------------------------------- candidates that no fit can follow
+
+
+def softening(coefficient, reference):
+    """A spring of the ninth power that overtakes the rig's own far below its largest motion."""
+
+    def build(setting, values, place):
+        port = setting.scales.ports[place]
+        size = coefficient * values["stiffening"] * port.stiffness * port.displacement
+        return ModelPatch((PowerStiffness(place, size, 9.0, 0, reference * port.displacement),))
+
+    (cubic,) = kit.chosen("cubic_stiffness")
+    sizes = (replace(cubic.parameters[0], prior=Prior("normal", -30.0, 30.0)),)
+    return Term(replace(cubic, identifier="ninth_power", build=build, parameters=sizes, shape=()), "slide")
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return kit.problem_of(*measured("quadratic_damping", 0.02))
+
+
+@given(
+    u=st.floats(-8.0, 8.0), coefficient=st.sampled_from([-1.0, 1.0, 1e100]),
+    reference=st.sampled_from([0.01, 0.3]), iterations=st.sampled_from([0, 4]),
+)  # fmt: skip
+@example(u=-2.66, coefficient=-1.0, reference=0.01, iterations=0)
+@settings(max_examples=12, deadline=None)
+def test_a_fit_ends_with_finite_numbers_or_a_sentence(problem, u, coefficient, reference, iterations):
+    candidate = Candidate((softening(coefficient, reference),))
+    start = replace(problem.start(candidate), effect=np.array([u]))
+    try:
+        found = fit(problem, candidate, start, iterations=iterations)
+    except DiscrepancyError:
+        assert attempt(problem, candidate, start, iterations=iterations) is None
+        assert problem.refusals["ninth_power"].endswith(".")
+        return
+    assert np.isfinite(found.log_evidence)
+    assert np.all(np.isfinite(found.covariance))
+
+
+def test_what_a_model_can_follow_only_while_it_is_small(problem):
+    """It has been outdone by others and is no refusal; the last point that can be followed is compared."""
+    none = kit.fitted(problem)
+    screen = Screen(problem, none)
+    for coefficient, kept in ((-1e-7, 1), (-1e-5, 0)):
+        term = softening(coefficient, 0.3)
+        problem.refusals.clear()
+        assert len(list(Screen(problem, none).changes(term))) == kept
+        assert len(problem.refusals) == 1 - kept
+    problem.refusals.clear()
+    problem.refused(Candidate((term, term)), FitError("Of two, either may be to blame."))
+    assert not problem.refusals
+    term = softening(-4.5e-8, 0.3)
+    last = screen.change(term, np.array([1.0]))
+    with pytest.raises(DiscrepancyError):
+        screen.change(term, np.array([1.1]))
+    assert last.size > 0.0
+    assert _distance(screen, last, [last]) == pytest.approx(0.0, abs=1e-5 * last.size)
+
+
+def test_a_search_tells_what_could_not_be_fitted_and_goes_on():
+    effects = [*kit.chosen("quadratic_damping"), *effects_of_file(Inputs(__file__).folder / "explosive.toml")]
+    campaign, model = measured("quadratic_damping", 0.02)
+    verdict = investigate(campaign, model, effects, thorough=False).verdict
+    assert verdict.kind is VerdictKind.NAMED
+    assert [effect.identifier for effect in verdict.effects] == ["quadratic_damping"]
+    (left,) = verdict.not_fitted
+    assert left.identifier == "explosive"
+    assert left.reason.startswith("could not be fitted: ")
+    assert left.reason.endswith("is not a finite number at every time.")

@@ -1,4 +1,4 @@
-"""Screening and gates: dense projections, fits, level and power."""
+"""Screening and gates: dense projections, fits, level and power; what is left beside the noise."""
 
 from dataclasses import replace
 from math import inf, sin
@@ -15,6 +15,7 @@ from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
 from discrepancy.fits.screening import Screen, grid
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.location.locate import locate
+from discrepancy.search.honest_evidence import left_by, refitted, widened
 from discrepancy.search.starts import pairs
 from discrepancy.search_settings import SEARCH
 from discrepancy.workflow import patch_draws
@@ -307,3 +308,108 @@ def test_held_out_trials_move_nothing_that_is_shared():
         more = np.sum(along * (found.covariance[np.ix_(index, index)] @ along), axis=0)
         wanted = 1.0 + more - np.sum(local * taken, axis=0)
         np.testing.assert_allclose(shown[data.trial.name].expected_variance.ravel(), wanted, atol=1e-9)
+
+
+# ---------------------------------------------------------------- what is left beside the noise
+
+
+def ringing(seed, samples, extra=None, **given):
+    """Return ring-downs with something added to the first channel, and what their fit leaves."""
+    problem = kit.closed_problem(seed=seed, kinds=("ringdown",), samples=samples, extra=extra, **given)
+    none = kit.fitted(problem)
+    return problem, none, left_by(problem, none)
+
+
+def covariance(time, size, tau, frequency):
+    lag = np.abs(time[:, np.newaxis] - time)
+    return np.asarray(size**2 * np.exp(-lag / tau) * np.cos(frequency * lag) + 1e-9 * np.eye(len(time)))
+
+
+def coloured(size, tau, frequency, seed=8):
+    """Return what adds an exact draw of a remainder to the first channel of every trial, noise 0.02."""
+    generator = np.random.default_rng(seed)
+
+    def extra(rows):
+        root = np.linalg.cholesky(covariance(0.01 * rows, size, tau, frequency))
+        return np.asarray(0.02 * root @ generator.standard_normal(len(rows)))
+
+    return extra
+
+
+@pytest.mark.parametrize("freedom", [inf, 400.0])
+def test_white_noise_has_no_remainder(freedom):
+    """Forty campaigns of three channels: none has one, and fits stay as they were."""
+    wrong = 0
+    for seed in range(40):
+        problem, found, left = ringing(seed, 150, noise=NoiseRecord(0.02, freedom))
+        wrong += left.acts
+        assert np.all(left.factor >= 1.0)
+        if seed == 0:
+            assert refitted(problem, widened(problem, left), found) is found
+    assert wrong <= 1
+
+
+@pytest.mark.parametrize(
+    ("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0), (np.sqrt(0.2), 1e-6, 0.0)]
+)
+def test_size_time_and_frequency_are_found(size, tau, frequency):
+    """And of white noise a fifth above its record a size, and no time over which it forgets."""
+    problem, _, left = ringing(4, 900, coloured(size, tau, frequency))
+    first = problem.channel_names.index("y1")
+    over_noise = np.sqrt(np.mean([data.trial.noise_factor**-2 for data in problem.trials]))
+    assert left.size[first] == pytest.approx(size * over_noise, rel=0.2)
+    assert left.time[first] == pytest.approx(tau, rel=0.6, abs=0.04)
+    assert 2.0 * np.pi * left.frequency[first] == pytest.approx(frequency, abs=1.0)
+    assert np.all(np.delete(left.size, first) == 0.0)
+    assert not left.is_noise
+
+
+def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():
+    """Optimum, covariance and evidence are those of the same campaign whose records say so."""
+    problem, none, left = ringing(4, 300, coloured(3.0, 0.15, 0.0))
+    found = refitted(problem, widened(problem, left), none)
+    names = problem.campaign.channels
+    said = kit.fitted(kit.with_noise(
+        problem, **{key: NoiseRecord(0.02 * float(f), inf) for key, f in zip(names, left.factor, strict=True)}
+    ))  # fmt: skip
+    np.testing.assert_allclose(found.point.shared, said.point.shared, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, said.covariance, rtol=1e-3, atol=1e-9)
+    assert found.log_evidence == pytest.approx(said.log_evidence, abs=0.05)
+    assert found.chi_square > 3.0 * said.chi_square  # told against the recorded noise
+
+
+def record_of(generator, count, size=1.5):
+    """Return a noise record with the same process as the trials, or with none of a size."""
+    root = np.linalg.cholesky(covariance(0.01 * np.arange(count), size, 0.03, 0.0) + np.eye(count))
+    samples = 0.02 * root @ generator.standard_normal(count)
+    return NoiseRecord(float(samples.std()), count - 1.0, samples - samples.mean(), 0.01, "pre-trigger")
+
+
+def test_colour_of_the_noise_is_told_from_a_remainder():
+    """The same process in the trials, in the noise record or not."""
+    generator = np.random.default_rng(5)
+    for of_noise in (True, False):
+        record = record_of(generator, 200, 1.5 * of_noise)
+        problem, _, _ = ringing(6, 400, coloured(1.5, 0.03, 0.0))
+        problem = kit.with_noise(problem, y1=record)
+        left = left_by(problem, kit.fitted(problem))
+        size = left.size[problem.channel_names.index("y1")]
+        # what the record's own autoregression took out is no remainder, nor is what it left
+        assert size == (0.0 if of_noise else pytest.approx(1.5, rel=0.5))
+        assert left.is_noise is of_noise
+
+
+def test_colour_of_the_noise_is_no_gap_where_stamps_are_uneven_and_it_stays():
+    generator, wrong = np.random.default_rng(5), [0, 0]
+    for seed in range(12):
+        record = record_of(generator, 500)
+        problem, _, _ = ringing(seed, 400, coloured(1.5, 0.03, 0.0, seed))
+        trials = (item.rows(np.sort(generator.permutation(400)[:320])) for item in problem.campaign.trials)
+        problem = kit.problem_of(replace(problem.campaign, trials=tuple(trials)), problem.model)
+        problem = kit.with_noise(problem, y1=record)
+        found = kit.fitted(problem)
+        wrong[0] += absolute_gate(problem, replace(found, remainder=left_by(problem, found))).passed is False
+        located = locate(residual_set(problem, found))
+        assert all(cell.channel != "y1" for cell in located.cells)
+        wrong[1] += located.disagrees
+    assert max(wrong) <= 1
