@@ -16,7 +16,6 @@ from discrepancy.campaign.noise import (
     without_lines,
 )
 from discrepancy.campaign.noise_tests import (
-    combine,
     cumulative_periodogram,
     fisher_g,
     holm,
@@ -74,15 +73,6 @@ def test_model_of_a_coloured_record():
     assert noise.applies(INTERVAL)
     assert not noise.applies(2.0 * INTERVAL)
     np.testing.assert_array_equal(noise.whiten(samples, 2.0 * INTERVAL), samples)
-
-
-def test_white_records_stay_white():
-    generator = np.random.default_rng(3)
-    orders = [
-        len(noise_model(channel(generator.standard_normal(400)), 1.0).autoregression) for _ in range(300)
-    ]
-    # the Ljung-Box test of the record has level 1e-3
-    assert np.count_nonzero(orders) <= stats.binom.isf(1e-4, 300, 1e-3)
 
 
 @pytest.mark.parametrize(("coefficients", "count", "records"), [((), 64, 4000), ((0.9,), 500, 700)])
@@ -167,14 +157,6 @@ def test_holm_by_hand():
     assert holm([0.004, 0.011, 0.03, np.nan], 0.03) == (True, True, True, False)
     assert holm([0.011, 0.02, 0.03], 0.03) == (False, False, False)
     assert holm([], 0.01) == ()
-
-
-def test_combined_p_values_are_valid():
-    p = np.random.default_rng(8).uniform(size=(4000, 7))
-    combined = np.array([combine(row) for row in p])
-    for level in (0.1, 0.01):
-        assert np.mean(combined <= level) <= level + 3.0 * np.sqrt(level / 4000)
-    assert combine([0.3]) == 0.3
 
 
 def test_ljung_box_allows_for_samples_that_do_not_count():

@@ -12,12 +12,11 @@ from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
 from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
-from discrepancy.fits.screening import Screen, grid
+from discrepancy.fits.screening import Screen
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.location.locate import locate
 from discrepancy.search.honest_evidence import left_by, refitted, widened
 from discrepancy.search.starts import pairs
-from discrepancy.search_settings import SEARCH
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import ModelPatch, RunOffset
 
@@ -102,7 +101,6 @@ def test_noise_unknown_to_the_record_counts_by_what_is_left():
     ("freedom", "kinds", "samples", "gap"),
     [
         (inf, ("static",), 0, 0.0),
-        (30.0, ("static",), 0, 0.0),
         (20.0, ("static", "ringdown"), 60, 0.0),
         (200.0, ("ringdown",), 120, 0.0),  # long enough for whiteness
         (inf, ("ringdown",), 80, 0.5),  # a third more variance, spread evenly
@@ -113,7 +111,7 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
     problem = kit.closed_problem(seed=1, noise=NoiseRecord(0.02, freedom), kinds=kinds, samples=samples)
     found = kit.fitted(problem)
     generator = np.random.default_rng(17)
-    draws, rejected, of_one = 300 if gap else 1500, 0, []
+    draws, rejected, of_one = 300 if gap else 600, 0, []
     for _ in range(draws):
         scale = 1.0 if freedom == inf else generator.chisquare(freedom, 3) / freedom
         sums = (1.0 + gap) * generator.chisquare(problem.counts - found.spent) / scale
@@ -125,23 +123,6 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
     whiteness = any(name.startswith("whiteness") for name, _ in absolute_tests(problem, found))
     assert whiteness or samples < 120
     assert rejected > 280 if gap else rejected <= binom.isf(1e-3, draws, ABSOLUTE_LEVEL)
-
-
-@pytest.mark.parametrize("effect", kit.CATALOGUE, ids=lambda effect: effect.identifier)
-def test_grids_hold_one_scale_and_every_level(effect):
-    term, points = Term(effect), list(grid(Term(effect)))
-    assert {point.shape for point in points} == {(len(term.parameters),)}
-    magnitudes = [n for n, item in enumerate(effect.parameters) if item.magnitude]
-    for at in magnitudes[:1]:
-        first, found = effect.parameters[at], {float(point[at]) for point in points}
-        if first.levels:
-            assert len(found) == first.levels
-            assert min(found) == pytest.approx(-max(found))
-        else:
-            assert found == ({1.0, SEARCH.linear} if first.prior.value(0.0) == 0.0 else {0.0})
-    # none of them is the model as it was
-    values = [term.values(point) for point in points]
-    assert not magnitudes or all(any(row[effect.parameters[n].name] for n in magnitudes) for row in values)
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0])
@@ -193,19 +174,6 @@ def test_shape_gate_compares_evidence():
 
 RIPPLES = 200.0
 """Waves of the ripple in a metre, over 2 pi."""
-
-
-def test_the_misfit_rises_by_the_covariance_where_all_is_linear():
-    problem = kit.closed_problem(seed=3, effect=0.2)
-    found = kit.fitted(problem, kit.OFFSET)
-    screen = Screen(problem, found, record_noise=False)
-    (centre,), deviation = found.point.effect, float(np.sqrt(found.effect_covariance[0, 0]))
-    for steps in (-2.0, 0.5, 1.0):
-        moved = centre + steps * deviation
-        rise = screen.rise(np.array([moved])) + 0.5 * (moved**2 - centre**2)
-        # a fit ends a little beside its optimum
-        assert rise == pytest.approx(0.5 * steps**2, rel=0.01)
-    assert with_draws(problem, found) is found
 
 
 def rippled(steepest):

@@ -274,13 +274,13 @@ def test_restored_residuals_are_white_with_unit_variance(held_out):
     bench = Bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
-        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(1200)
+        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(500)
     ])  # fmt: skip
     covariance = draws.T @ draws / len(draws)
     plain = np.abs(covariance - np.eye(len(covariance)))
-    # Standard deviations of the entries are sqrt(2 / 1200) on and sqrt(1 / 1200) off the diagonal.
-    assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 1200)
-    assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 1200)
+    # Standard deviations of the entries are sqrt(2 / 500) on and sqrt(1 / 500) off the diagonal.
+    assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 500)
+    assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 500)
 
 
 def test_what_no_fit_leaves_is_refused():
@@ -352,19 +352,13 @@ def _viscous(zeta=0.01, f=5.0, size=1.0):
     return size * np.exp(-zeta * w * TIME) * np.cos(w * np.sqrt(1.0 - zeta**2) * TIME + 0.4)
 
 
-def test_viscous_damping_is_flat_and_exact():
-    curve = _curve(_viscous() + 0.2 - 0.01 * TIME)
-    np.testing.assert_allclose(curve.frequency, 5.0, rtol=1e-7)
-    np.testing.assert_allclose(curve.damping_ratio, 0.01, rtol=1e-5)
-    np.testing.assert_allclose(curve.amplitude, np.exp(-0.01 * OMEGA * curve.time), rtol=1e-5)
-    assert curve.time[0] < 0.5
-    assert curve.time[-1] > 9.0
-
-
 def test_two_modes_are_separated():
     """A mode that dies away is dropped, the other goes on; pure noise gives no points."""
-    first, second = backbones(TIME, _viscous() + _viscous(0.006, 7.3, 0.5), (4.9, 7.5))
+    drift = 0.2 - 0.01 * TIME
+    first, second = backbones(TIME, _viscous() + _viscous(0.006, 7.3, 0.5) + drift, (4.9, 7.5))
     np.testing.assert_allclose(first.frequency, 5.0, rtol=1e-5)
+    np.testing.assert_allclose(first.damping_ratio, 0.01, rtol=1e-3)
+    np.testing.assert_allclose(first.amplitude, np.exp(-0.01 * OMEGA * first.time), rtol=1e-3)
     np.testing.assert_allclose(second.frequency, 7.3, rtol=1e-5)
     np.testing.assert_allclose(second.damping_ratio, 0.006, rtol=1e-3)
     noise = np.random.default_rng(3).standard_normal(TIME.size)

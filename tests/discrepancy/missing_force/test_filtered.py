@@ -296,8 +296,12 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed"), [("offset", 23), ("random motion", 23), ("line", 49), ("scatter", 57), ("quiet", 7)]
-)
+    ("kind", "seed"),
+    [
+        ("offset", 23), pytest.param("random motion", 23, marks=pytest.mark.long),
+        pytest.param("line", 49, marks=pytest.mark.long), ("scatter", 57), ("quiet", 7),
+    ],
+)  # fmt: skip
 def test_moments_of_residuals_are_where_they_were_made(kind, seed):
     """In an even and an uneven record, of events that last and that end; quiet coloured noise has none."""
     generator = np.random.default_rng(seed)
