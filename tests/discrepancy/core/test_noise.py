@@ -60,19 +60,13 @@ def test_autoregression_is_recovered(coefficients):
     padded[: len(coefficients)] -= coefficients
     assert np.abs(padded).max() < 5.0 / np.sqrt(8000)
     assert innovation == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 8000))
+    noise = noise_model(channel(series[:3000]), 1.0)
+    assert noise.standard_deviation == pytest.approx(1.0, rel=0.05)  # of the innovation
+    assert noise.static_deviation == pytest.approx(series.std(), rel=0.1)
+    assert (noise.applies(INTERVAL), noise.applies(2.0 * INTERVAL)) == (True, False)
+    np.testing.assert_array_equal(noise.whiten(series, 2.0 * INTERVAL), series)
     left = np.convolve(series, np.r_[1.0, -found])  # of the record in silence
     assert innovation == pytest.approx(left @ left / (8000 - len(found) - 1.0), rel=1e-9)
-
-
-def test_model_of_a_coloured_record():
-    samples = 3.0 * coloured(np.random.default_rng(2), (0.8,), 4000)
-    noise = noise_model(channel(samples), 1.0)
-    assert noise.standard_deviation == pytest.approx(3.0, rel=0.05)  # of the innovation
-    assert noise.static_deviation == pytest.approx(3.0 / 0.6, rel=0.1)  # sigma / sqrt(1 - a^2)
-    assert noise.degrees_of_freedom > 0.0
-    assert noise.applies(INTERVAL)
-    assert not noise.applies(2.0 * INTERVAL)
-    np.testing.assert_array_equal(noise.whiten(samples, 2.0 * INTERVAL), samples)
 
 
 @pytest.mark.parametrize(("coefficients", "count", "records"), [((), 64, 4000), ((0.9,), 500, 700)])

@@ -85,18 +85,6 @@ def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
     assert mode.parameters[0].prior.value(change.start[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
 
 
-def test_noise_unknown_to_the_record_counts_by_what_is_left():
-    """With n0 = 0 the residual's own size stands for the noise: gains do not depend on the stand-in scale."""
-    sizes = []
-    for noise in (kit.NOISE, None):
-        problem = kit.closed_problem(seed=13, effect=0.12, noise=noise)
-        none = kit.fitted(problem)
-        sizes.append(next(iter(Screen(problem, none).changes(kit.OFFSET))).size)
-        if noise:  # sizes agree in units of what is left
-            left = none.sums[0] / (problem.counts[0] - none.spent[0])
-    assert sizes[1] == pytest.approx(sizes[0] / left, rel=0.25)
-
-
 @pytest.mark.parametrize(
     ("freedom", "kinds", "samples", "gap"),
     [

@@ -181,9 +181,6 @@ def test_a_load_cell_of_driven_trials_may_be_called_force(tmp_path):
     assert campaign.trials[0].values[2, 1] == 180e3
     again = read_campaign(write_campaign(campaign, tmp_path / "again"))
     np.testing.assert_array_equal(again.trials[0].values, campaign.trials[0].values)
-    changes.append((TOML, 'name = "second", kind = "driven"', 'name = "second", kind = "forced"'))
-    with pytest.raises(CampaignFileError, match="the column 'force' holds an input of the trial"):
-        read_campaign(campaign_folder(tmp_path / "a", HEATED, *changes))
 
 
 # ---------------------------------------------------------------- round trip

@@ -1,10 +1,8 @@
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from evidence.identification import least_squares
 from evidence.identification.errors import IdentificationError
 from evidence.identification.identifiability import analyse, profile
 from evidence.identification.least_squares import DesignFit, identify, minimise_local
@@ -100,29 +98,3 @@ def test_the_analysis_tells_known_from_unknown(recovered, virtual_targets):
     assert found.rise == pytest.approx(found.linear, rel=0.1, abs=0.05)
     with pytest.raises(IdentificationError, match="no free number 'lift'"):
         profile(recovered, virtual_targets, Weights(), analysis, "lift")
-
-
-def test_steps_that_are_refused_again_and_again_are_no_convergence(
-    monkeypatch, virtual_design, free, virtual_targets
-):
-    """The local model promises that farther is better, and the full model never keeps it."""
-    costs = iter([1.0] + [2.0] * 50)
-
-    def build(design: WingDesign, *_: object) -> SimpleNamespace:
-        return SimpleNamespace(design=design, cost=next(costs), values=values_of(design, free))
-
-    def residuals(model: SimpleNamespace, *_: object) -> tuple[np.ndarray, np.ndarray]:
-        return np.array([model.cost]), np.zeros((1, len(free)))
-
-    def push(model: SimpleNamespace, parameters: object, *rest: object) -> np.ndarray:
-        width = np.array([p.standard_deviation * p.stride for p in free])
-        return np.asarray(model.values + rest[-1] * width)
-
-    monkeypatch.setattr(least_squares, "build_local_model", build)
-    monkeypatch.setattr(least_squares, "objective", residuals)
-    monkeypatch.setattr(least_squares, "minimise_local", push)
-    fit = identify(virtual_design, free, virtual_targets)
-    assert not fit.converged
-    assert all(iteration.limited for iteration in fit.iterations)
-    assert len(fit.iterations) < 15  # it gives up
-    np.testing.assert_array_equal(fit.values, values_of(virtual_design, free))
