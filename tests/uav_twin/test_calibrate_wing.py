@@ -174,6 +174,11 @@ def test_what_a_calibration_leaves_and_says(soft):
         *["planform"] * 3, "load test", "weighing", *["ring-down"] * 4,
     ]  # fmt: skip
     assert result.mean("semi_span") == pytest.approx(1.828005, abs=1e-6)
+    pairs, bending = read_measurements(soft.words[2]), result.readings[3]  # least squares through the origin
+    error = np.hypot(pairs.load_standard_deviation, bending.value * pairs.displacement_standard_deviation)
+    (expected,), *_ = np.linalg.lstsq(pairs.displacement[:, None], pairs.load)
+    assert bending.value == pytest.approx(expected, rel=1e-12)
+    assert bending.deviation == pytest.approx(error / np.linalg.norm(pairs.displacement), rel=1e-12)
 
 
 @pytest.mark.long
