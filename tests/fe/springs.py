@@ -7,9 +7,9 @@ import numpy as np
 from scipy import sparse
 
 from fe.reduction.reduced_basis import Reduction, reduce_structure
-from fe.reduction.settings import StructureSettings
 from fe.runtime.state import region_names
 from fe.structure.affine import StiffnessTerm, designed
+from fe.structure.tables import StructureSettings
 from fe.wing.design import wing_structure
 from fe.wing.operators import AffineWing, outputs, stiffness_parts
 

@@ -12,14 +12,14 @@ from threadpoolctl import threadpool_limits
 from fe.reduction import patch_basis
 from fe.reduction.model_cache import build_patch_arrays
 from fe.reduction.reduced_basis import reduce_structure
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
+from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import companion_bytes
-from fmu_asset.compiled.compiler import find_compiler
+from fmu_asset.compiled.package import find_compiler
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.patch_file import load_patch

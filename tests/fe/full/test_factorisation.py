@@ -41,7 +41,7 @@ def test_a_slender_body_is_cut_across():
     held = np.bincount(elimination_blocks(body, np.ones(1440), 100))
     assert held[-1] <= 30
     assert held.max() <= 100
-    sizes = [(front.end - front.start, len(front.boundary)) for front in analyse(body).fronts]
+    sizes = [(front.end - front.start, len(front.boundary)) for front in analyse(body)[1]]
     assert sum(own * (own + boundary) for own, boundary in sizes) < 160_000
 
 

@@ -25,12 +25,18 @@ from threadpoolctl import threadpool_limits
 
 from fe.reduction import model_cache
 from fe.reduction.built_once import built_once, cache_folder
-from fe.reduction.fields import WingFields
-from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
-from fe.reduction.settings import StructureSettings
+from fe.reduction.model_cache import (
+    MODELLING_ROOMS,
+    WingFields,
+    entry,
+    patch_arrays,
+    reduced_model,
+    wing_fields,
+)
 from fe.runtime import arrays as array_records
 from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
+from fe.structure.tables import StructureSettings
 from fe.wing.design import WingDesign
 from tests.refusals import Inputs, refused
 

@@ -1,5 +1,6 @@
 """The patched wing against the full model with the same change, each change made in its own way there."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,16 +11,18 @@ from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.state import STANDARD_GRAVITY
 from fe.wing.operators import (
     AffineOperators,
     assemble,
     gauge_output,
+    lift_load,
     point_masses,
     section_displacement,
     upward,
 )  # fmt: skip
+from fe.wing.parts import DISTRIBUTIONS
 from fe.wing.patch_operators import area_shares
-from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 from tests.refusals import Inputs, refused
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
@@ -209,13 +212,13 @@ def placed(
 def washed(both: Compared, exponent: float) -> tuple[FloatArray, FloatArray]:
     """A washout is another distribution of the lift."""
     coefficient, factor, lift = 0.15, 3.0, both.design.lift
-    course = DISTRIBUTIONS[lift.distribution](both.design.planform)
+    course = partial(DISTRIBUTIONS[lift.distribution], both.design.planform)
     points, weights = np.polynomial.legendre.leggauss(400)
     eta = 0.5 * (points + 1.0)
     kept = weights * course(eta) @ (1.0 - coefficient * factor * eta**exponent) / (weights @ course(eta))
 
-    def less(planform: Any) -> Any:
-        return lambda station: course(station) * (1.0 - coefficient * factor * station**exponent)
+    def less(planform: Any, station: Any) -> Any:
+        return course(station) * (1.0 - coefficient * factor * station**exponent)
 
     restriction = both.operators.expansion.T
     with pytest.MonkeyPatch.context() as other:
