@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fe.elements import cells as assembly
-from fe.elements.kinds import KINDS
+from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime import errors
 from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.design import Gauge, Material
@@ -25,6 +26,20 @@ PRODUCTS = {  # of coordinates that a kind of element holds, by their powers
     "tetra": (1, 0, 0), "tetra10": (1, 0, 1), "wedge": (1, 0, 1), "wedge15": (1, 0, 2),
     "hexahedron": (1, 1, 1), "hexahedron20": (2, 1, 1),
 }  # fmt: skip
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[..., Path]:
+    """A writer of a structure file and its mesh; returns the structure file."""
+
+    def make(points: NDArray[np.float64], kind: str, cells: Any, text: str, **sets: Any) -> Path:
+        meshio = meshio_with_wedges()
+        meshio.write(tmp_path / "mesh.vtu", meshio.Mesh(points, [(kind, cells)], **sets))
+        file = tmp_path / "structure.toml"
+        file.write_text(text, encoding="utf-8")
+        return file
+
+    return make
 
 
 @pytest.fixture(params=sorted(KINDS))
