@@ -68,7 +68,8 @@ def _packed(name: str) -> Any:
     return pytest.fixture(scope="session")(made)
 
 
-fmu, compiled_fmu, spring_mass = map(_packed, ("python", "compiled", "spring_mass"))
+NAMED = "python", "compiled", "spring_mass", "sensing", "patched"
+fmu, compiled_fmu, spring_mass, sensing, patched = map(_packed, NAMED)
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,9 @@
 """Reduced models: the contract of a wing's, a structure's and springs', how they are made, their fields."""
 
 import re
-import tomllib
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import meshio
@@ -35,13 +35,13 @@ from fe.structure.affine import (
     natural_frequencies,
     static_response,
 )
-from fe.structure.design import load_structure, structure_hash
 from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import wing_structure
 from fe.wing.operators import AffineWing, outputs, stiffness_parts
 from fe.wing.responses import eigenmodes, solve_static
 from reporting.errors import FileNotWrittenError
+from tests.kept import FE, kept
 from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
 
@@ -245,8 +245,6 @@ def test_values_outside_validity_are_refused_by_name(pair, bad):
     [
         (0.9, (0.8, 0.8), 0.30, 0.0),
         (1.1, (0.0, 0.8), 0.05, 0.30),
-        (0.97, (0.35, 0.6), 0.21, 0.07),
-        (1.04, (0.8, 0.15), 0.05, 0.0),
     ],
 )
 def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model, state):
@@ -267,17 +265,28 @@ def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model, st
         np.testing.assert_allclose(output[:-1], strain, rtol=0, atol=1e-2 * np.abs(strain).max())
 
 
-@pytest.mark.parametrize(
-    ("full", "reduced", "count", "largest"),
-    [("beam", "beam_reduction", 6, 1e-3), ("coarse_plate", "plate_model", 10, 8e-3)],
-)
-def test_errors_are_measured(full, reduced, count, largest, request):
+@pytest.fixture
+def beam_pair(beam: AffineStructure, beam_reduction: Reduction) -> tuple[AffineStructure, ReducedModel]:
+    return beam, beam_reduction.model
+
+
+@pytest.fixture
+def plate_pair(tmp_path: Path) -> tuple[AffineStructure, ReducedModel]:
+    """A coarse plate with a hole, four regions around it, its reduced model good to half a per cent."""
+    file = plate(tmp_path, 4, around=8, across=3)
+    with file.open("a", encoding="utf-8") as text:
+        text.write("\n[reduction]\ntolerance = 5e-3\n")
+    full = load_and_assemble(file)
+    return full, kept("coarse-plate", lambda: reduce_structure(full).model, FE, full.design_hash)
+
+
+@pytest.mark.parametrize(("kind", "count", "largest"), [("beam", 4, 1e-3), ("plate", 5, 8e-3)])
+def test_errors_are_measured(kind, count, largest, request):
     """The bound holds at random states, nearly as asked for, and tells the error within a few times."""
-    model = request.getfixturevalue(reduced)
-    errors = measured_errors(request.getfixturevalue(full), getattr(model, "model", model), count, seed=7)
+    errors = measured_errors(*request.getfixturevalue(f"{kind}_pair"), count, seed=7)
     assert max(errors.strain, errors.displacement) < errors.bound < largest
     assert errors.broken == 0
-    assert errors.frequency < 2e-5 if full == "beam" else errors.bound < 30 * errors.strain
+    assert errors.frequency < 2e-5 if kind == "beam" else errors.bound < 30 * errors.strain
 
 
 def test_a_load_that_no_output_sees(write_beam, tmp_path):
@@ -370,15 +379,6 @@ def test_six_regions_by_default(tmp_path, make):
     structure = load_and_assemble(make(tmp_path, 6))
     errors = measured_errors(structure, reduce_structure(structure).model, 60)
     assert max(errors.strain, errors.displacement) <= errors.bound < 1e-3
-
-
-def test_the_file_says_how_well_and_the_structure_stays_the_same(plate_file, tmp_path):
-    design, other = load_structure(plate_file), tmp_path / "plate.toml"
-    assert StructureSettings.of(design).bound_tolerance == pytest.approx(5e-3)
-    other.write_text(plate_file.read_text(encoding="utf-8").replace("5e-3", "1e-2"), encoding="utf-8")
-    assert tomllib.loads(other.read_text(encoding="utf-8"))["reduction"] == {"tolerance": 1e-2}
-    folder = plate_file.parent
-    assert structure_hash(load_structure(other), folder) == structure_hash(design, folder)
 
 
 @pytest.mark.parametrize(("changes", "cells", "sentence"), Inputs(__file__).refused("beam"))

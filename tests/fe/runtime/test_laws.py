@@ -4,11 +4,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.polynomial import Polynomial
 from scipy.integrate import quad, solve_ivp
-from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 
 from fe.compilation import compiled_kernel
@@ -21,7 +19,6 @@ from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients, rayleigh
 from fe.runtime.motion import (
     NO_LAWS,
     PLANFORM,
-    STATION_COUNT,
     STATION_PORTS,
     Laws,
     at_stations,
@@ -174,13 +171,15 @@ def integrated(law: Any) -> Any:
 @pytest.mark.parametrize("name", TYPICAL)
 def test_default_steps_are_fine_and_the_order_is_two(name):
     law, least_order, largest = TYPICAL[name]
-    *runs, exact = (moved(law, force=np.zeros(100), refinement=n).q @ PORTS["tip"] for n in (1, 2, 4, 8, 128))
-    if name != "coulomb":  # whose closed form is below
-        exact = integrated(law)
-    errors = [np.max(np.abs(one - exact)) / A for one in runs]
+
+    def found(refinement: int) -> Any:
+        return moved(law, force=np.zeros(100), refinement=refinement).q @ PORTS["tip"]
+
+    exact = found(128) if name == "coulomb" else integrated(law)  # coulomb's closed form is below
+    errors = [np.max(np.abs(found(refinement) - exact)) / A for refinement in (1, 8)]
     assert errors[0] < largest
     # events fall differently into the steps of each refinement, so the order is that over a factor of eight
-    assert np.log2(errors[0] / errors[-1]) / 3.0 > least_order
+    assert np.log2(errors[0] / errors[1]) / 3.0 > least_order
 
 
 SEVERAL = (
@@ -215,15 +214,6 @@ def test_a_run_can_be_stopped_and_taken_further():
 SPAN, ROOT, TIP = 1.8, 0.4, 0.25
 
 
-@given(st.floats(0.05, 5.0), st.floats(0.05, 5.0), st.integers(0, 2 * STATION_COUNT - 2))
-def test_powers_of_the_distance_have_the_mean_over_the_area(root, tip, power):
-    distance, share = planform_stations(SPAN, root, tip)
-    chord = Polynomial((root, (tip - root) / SPAN))
-    moment = (chord * Polynomial((0.0, 1.0)) ** power).integ()(SPAN) / chord.integ()(SPAN)
-    assert share.sum() == pytest.approx(1.0)
-    assert float(share @ distance**power) == pytest.approx(moment, rel=1e-12)
-
-
 @pytest.mark.parametrize("kind", AT_EACH)
 def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind):
     """What is elsewhere in a patch stays as it is."""
@@ -239,19 +229,6 @@ def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind):
     assert np.allclose(
         parts.values[:, PARAMETERS:], one.values[:, PARAMETERS:]
     )  # each slips where the whole does
-
-
-def test_rows_of_the_stations_are_displacements_of_the_elastic_line(coarse_patched_wing):
-    wing = coarse_patched_wing
-    bent = np.linalg.solve(
-        wing.at(np.array([1.0, 0.0, 0.0, 0.17, 0.13, 1.0, 0.0])).stiffness, wing.arrays.load_tip
-    )
-    along = wing.arrays.line_rows[2] @ bent
-    seen = np.array([wing.port_rows[port] @ bent for port in STATION_PORTS])
-    between = CubicSpline(wing.arrays.stations, along)(wing.planform[0])
-    assert seen == pytest.approx(between, rel=1e-2)
-    # the mean over the area is that of the port "span"
-    assert float(wing.planform[1] @ seen) == pytest.approx(float(wing.port_rows["span"] @ bent), rel=1e-2)
 
 
 # ---------------------------------------------------------------- one mass, by closed forms
@@ -441,15 +418,9 @@ def test_the_step_of_any_oscillator_is_the_exponential(omega, zeta):
         np.testing.assert_allclose(scaled, wanted, rtol=1e-7, atol=9e-10)
 
 
-@given(
-    alpha=st.floats(0.0, 100.0),
-    beta=st.floats(0.0, 1.0),
-    first=st.floats(0.1, 10.0),
-    factor=st.floats(1.5, 100.0),
-)
-@example(alpha=1.0735, beta=7.3124e-4, first=5.6492, factor=29.9699 / 5.6492)
-def test_rayleigh_coefficients_are_the_inverse_of_the_ratios(alpha, beta, first, factor):
-    frequency = (first, first * factor)
+@pytest.mark.parametrize(("alpha", "beta"), [(1.0735, 7.3124e-4), (0.0, 1.0), (100.0, 0.0)])
+@pytest.mark.parametrize("frequency", [(5.6492, 29.9699), (0.1, 10.0)])
+def test_rayleigh_coefficients_are_the_inverse_of_the_ratios(alpha, beta, frequency):
     low, high = rayleigh_damping_ratio(alpha, beta, frequency)
     found = rayleigh_coefficients(frequency, (float(low), float(high)))
     np.testing.assert_allclose(found, (alpha, beta), rtol=1e-9, atol=1e-9)

@@ -23,7 +23,6 @@ from fe.wing.operators import (
     section_displacement,
     upward,
 )  # fmt: skip
-from fe.wing.patch_operators import area_shares
 from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 from tests.fe.runtime.stepping import exact, second_order
 from tests.refusals import Inputs, refused
@@ -296,13 +295,6 @@ def test_what_cannot_be_is_refused(both, kind, values, sentence):
         _ = both.structure(item, temperature=10.0).answers
     with refused(InvalidPatchError, "place 'nose' is not known"):
         both.wing.force_row("nose")
-
-
-def test_shares_of_the_area_integrate_a_parabola_on_each_cell():
-    stations = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
-    # mean of y^2 with chord 2 - y: (2/3 - 1/4) / 1.5
-    mean = area_shares(stations, 2.0, 1.0) @ stations**2
-    assert mean == pytest.approx((2.0 / 3.0 - 0.25) / 1.5, rel=1e-12)
 
 
 # ---------------------------------------------------------------- in motion, patched or not, and of a beam
