@@ -29,7 +29,7 @@ _WARM = """
 import json, sys, time
 begin = time.perf_counter()
 from fe.reduction.model_cache import wing_fields
-from fe.reduction.fields import write_wing_vtu
+from fe.reduction.model_cache import write_wing_vtu
 wing = wing_fields()
 write_wing_vtu(sys.argv[1], wing, wing.vector(stiffness_loss=(0.4, 0.2), load_factor=3.0))
 print(json.dumps({"wall": time.perf_counter() - begin}))
@@ -68,8 +68,7 @@ def _against_the_full_model() -> list[Measurement]:
     from fe.runtime.state import TIP_FORCE
     from fe.runtime.transient import ModalIntegrator
     from fe.wing.design import load_design
-    from fe.wing.operators import assemble
-    from fe.wing.responses import eigenmodes, solve_static
+    from fe.wing.operators import assemble, eigenmodes, solve_static
 
     model = reduced_model()
     begin = time.perf_counter()

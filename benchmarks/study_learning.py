@@ -20,8 +20,7 @@ from benchmarks.seeds import outcomes
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import load_design
-from fe.wing.operators import assemble
-from fe.wing.responses import solve_static
+from fe.wing.operators import assemble, solve_static
 from twin_master.assets.asset_source import Asset, AssetReading, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.reading import Estimated, Outcomes

@@ -25,8 +25,7 @@ from fe.reduction.reduced_basis import MeasuredErrors, measured_errors, reduce_s
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import WingDesign, load_design
-from fe.wing.operators import AffineOperators, assemble
-from fe.wing.responses import solve_static
+from fe.wing.operators import AffineOperators, assemble, solve_static
 from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import structure_files
 

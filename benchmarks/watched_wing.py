@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
-from fe.wing.operators import assemble
-from fe.wing.responses import solve_static
+from fe.wing.operators import assemble, solve_static
 from reporting.files import atomic_write_text
 from scenarios import RECORDING_FOLDER
 from twin_master.assets.asset_source import AssetReading, StatelessAsset

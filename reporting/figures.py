@@ -162,7 +162,7 @@ def color_bar(figure: Figure, drawn: Any, label: str, **place: Any) -> Axes:
     return bar.ax
 
 
-def panel_label(axes: Axes, label: str, title: str = "", *, offset: float = 0.0) -> None:
+def panel_label(axes: Axes, label: str, title: str = "") -> None:
     """Put a panel's letter and short title above its upper left corner.
 
     Parameters
@@ -173,12 +173,8 @@ def panel_label(axes: Axes, label: str, title: str = "", *, offset: float = 0.0)
         Its letter, such as ``a``.
     title
         A few words beside the letter.
-    offset
-        How far left of the axes the text begins, as a fraction of the axes' width.
     """
-    text = axes.set_title("  ".join(part for part in (label, title) if part), loc="left")
-    if offset:
-        text.set_x(-offset)
+    axes.set_title("  ".join(part for part in (label, title) if part), loc="left")
 
 
 def to_svg(figure: Figure) -> bytes:

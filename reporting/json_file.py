@@ -1,10 +1,18 @@
-"""The one reader of JSON: whatever is wrong with a file becomes one sentence of the caller's exception."""
+"""The one reader of JSON: whatever is wrong with a file becomes one sentence of the caller's exception.
+
+Last records (dataclasses of numbers, words, arrays and other records) as plain data of JSON.
+"""
 
 import json
 from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from math import isfinite
 from pathlib import Path
 from typing import Any, NoReturn
+
+import numpy as np
 
 from reporting.text_file import check_nesting, decoded, read_text, too_deep
 
@@ -72,3 +80,23 @@ def _integer(digits: str) -> int:
     if len(digits) > _LONGEST_INTEGER or not -(2**63) <= (number := int(digits)) < 2**63:
         raise ValueError(f"an integer of {len(digits)} digits, and 64 bits are what a file may hold")
     return number
+
+
+def plain(value: Any, odd: Callable[[float], Any] = lambda _: None) -> Any:
+    """Return a value as JSON has it: records by their fields, arrays as lists.
+
+    `odd` says what stands for a number that is not finite: null.
+    """
+    if hasattr(value, "to_list"):  # what says itself how it is written, as a patch does
+        return value.to_list()
+    if isinstance(value, Enum):
+        return value.value
+    if is_dataclass(value):
+        return {item.name: plain(getattr(value, item.name), odd) for item in fields(value) if item.init}
+    if isinstance(value, Mapping):
+        return {str(name): plain(item, odd) for name, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, tuple | list):
+        return [plain(item, odd) for item in value]
+    return odd(value) if isinstance(value, float) and not isfinite(value) else value

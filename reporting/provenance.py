@@ -15,7 +15,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
-from reporting.record_json import plain
+from reporting.json_file import plain
 
 STACK = (
     "uav-twin", "numpy", "scipy", "scikit-fem", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf",
@@ -68,18 +68,10 @@ def collect_provenance(
     """Collect versions, source hashes and seed of what runs now."""
     return Provenance(
         seed=seed,
-        versions=stack_versions(distributions),
+        versions={"python": platform.python_version(), **{name: _version(name) for name in distributions}},
         source_hashes={package: source_hash(package) for package in packages},
         input_hashes=dict(sorted((input_hashes or {}).items())),
     )
-
-
-def stack_versions(distributions: Iterable[str] = STACK) -> dict[str, str]:
-    """Return the version of Python and of each distribution, in the order given."""
-    versions = {"python": platform.python_version()}
-    for name in distributions:
-        versions[name] = _version(name)
-    return versions
 
 
 @cache

@@ -43,33 +43,28 @@ def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -
         The file is not there, cannot be read, is not UTF-8 or not TOML, is nested too deeply, or holds an
         integer that 64 bits cannot.
     """
-    text = read_text(path, error, what=what)
-    return _parsed(text, f"The {what} {path}", error)
+    return parse_toml(read_text(path, error, what=what), f"The {what} {path}", error)
 
 
 def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> dict[str, Any]:
     """Return the content of TOML that was read elsewhere; `source` names it in the sentence of `error`."""
     text = decoded(content, source, error) if isinstance(content, bytes) else content
-    return _parsed(text, source, error)
-
-
-def _parsed(text: str, subject: str, error: type[Exception]) -> dict[str, Any]:
     # The time that `tomllib` takes for a dotted key grows with the square of its parts.
     if any(line.count(".") >= DEEPEST_NESTING for line in text.split("\n")):
-        keys = (found[1] or "" for found in _KEYS.finditer(text))
+        keys = (match[1] or "" for match in _KEYS.finditer(text))
         if any(key.count(".") >= DEEPEST_NESTING < len(re.findall(_PART, key)) for key in keys):
-            raise error(too_deep(subject))
+            raise error(too_deep(source))
     try:
-        content = tomllib.loads(text)
+        found = tomllib.loads(text)
     except tomllib.TOMLDecodeError as cause:
-        raise error(f"{subject} is not valid TOML: {cause}.") from cause
+        raise error(f"{source} is not valid TOML: {cause}.") from cause
     except RecursionError:
-        raise error(too_deep(subject)) from None
+        raise error(too_deep(source)) from None
     except ValueError:  # Python turns no text of more than 4,300 digits into an integer
-        raise error(said("text.digits", subject=subject)) from None
-    check_nesting(content, subject, error)
-    _check_integers(content, "", subject, error)
-    return content
+        raise error(said("text.digits", subject=source)) from None
+    check_nesting(found, source, error)
+    _check_integers(found, "", source, error)
+    return found
 
 
 def _check_integers(

@@ -5,8 +5,7 @@ from typing import Any
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import Losses
 from fe.runtime.transient import ModalIntegrator
-from fe.wing.operators import AffineWing
-from fe.wing.responses import solve_static
+from fe.wing.operators import AffineWing, solve_static
 
 
 def wing_integrator(

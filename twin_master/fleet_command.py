@@ -117,7 +117,7 @@ def _watched_table(standing: Mapping[str, Any]) -> "parts.Table":
         alarms = str(asset["alarms"] or "")
         rows.append((name, str(last["turn"]), last["control"], *cells, last["next_control"], alarms))
     headings = "asset", "turn", "control", *states, "next", "alarms"
-    table = parts.console_table(headings, rows, terminal.console().width)
+    table = terminal.console_table(headings, rows, terminal.console().width)
     table.title = _heading(standing)
     return table
 

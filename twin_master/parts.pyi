@@ -11,7 +11,6 @@ from fe.structure.operators import write_vtu as write_vtu
 from fe.wing.design import load_design as load_design
 from fmu_asset.errors import FmuError as FmuError
 from reporting.arrays import Float as Float
-from reporting.console_table import console_table as console_table
 from reporting.figures import to_png as to_png
 from reporting.figures import to_svg as to_svg
 from reporting.page import Words as Words

@@ -72,11 +72,11 @@ from discrepancy.verdict_folder import check_verdict_folder as check_verdict_fol
 from discrepancy.verdict_folder import write_verdict_folder as write_verdict_folder
 from discrepancy.workflow import checked as checked
 from discrepancy.workflow import investigate as investigate
-from fe.reduction.fields import write_modes_vtu as write_modes_vtu
-from fe.reduction.fields import write_wing_vtu as write_wing_vtu
 from fe.reduction.model_cache import reduced_model as reduced_model
 from fe.reduction.model_cache import reduced_structure as reduced_structure
 from fe.reduction.model_cache import wing_fields as wing_fields
+from fe.reduction.model_cache import write_modes_vtu as write_modes_vtu
+from fe.reduction.model_cache import write_wing_vtu as write_wing_vtu
 from fe.reduction.reduced_basis import measured_errors as measured_errors
 from fe.runtime.patch import ModelPatch as ModelPatch
 from fe.runtime.reduced import ReducedModel as ReducedModel
@@ -133,9 +133,9 @@ from reporting.figures import publication_style as publication_style
 from reporting.figures import save_figure as save_figure
 from reporting.figures import to_png as to_png
 from reporting.figures import to_svg as to_svg
+from reporting.json_file import plain as plain
 from reporting.provenance import collect_provenance as collect_provenance
 from reporting.provenance import hash_file as hash_file
-from reporting.record_json import plain as plain
 from reporting.table_file import table_text as table_text
 from reporting.toml_file import read_toml as read_toml
 from twin_master.assets.resolution import Overrides as Overrides

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
+from fe.runtime.state import STANDARD_GRAVITY
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fe.wing.operators import (
     ROOT_UNKNOWNS,
@@ -28,7 +29,6 @@ from fe.wing.operators import (
     point_masses,
     section_displacement,
 )
-from fe.wing.turn_load import STANDARD_GRAVITY
 
 FloatArray = NDArray[np.float64]
 

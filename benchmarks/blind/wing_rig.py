@@ -10,7 +10,7 @@ from benchmarks.blind.laws import DRAG, POWER, Law
 from benchmarks.blind.plan import TrialPlan
 from benchmarks.blind.structure import Release, Structure
 from benchmarks.blind.wing_basis import WingBasis, WingBasisStore
-from fe.wing.turn_load import STANDARD_GRAVITY
+from fe.runtime.state import STANDARD_GRAVITY
 
 FloatArray = NDArray[np.float64]
 

@@ -36,8 +36,7 @@ from calibration.static.errors_in_variables import FitQuality, assess_fit
 from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import PUBLISHED_LINE, child_seed
 from calibration.wing.lab_data import LabData, published_data, read_lab_folder
-from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
-from fe.reduction.model_cache import reduced_model, wing_fields
+from fe.reduction.model_cache import WingFields, reduced_model, wing_fields, write_modes_vtu, write_wing_vtu
 from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting.figures import LEVELS, panels, publication_style
@@ -394,7 +393,7 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
     titles : sequence of str
         One for each mode.
     """
-    # the skin and the damage regions in it, see `fe.reduction.fields.WingFields`
+    # the skin and the damage regions in it, see `fe.reduction.model_cache.WingFields`
     skin = fields.cells[fields.region <= len(fields.regions)][:, :8]
     upper = np.unique(skin[fields.points[skin][:, :, 2].mean(axis=1) > 0.0])
     points = fields.points[upper]

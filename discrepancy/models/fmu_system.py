@@ -184,7 +184,7 @@ class FmuPace(FmuRuns):
         self._linear, self._sizes = dict[Hashable, bool](), dict[str, float]()
         self._systems, self._paces = Memory(KEPT), Memory()
 
-    def refusals(self) -> AbstractContextManager[None, None]:
+    def refusals(self) -> AbstractContextManager[None]:
         """Return the context that says of which model it is what the FMU refuses."""
         return ModelError.instead_of(FmuError, before=f"The FMU model {self.description.name!r}: ")
 

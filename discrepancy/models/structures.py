@@ -23,11 +23,10 @@ from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import PLANFORM, STATION_PORTS
 from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, Primitive
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedState, PatchedWing
 from fe.runtime.reduced import ReducedModel, ReducedState
 from fe.runtime.state import wing_names
-from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
+from fe.runtime.wing_rows import LOAD_PLACE, PORTS, PatchArrays, strain_gauge
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
 

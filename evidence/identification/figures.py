@@ -91,7 +91,7 @@ def identifiability_figure(fit: DesignFit, analysis: Identifiability) -> Figure:
         right.set_yticks(places, analysis.names, fontsize=6)
         right.set_ylim(-0.7, len(places) - 0.3)
         right.set_xlabel("width after / before")
-        panel_label(right, "b", "what the data leave open", offset=0.75)
+        right.set_title("b  what the data leave open", loc="left", x=-0.75)
     return figure
 
 

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from fe.runtime.state import STANDARD_GRAVITY
 from fe.structure.affine import StiffnessTerm, designed
 from fe.wing.design import WingDesign, wing_structure
 from fe.wing.operators import ROOT_UNKNOWNS, AffineWing, outputs, patch_pieces, stiffness_parts
-from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY
+from fe.wing.parts import DISTRIBUTIONS
 
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_strain
 from .plate_frame import frame_stiffness
@@ -244,7 +245,7 @@ def _lift(layout: PlateLayout) -> FloatArray:
     """
     design, plate = layout.design, layout.plate
     points, plan = plate.points, design.planform
-    per_length = DISTRIBUTIONS[design.lift.distribution](plan)(points[..., 1] / plan.semi_span)
+    per_length = DISTRIBUTIONS[design.lift.distribution](plan, points[..., 1] / plan.semi_span)
     chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * points[..., 1] / plan.semi_span
     lift = design.lift
     pressure = per_length * (1.0 - layout.chord_fraction(points)) ** lift.chordwise_exponent / chord

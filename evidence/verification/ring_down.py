@@ -62,7 +62,7 @@ def ring_down_agreement(
     model = reduce_structure(operators).model
     vector = model.vector(state.values, state.stiffness_loss)
     integrator = ModalIntegrator(model, vector, state.damping_alpha, state.damping_beta)
-    frequency, row = integrator.modes.frequency, integrator.modes.output[-1]
+    frequency, row = integrator.modes.frequency, model.modes(vector).output[-1]
     increment, steps = 1.0 / (steps_per_period * float(frequency[0])), round(periods * steps_per_period)
     initial = integrator.outputs(integrator.at_rest((0.0, TEST_FORCE)))[-1]
     current = integrator.released(initial, (0.0, 0.0), TIP_FORCE)

@@ -6,7 +6,7 @@ after the other. Strains are in Voigt order 11, 22, 33, 23, 13, 12 with engineer
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,12 +44,6 @@ def strain_matrix(gradients: FloatArray) -> FloatArray:
         if i != j:
             B[..., row, :, j] += gradients[..., i]
     return B.reshape(*B.shape[:-2], 3 * nodes)
-
-
-def point_jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatArray:
-    """Jacobians dx_i/dX_j (p, 3, 3) at one local place (p, 3) of each of p cells with nodes (p, k, 3)."""
-    _, slopes = kind.shape_functions(local)
-    return np.asarray(np.einsum("pai,paj->pij", nodes, slopes))
 
 
 def stiffness_blocks(
@@ -106,12 +100,17 @@ def isotropic_compliance(young_modulus: float, poisson_ratio: float) -> FloatArr
     return orthotropic_compliance(young_modulus, poisson_ratio, shear)
 
 
+def unit_vector(vectors: ArrayLike) -> FloatArray:
+    """Vectors (..., 3) of length one along vectors (..., 3)."""
+    given = np.asarray(vectors, dtype=np.float64)
+    return np.asarray(given / np.linalg.norm(given, axis=-1, keepdims=True))
+
+
 def axes_of(first: ArrayLike, second: ArrayLike) -> FloatArray:
     """Axes (3, 3), rows of length one: along a vector, in the plane of both at right angles to it, across."""
     one, other = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     across = np.cross(one, other)
-    axes = np.array([one, np.cross(across, one), across])
-    return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    return unit_vector([one, np.cross(across, one), across])
 
 
 def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
@@ -187,23 +186,23 @@ class CellMesh:
         values, _ = self.kind.shape_functions(local)
         return np.asarray(np.einsum("qa,nai->nqi", values, self.nodes[cells]))
 
-    def strains(
-        self, displacement: FloatArray, cells: IntArray | slice = slice(None), local: FloatArray | None = None
-    ) -> FloatArray:
-        """Strains (n, q, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain.
+    def jacobians_at(self, cells: IntArray, local: FloatArray) -> FloatArray:
+        """Jacobians dx_i/dX_j (p, 3, 3) at one local place (p, 3) of each of p cells (p,)."""
+        return np.asarray(np.einsum("pai,paj->pij", self.nodes[cells], self.kind.shape_functions(local)[1]))
+
+    def strains(self, displacement: FloatArray, local: FloatArray | None = None) -> FloatArray:
+        """Strains (nc, q, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain.
 
         Parameters
         ----------
         displacement : (nodes, 3) m
             Of all nodes.
-        cells : (n,) or slice, optional
-            All cells by default.
         local : (q, 3), optional
-            Local places in them; by default their centre.
+            Local places in the cells; by default their centre.
         """
         places = np.mean(self.kind.corners, axis=0)[None] if local is None else local
-        slopes, _ = gradients(self.kind, self.nodes[cells], places)
-        moved = displacement[self.cells[cells]].reshape(len(slopes), -1)
+        slopes, _ = gradients(self.kind, self.nodes, places)
+        moved = displacement[self.cells].reshape(len(slopes), -1)
         return np.asarray(np.einsum("nqij,nj->nqi", strain_matrix(slopes), moved))
 
     def strain_rows(
@@ -220,9 +219,8 @@ class CellMesh:
         direction : (p, 3)
             Unit vectors along which the strain is.
         """
-        nodes = self.nodes[cells]
         _, slopes = self.kind.shape_functions(local)
-        inverse = np.linalg.inv(point_jacobians(self.kind, nodes, local))
+        inverse = np.linalg.inv(self.jacobians_at(cells, local))
         slope = np.asarray(share)[:, None] * np.einsum("pai,pij,pj->pa", slopes, inverse, direction)
         values = slope[:, :, None] * direction[:, None, :]
         rows = np.repeat(owner, 3 * self.kind.node_count)
@@ -237,25 +235,17 @@ class CellMesh:
         points = len(self.kind.stiffness_rule[1])
         moduli = np.broadcast_to(elasticity, (len(cells), 6, 6))
         factors = np.broadcast_to(factor, (len(cells), points))
-
-        def blocks(part: slice) -> FloatArray:
-            return stiffness_blocks(self.kind, self.nodes[cells[part]], moduli[part], factors[part])
-
-        return self._assembled(cells, blocks, 3)
+        return self._assembled(3, partial(stiffness_blocks, self.kind), cells, moduli, factors)
 
     def mass(self, cells: IntArray, density: ArrayLike, rule: Rule | None = None) -> sparse.csr_array:
         """Mass, csr (nodes, nodes) [kg], of one component of cells (n,) with density (n,) [kg/m^3]."""
-        densities = np.broadcast_to(density, len(cells))
-
-        def blocks(part: slice) -> FloatArray:
-            own = rule or self.kind.mass_rule
-            return mass_blocks(self.kind, self.nodes[cells[part]], densities[part], own)
-
-        return self._assembled(cells, blocks, 1)
+        blocks = partial(mass_blocks, self.kind, rule=rule or self.kind.mass_rule)
+        return self._assembled(1, blocks, cells, np.broadcast_to(density, len(cells)))
 
     def _assembled(
-        self, cells: IntArray, blocks: Callable[[slice], FloatArray], components: int
+        self, components: int, blocks: Callable[..., FloatArray], cells: IntArray, *values: FloatArray
     ) -> sparse.csr_array:
+        """Sum the arrays that `blocks` makes of the nodes of cells (n,), and of values (n, ...) of each."""
         size = components * len(self.points)
         total = sparse.csr_array((size, size))
         together = max(BATCH, _TRIPLETS // (components * self.kind.node_count) ** 2)
@@ -264,9 +254,10 @@ class CellMesh:
             unknowns = self.unknowns_of(cells[start:last], components).astype(np.int32)
             width = unknowns.shape[1]
             parts = (slice(first, min(first + BATCH, last)) for first in range(start, last, BATCH))
-            values = np.concatenate([blocks(part).ravel() for part in parts])
+            entries = [blocks(self.nodes[cells[part]], *(own[part] for own in values)) for part in parts]
             places = (np.repeat(unknowns, width, axis=1).ravel(), np.tile(unknowns, (1, width)).ravel())
-            total = total + sparse.coo_array((values, places), shape=total.shape).tocsr()
+            summed = sparse.coo_array((np.concatenate(entries).ravel(), places), shape=total.shape)
+            total = total + summed.tocsr()
         return total
 
 

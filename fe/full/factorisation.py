@@ -58,28 +58,20 @@ class Front(NamedTuple):
     parent: int
 
 
-class Elimination(NamedTuple):
-    """Order of elimination of a sparse symmetric matrix.
-
-    Attributes
-    ----------
-    order : (n,)
-        Unknown at each place of the order.
-    fronts : tuple of Front
-        In the order of elimination.
-    """
-
-    order: IntArray
-    fronts: tuple[Front, ...]
-
-
-def analyse(matrix: sparse.csr_array) -> Elimination:
+def analyse(matrix: sparse.csr_array) -> tuple[IntArray, tuple[Front, ...]]:
     """Find an order of elimination by nested dissection, and the fronts that follow from it.
 
     Parameters
     ----------
     matrix : csr (n, n)
         Symmetric pattern with a full diagonal; the values do not count.
+
+    Returns
+    -------
+    order : (n,)
+        Unknown at each place of the order.
+    fronts : tuple of Front
+        In the order of elimination.
     """
     first, group = _twins(matrix)
     graph = matrix[first][:, first]
@@ -94,7 +86,7 @@ def analyse(matrix: sparse.csr_array) -> Elimination:
         Front(int(offset[start]), int(offset[end]), _expanded(boundary, size, offset), parent)
         for start, end, boundary, parent in _boundaries(graph[order], place, starts)
     )
-    return Elimination(np.argsort(place[group], kind="stable"), fronts)
+    return np.argsort(place[group], kind="stable"), fronts
 
 
 def _twins(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]:
@@ -135,7 +127,7 @@ def _expanded(groups: IntArray, size: IntArray, offset: IntArray) -> IntArray:
 
 
 @lru_cache(maxsize=2)
-def _analysed(size: int, starts: bytes, columns: bytes) -> Elimination:
+def _analysed(size: int, starts: bytes, columns: bytes) -> tuple[IntArray, tuple[Front, ...]]:
     """Analyse a pattern; a matrix of the same unknowns with other values, as after damage, asks again."""
     places = np.frombuffer(columns, dtype=np.int32), np.frombuffer(starts, dtype=np.int32)
     return analyse(sparse.csr_array((np.ones(len(places[0]), dtype=np.int8), *places), shape=(size, size)))
@@ -171,8 +163,7 @@ class Factorisation:
         if not np.all(matrix.diagonal() > 0.0):
             self._refuse(matrix, "it has a diagonal entry that is not positive")
         places = (part.astype(np.int32).tobytes() for part in (matrix.indptr, matrix.indices))
-        elimination = _analysed(matrix.shape[0], *places)
-        self._order, self._fronts = elimination.order, elimination.fronts
+        self._order, self._fronts = _analysed(matrix.shape[0], *places)
         self._factors: list[tuple[FloatArray, FloatArray]] = []
         with _threads().limit(limits=1):
             self._eliminate(matrix)

@@ -18,10 +18,10 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.sentences import said
+from fe.structure.tables import StructureSettings
 from reporting.progress import Stage
 from reporting.words import counted
 
-from .settings import StructureSettings
 from .terms import ReductionTerms, State
 
 OUTPUTS_TOGETHER = 8

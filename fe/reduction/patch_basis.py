@@ -15,8 +15,8 @@ from scipy.linalg import eigh
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedState, PatchedWing
+from fe.runtime.wing_rows import PatchArrays
 from fe.structure.affine import natural_frequencies
 from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators

@@ -20,10 +20,10 @@ from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
 from fe.sentences import said
 from fe.structure.affine import AffineStructure, natural_frequencies, static_response
+from fe.structure.tables import StructureSettings
 from reporting.progress import Progress, Stage, reporter
 
 from .certified_basis import TOGETHER, StaticReduction, fewest_directions
-from .settings import StructureSettings
 from .terms import ModalState, ReductionTerms, State
 
 START_ITERATIONS = 4
@@ -189,7 +189,8 @@ def reduce_structure(
     SolutionError
         If the full model cannot be solved.
     """
-    settings, progress = settings or StructureSettings.of(structure.design), reporter(progress)
+    limits, progress = structure.design.reduction, reporter(progress)
+    settings = settings or StructureSettings(limits.tolerance, limits.most_solutions)
     terms = ReductionTerms(replace(structure, ranges=structure.ranges | settings.ranges))
     _check(terms)
     with progress.stage("Factorising the structure"):

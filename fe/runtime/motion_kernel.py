@@ -197,34 +197,34 @@ def second_half(go: Steps, k: int, ports: Ports, kept: Kept, state: State, h: fl
 
 
 def acceleration(
-    go: Steps, ports: Ports, q: FloatArray, v: FloatArray, forces: FloatArray, push: float, t: float, m: int
-) -> float:
-    """Return the acceleration of a mode under a push and the forces of laws; those of speed have none."""
-    total = push - go.stiffness[m] * (1.0 + ports.rate * t) * q[m]
-    for k in range(len(q)):
-        total -= go.damping[m, k] * v[k]
-    for k in range(len(forces)):
-        total -= ports.acts[k, m] * forces[k]
-    return float(total)
+    go: Steps, ports: Ports, j: int, q: FloatArray, v: FloatArray, forces: FloatArray, push: FloatArray,
+    t: float,
+) -> float:  # fmt: skip
+    """Return the acceleration of the port of law `j` under a push of the modes and the forces of laws.
+
+    Laws of speed have none.
+    """
+    total = 0.0
+    for m in range(len(q)):
+        own = push[m] - go.stiffness[m] * (1.0 + ports.rate * t) * q[m]
+        for k in range(len(q)):
+            own -= go.damping[m, k] * v[k]
+        for k in range(len(forces)):
+            own -= ports.acts[k, m] * forces[k]
+        total += ports.rows[j, m] * own
+    return total
 
 
 def turn_over(
     go: Steps, k: int, ports: Ports, kept: Kept, state: State, j: int, now: float, h: float
 ) -> None:
     """Correct speed and position of a port whose friction turned over within a step."""
-    at_begin = -2.0 * kept.lost[j] / h  # acceleration at both ends, as friction of the first sign has it
-    at_end = at_begin
-    for m in range(len(state.q)):
-        first = acceleration(go, ports, kept.q, kept.v, kept.forces, go.begin[k, m], go.time[k], m)
-        last = acceleration(
-            go, ports, state.q, state.v, state.memory[:, FORCE], go.end[k, m], go.time[k] + h, m
-        )
-        at_begin += ports.rows[j, m] * first
-        at_end += ports.rows[j, m] * last
-    v = at_port(ports.rows, j, state.v)
-    change, way, held = speed.crossing(
-        ports.values[j], kept.speed[j], v - kept.lost[j], (at_begin, at_end), kept.lost[j], now, h
-    )
+    lost, forces, end = kept.lost[j], state.memory[:, FORCE], go.time[k] + h
+    at_begin = acceleration(go, ports, j, kept.q, kept.v, kept.forces, go.begin[k], go.time[k])
+    at_end = acceleration(go, ports, j, state.q, state.v, forces, go.end[k], end)
+    friction = -2.0 * lost / h  # of the first sign, at both ends
+    v, slopes = at_port(ports.rows, j, state.v), (at_begin + friction, at_end + friction)
+    change, way, held = speed.crossing(ports.values[j], kept.speed[j], v - lost, slopes, lost, now, h)
     if held == 1.0:
         change = -v
         x = at_port(ports.rows, j, state.q)
@@ -247,19 +247,8 @@ def record(
             x, v = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
             force = speed.steady(law, x, v)
             if memory[HELD] == 1.0:  # what it takes to hold the port
-                force = 0.0
-                for m in range(len(state.q)):
-                    own = acceleration(
-                        go,
-                        ports,
-                        state.q,
-                        state.v,
-                        state.memory[:, FORCE],
-                        push[m],
-                        go.time[k],
-                        m,
-                    )
-                    force += ports.rows[j, m] * own / weight
+                others = state.memory[:, FORCE]
+                force = acceleration(go, ports, j, state.q, state.v, others, push, go.time[k]) / weight
                 if law[1] == 0.0:
                     most = speed.strength(law, x, weight) / weight
                     force = min(max(force, -most), most)

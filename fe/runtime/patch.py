@@ -16,14 +16,14 @@ import numpy as np
 from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .laws import LAWS
-from .laws.hysteresis import BoucWen as BoucWen
-from .laws.hysteresis import MicroSlip as MicroSlip
 from .laws.interface import PortForce as PortForce
+from .laws.position import BoucWen as BoucWen
+from .laws.position import FreePlay as FreePlay
+from .laws.position import MicroSlip as MicroSlip
+from .laws.position import PowerStiffness as PowerStiffness
+from .laws.position import SineForce as SineForce
 from .laws.speed import Overflow as Overflow
 from .laws.speed import PowerDamping as PowerDamping
-from .laws.springs import FreePlay as FreePlay
-from .laws.springs import PowerStiffness as PowerStiffness
-from .laws.springs import SineForce as SineForce
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window
 from .primitive import course_of as course_of

@@ -1,7 +1,7 @@
 """The wing with changes, online: what the primitives of `patch` do to structure, loads and outputs.
 
 NumPy and relative imports only: this file is copied into the FMU. The arrays are those of
-`fe.runtime.patch_arrays`; the equations are in `docs/patches.md`.
+`fe.runtime.wing_rows`; the equations are in `docs/patches.md`.
 """
 
 from collections.abc import Callable

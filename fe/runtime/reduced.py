@@ -179,11 +179,8 @@ class ReducedModel(ReducedArrays):
         """
         if isinstance(values, np.ndarray):
             return values
-        found, first = self.nominal.copy(), len(self.parameters)
-        found[first : first + len(self.regions)] = self.losses(stiffness_loss)
-        for name, value in {**(values or {}), **named}.items():
-            found[self._place(name)] = value
-        return found
+        losses = dict(zip(self.regions, self.losses(stiffness_loss), strict=True))
+        return np.asarray(self.vectors({**losses, **(values or {}), **named})[0])
 
     def vectors(self, columns: Mapping[str, npt.ArrayLike]) -> FloatArray:
         """Return all that can be chosen, (B, V), of columns (B,) or numbers by name; the others are nominal.
@@ -196,16 +193,13 @@ class ReducedModel(ReducedArrays):
         arrays = np.broadcast_arrays(np.zeros(1), *(np.asarray(column) for column in columns.values()))
         found = np.tile(self.nominal, (len(arrays[0]), 1))
         for name, array in zip(columns, arrays[1:], strict=True):
-            found[:, self._place(name)] = array
+            if name not in self.chosen:
+                raise OutsideModelError(
+                    f"The structure {self.name} has nothing named {name!r} to be chosen; it has "
+                    f"{', '.join(self.chosen)}."
+                )
+            found[:, self.chosen.index(name)] = array
         return found
-
-    def _place(self, name: str) -> int:
-        if name not in self.chosen:
-            raise OutsideModelError(
-                f"The structure {self.name} has nothing named {name!r} to be chosen; it has "
-                f"{', '.join(self.chosen)}."
-            )
-        return self.chosen.index(name)
 
     def check_validity(self, values: Sequence[float]) -> None:
         """Check that each of the values (V,) lies in the validity box; also refuses NaN and infinity.

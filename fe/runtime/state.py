@@ -26,8 +26,10 @@ def region_names(count: int) -> tuple[str, ...]:
 WING = "uav_wing"
 """Name of the reduced model of a wing."""
 
-LIFT, TIP_FORCE = 0, 1
-"""Numbers of the loads of a wing."""
+TIP_FORCE = 1
+"""Number of the load near the tip among those of a wing; the first is the lift."""
+STANDARD_GRAVITY = 9.80665
+"""[m/s^2]."""
 
 
 def wing_names(regions: tuple[str, ...]) -> tuple[str, ...]:
@@ -138,11 +140,8 @@ class DigitalState:
     @property
     def values(self) -> dict[str, float]:
         """Factor and masses by the names of `wing_names`."""
-        return {
-            "young_modulus_factor": self.young_modulus_factor,
-            "servo_mass": self.servo_mass,
-            "pitot_mass": self.pitot_mass,
-        }
+        names = ("young_modulus_factor", "servo_mass", "pitot_mass")
+        return {name: getattr(self, name) for name in names}
 
     def __post_init__(self) -> None:
         _require("young_modulus_factor", self.young_modulus_factor, positive=True)

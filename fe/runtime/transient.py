@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import exp, isfinite
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,8 @@ from .modal_system import ModalSystem, rayleigh_damping_ratio
 if TYPE_CHECKING:
     from .motion import Laws
     from .motion_arrays import ModalMotion
+    from .patched_wing import PatchedWing
+    from .reduced import ReducedModel
 
 
 INSTANT = 1e-6
@@ -78,48 +80,6 @@ class TransientState:
         return cls(place, velocity, load, rest.reshape(memory.shape))
 
 
-class StructureState(Protocol):
-    """A structure in one state of health, parameters and masses, in n coordinates of its own.
-
-    Attributes
-    ----------
-    laws : Laws or None
-        J forces at its ports.
-    loads : (n, L + J) ndarray
-        Unit loads, then those at the ports of the laws; also what their points move by.
-    answers : (n, L + J) ndarray
-        Displacements at rest under them.
-    modes : object
-        M modes, with their `frequency` [Hz].
-    shapes, to_modes : (n, M), (M, n) ndarray
-        Displacements of the modes, mass-normalised, and the modal coordinates of a displacement.
-    outputs, accelerations : (O, n), (A, n) ndarray
-        Rows of what is read; the last of the outputs is where a release is measured.
-    components : (2, G, n) ndarray
-        Rows of the strains across the gauges and in shear; none where no sensor asks for them.
-    holding : int or None
-        Number of the load that acts before a release alone, and whose end omitted modes follow as they do
-        forces of laws; None: there is none, and they follow at once.
-    on_modes : frozenset of str
-        Ports whose position is that of the modes alone.
-    """
-
-    laws: "Laws | None"
-    loads: FloatArray
-    answers: FloatArray
-    modes: Any
-    shapes: FloatArray
-    to_modes: FloatArray
-    outputs: FloatArray
-    accelerations: FloatArray
-    components: FloatArray
-    holding: int | None
-    on_modes: frozenset[str]
-
-    def acting(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients (L,) of the loads at values (V,) of all that can be chosen."""
-
-
 class ModalIntegrator:
     """Response of a structure in time, at one state of health, parameters and masses.
 
@@ -139,8 +99,16 @@ class ModalIntegrator:
 
     Attributes
     ----------
-    structure : StructureState
-        The structure at this state.
+    structure : ReducedState or PatchedState
+        The structure in this state, in n coordinates of its own: its `laws`, J forces at its ports, or None;
+        `loads` (n, L + J), unit loads, then those at the ports of the laws, also what their points move by,
+        and `answers` (n, L + J), displacements at rest under them; M `modes`, their `shapes` (n, M),
+        mass-normalised, and `to_modes` (M, n), modal coordinates of a displacement; rows of `outputs` (O, n),
+        the last of them where a release is measured, and `accelerations` (A, n); rows `components` (2, G, n)
+        of the strains across the gauges and in shear, none where no sensor asks for them; `holding`, the
+        number of the load that acts before a release alone, and whose end omitted modes follow as they do
+        forces of laws, None where they follow at once; `on_modes`, ports whose position is that of the modes
+        alone; `acting`, the coefficients (L,) of the loads at values (V,) of all that can be chosen.
     modes : object
         Its modes.
     damping_ratio : (M,) ndarray
@@ -157,12 +125,13 @@ class ModalIntegrator:
     """
 
     def __init__(
-        self, model: Any, vector: FloatArray, damping_alpha: float, damping_beta: float, *changes: Any
-    ) -> None:
+        self, model: "ReducedModel | PatchedWing", vector: FloatArray, damping_alpha: float,
+        damping_beta: float, *changes: Any,
+    ) -> None:  # fmt: skip
         for name, value in (("damping_alpha", damping_alpha), ("damping_beta", damping_beta)):
             if not (isfinite(value) and value >= 0.0):
                 raise InvalidStateError(f"{name} must be zero or a positive finite number, but is {value!r}.")
-        self.structure: StructureState = model.at(vector, *changes)
+        self.structure = model.at(vector, *changes)
         self._rayleigh = damping_alpha, damping_beta
         self.modes, self._laws = self.structure.modes, self.structure.laws
         self._count = 0 if self._laws is None else len(self._laws)
@@ -242,17 +211,14 @@ class ModalIntegrator:
         acting, none = np.array(load, dtype=np.float64), np.zeros(0)
         if not self._count:
             return TransientState(none, none, acting)
-        answers = self._port_answers
-        _, memory = self._loaded(
-            answers[:, : self._loads] @ acting,
-            answers[:, self._loads :],
-            None if before is None else before.memory,
-            None if before is None else answers[:, : self._loads] @ before.load,
-        )
+        assert self._laws is not None
+        linear, compliance = np.split(self._port_answers, [self._loads], axis=1)
+        before = before or TransientState(none, none, np.zeros(self._loads), self._laws.memory())
+        _, memory = self._loaded(linear @ acting, compliance, before.memory, linear @ before.load)
         return TransientState(none, none, acting, memory)
 
     def _loaded(
-        self, linear: FloatArray, compliance: FloatArray, memory: FloatArray | None, start: FloatArray | None
+        self, linear: FloatArray, compliance: FloatArray, memory: FloatArray, start: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return forces (J,) and memory of the laws at linear positions (J,), see `static_solution`."""
         from .motion import static_solution

@@ -1,22 +1,140 @@
-"""The wing for patches, its rows: displacements, loads, ports and outputs as `patch` changes them.
+"""The wing for patches: its arrays, checked, and its rows: displacements, loads, ports, outputs.
 
-First local losses of the skin: what strips of the wing keep of its stiffness, what gauges among them read.
-
-NumPy and relative imports only: this file is copied into the FMU. The arrays are those of
-`fe.runtime.patch_arrays`; the equations are in `docs/patches.md`.
+First the arrays and their file, then local losses of the skin: what strips of the wing keep of its stiffness,
+what gauges among them read. NumPy and relative imports only: this file is copied into the FMU. The equations
+are in `docs/patches.md`.
 """
 
 import re
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from math import inf
+from sys import float_info
+from typing import Annotated, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from . import patch as primitives
-from .arrays import FloatArray, IntArray
+from .arrays import FloatArray, IntArray, KeptArrays
 from .errors import InvalidPatchError
 from .motion import STATION_COUNT, STATION_PORTS, at_stations
-from .patch_arrays import PatchArrays
+from .state import STANDARD_GRAVITY, wing_names
+
+Positive = Annotated[float, float_info.min, inf]
+
+
+@dataclass(frozen=True, repr=False)
+class PatchArrays(KeptArrays):
+    """Dense matrices and rows of a wing in a basis of n vectors, made for changes of `fe.runtime.patch`.
+
+    Attributes
+    ----------
+    validity_box : (K + 5, 2) ndarray
+        Least and largest value of each of `fe.runtime.state.wing_names`, SI units.
+    largest_loss, largest_compliance, largest_mass : float
+        Stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] up to which the basis
+        was made; the accuracy falls slowly beyond.
+    stiffness : (K + 2, n, n) ndarray
+        Stiffness terms: skin, the K damage regions, the rest.
+    mass : (3, n, n) ndarray
+        Mass terms: structure, 1 kg in each servo, 1 kg in the pitot.
+    strip_lines : (S + 1,) ndarray
+        Edges of the strips of the skin [m from the root].
+    strip_stiffness : (T, n (n + 1) / 2) ndarray of float32
+        Lower triangles, row by row, of the parts of the stiffness terms of the skin that lie in strips.
+    strip_of, term_of : (T,) ndarray of int64
+        Strip, and stiffness term, of each part.
+    flap_row : (n,) ndarray
+        Flapping rotation of the root [rad].
+    flap_spring : float
+        Spring at the root [N m/rad].
+    semi_span, root_chord, tip_chord : float
+        L and the chords [m].
+    straight_chord_line : float
+        Chord fraction of the line that runs straight along the span.
+    load_place : float
+        Distance of the static test's load from the root [m].
+    stations : (P,) ndarray
+        Sections: mesh lines and the middles between them [m from the root], P odd.
+    line_chord : (L,) ndarray
+        Chord fractions of the elastic line and of the other lines, ascending; L at least 2.
+    line_rows : (L + 2, P, n) ndarray
+        Displacement of the elastic line along x, y and z and of the other lines along z.
+    station_weights : (P,) ndarray
+        Share of the planform's area; sums to one.
+    load_tip : (n,) ndarray
+        Load of 1 N at the place of the static test; as a row, the displacement there.
+    load_lift : (n,) ndarray
+        Load of load factor 1 [N].
+    lift_rows : (P, n) ndarray
+        The same without the weight, by stations.
+    weight : (n,) ndarray
+        Weight, downwards [N].
+    strain_rows : (3, G, n) ndarray
+        Strain of the gauges along the span, across it, and engineering shear strain, positive as measured.
+    gauge_stations : (G,) ndarray
+        Middles of the gauges [m from the root].
+    gauge_length : float
+        Length along the span over which they average [m].
+    tip_row : (n,) ndarray
+        Displacement of the tip.
+    start_shapes : (n, r) ndarray
+        Modes of the wing as it was, from which the modes of a patched one are iterated.
+    """
+
+    what = "a wing for patches"
+    version = 4
+
+    validity_box: Annotated[FloatArray, "chosen", 2]
+    largest_loss: Positive
+    largest_compliance: Positive
+    largest_mass: Positive
+    stiffness: Annotated[FloatArray, "terms", "basis", "basis"]
+    mass: Annotated[FloatArray, 3, "basis", "basis"]
+    strip_lines: Annotated[FloatArray, "lines"]
+    strip_stiffness: Annotated[npt.NDArray[np.float32], "parts", "triangle"]
+    strip_of: Annotated[IntArray, "parts"]
+    term_of: Annotated[IntArray, "parts"]
+    flap_row: Annotated[FloatArray, "basis"]
+    flap_spring: Positive
+    semi_span: Positive
+    root_chord: Positive
+    tip_chord: Positive
+    straight_chord_line: Annotated[float, 0.0, 1.0]
+    load_place: Positive
+    stations: Annotated[FloatArray, "stations"]
+    line_chord: Annotated[FloatArray, "chords"]
+    line_rows: Annotated[FloatArray, "directions", "stations", "basis"]
+    station_weights: Annotated[FloatArray, "stations"]
+    load_tip: Annotated[FloatArray, "basis"]
+    load_lift: Annotated[FloatArray, "basis"]
+    lift_rows: Annotated[FloatArray, "stations", "basis"]
+    weight: Annotated[FloatArray, "basis"]
+    strain_rows: Annotated[FloatArray, 3, "gauges", "basis"]
+    gauge_stations: Annotated[FloatArray, "gauges"]
+    gauge_length: Annotated[float, 0.0, inf]
+    tip_row: Annotated[FloatArray, "basis"]
+    start_shapes: Annotated[FloatArray, "basis", "started"]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        places = ((self.strip_of, len(self.strip_lines) - 1), (self.term_of, len(self.regions) + 1))
+        if any(not set(numbers) <= set(range(count)) for numbers, count in places):
+            self.refuse("has strips that do not fit its strip lines")
+        if np.any(np.diff(self.stations) <= 0.0) or np.any(np.diff(self.strip_lines) <= 0.0):
+            self.refuse("must have stations that rise from the root to the tip")
+
+    def _lengths(self) -> dict[str | int, int]:
+        size, chords = self.stiffness.shape[-1], len(self.line_chord)
+        return {
+            "chosen": len(wing_names(self.regions)),
+            "terms": len(self.regions) + 2,
+            "triangle": size * (size + 1) // 2,
+            "chords": max(chords, 2),
+            "directions": chords + 2,
+        }
+
 
 TIP_OFFSET = 1.02
 """Where the weight of a part of the skin would vanish, in semi-spans."""
@@ -96,8 +214,6 @@ _STRAIN = re.compile(r"strain\[(\d+)\](\.transverse|\.shear)?")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
 
-STANDARD_GRAVITY = 9.80665
-"""[m/s^2]; that of `fe.wing.turn_load`, which is not copied into the FMU."""
 EMPTY = primitives.ModelPatch()
 
 
@@ -274,9 +390,8 @@ class WingRows:
         if strain is not None:
             strains = self.arrays.strain_rows[(None, ".transverse", ".shear").index(strain[2])]
             return strains[int(strain[1]) - 1] if 0 < int(strain[1]) <= len(strains) else None
-        row = {"tip_displacement": self.arrays.tip_row, "load_point_displacement": self.arrays.load_tip}.get(
-            name
-        )
+        known = {"tip_displacement": self.arrays.tip_row, "load_point_displacement": self.arrays.load_tip}
+        row = known.get(name)
         place = _DISPLACEMENT.fullmatch(name)
         if place is not None and 0.0 <= float(place.group(1)) <= self.span:
             row = self.displacement_row(float(place.group(1)), float(place.group(2)))

@@ -89,11 +89,6 @@ Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
 Springs = tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring]
 
 
-def unit_vector(vector: tables.Vector) -> FloatArray:
-    """Vector (3,) of length one."""
-    return np.asarray(np.asarray(vector) / np.linalg.norm(vector), dtype=np.float64)
-
-
 class NamedSet(tables.Part):
     """Set of the nodes, or of the cells whose centres, lie in a box: two corners [unit of length]."""
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from fe.elements.cells import CellMesh
+from fe.elements.cells import CellMesh, unit_vector
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
 from fe.sentences import said
@@ -117,9 +117,8 @@ def _nearest(
         if step == _STEPS or moved < 1e-14:
             break
         gram = edges @ edges.swapaxes(1, 2)
-        if (
-            along.shape[1] == 3
-        ):  # outside its cell the map may fold: no solution, wherever the next step leads
+        # outside its cell the map may fold: no solution, wherever the next step leads
+        if along.shape[1] == 3:
             gram[np.linalg.det(gram) == 0.0] = np.eye(3)
         move = np.linalg.solve(gram, edges @ residual[..., None])[..., 0]
         before, along = along, kept(along + move, gram)
@@ -144,8 +143,7 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     corners = np.where(triangle[:, None, None], _TRIANGLE, _SQUARE)
     start = np.where(triangle[:, None], 1.0 / 3.0, [0.5, 0.5])
     local, residual, edges = _nearest(mesh, cells, point, start, corner, tangents, partial(_on_face, corners))
-    distance, normal = np.linalg.norm(residual, axis=1), np.cross(edges[:, 0], edges[:, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    distance, normal = np.linalg.norm(residual, axis=1), unit_vector(np.cross(edges[:, 0], edges[:, 1]))
     best = int(distance.argmin())
     size = float(radius[near[best]])
     if distance[best] > FARTHEST * size:
@@ -155,8 +153,8 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
             said("mesh.off", where=where, distance=far, mesh=mesh, inside=inside, place=place)
         )
     same = (distance <= distance[best] + _SAME_PLACE * size) & (normal @ normal[best] > _SAME_SIDE)
-    mean = normal[same].mean(axis=0)
-    return SurfacePoint(cells[same], local[same], mean / np.linalg.norm(mean), float(distance[best]))
+    mean = unit_vector(normal[same].mean(axis=0))
+    return SurfacePoint(cells[same], local[same], mean, float(distance[best]))
 
 
 def _on_face(corners: FloatArray, along: FloatArray, metric: FloatArray) -> FloatArray:
@@ -262,9 +260,8 @@ def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.c
             wide = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
             over = said("mesh.edge", where=where, gauge=gauge, mesh=mesh, wide=wide)
             places = [point + off for off in (*inside, *corners)]
-            spots = [on_surface(mesh, place, f"{over} {mesh.place(place)}") for place in places][
-                : len(inside)
-            ]
+            every = [on_surface(mesh, place, f"{over} {mesh.place(place)}") for place in places]
+            spots = every[: len(inside)]
         for spot in spots:
             along = _in_surface(direction, spot.normal, where)
             share = 1.0 / (len(spots) * len(spot.cell))  # the mean of the cells that meet there
@@ -290,15 +287,14 @@ def _spots(
 
 def _in_surface(direction: FloatArray, normal: FloatArray, where: str) -> FloatArray:
     """Return a direction (3,) turned into the surface, of length one."""
-    direction = direction / np.linalg.norm(direction)
+    direction = unit_vector(direction)
     angle = float(np.degrees(np.arcsin(min(1.0, abs(float(direction @ normal))))))
     if angle > STEEPEST:
         towards = ", ".join(f"{value + 0.0:.3g}" for value in normal)
         raise InvalidDesignError(
             said("mesh.direction", where=where, angle=angle, normal=towards, most=STEEPEST)
         )
-    inside = direction - (direction @ normal) * normal
-    return np.asarray(inside / np.linalg.norm(inside))
+    return unit_vector(direction - (direction @ normal) * normal)
 
 
 def spread_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
+from fe.elements.cells import unit_vector
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
 from fe.sentences import said
 
 from .affine import AffineStructure, StiffnessTerm, designed
-from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, unit_vector
+from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass
 from .mesh_file import Place, read_matrix, read_unknowns, read_vector
 from .tables import MOTIONS, Vector
 

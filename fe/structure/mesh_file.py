@@ -207,7 +207,7 @@ def memory_estimate(mesh: StructureMesh) -> float:
     shape = (len(mesh.cells), len(mesh.points))
     inside = sparse.coo_array((np.ones(len(cells), dtype=np.int32), (cells, mesh.cells.ravel())), shape=shape)
     graph = (inside.T @ inside).tocsr()  # of nodes that share a cell
-    sizes = [(front.end - front.start, len(front.boundary)) for front in analyse(graph).fronts]
+    sizes = [(front.end - front.start, len(front.boundary)) for front in analyse(graph)[1]]
     pivots, boundary = np.array(sizes).T
     factors = pivots * (pivots + boundary)
     most = factors.sum() + (2 * factors + boundary**2).max()  # the last fronts are the largest

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from fe.elements.cells import unit_vector
 from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
@@ -16,7 +17,7 @@ from fe.sentences import said
 from reporting.files import atomic_file
 
 from .affine import AffineStructure, static_response
-from .design import MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
+from .design import MatrixDesign, MeshDesign, load_structure, structure_hash
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
 from .mesh import Body, PointMass, StructureMesh, supported

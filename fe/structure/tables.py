@@ -1,6 +1,10 @@
-"""The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
+"""The tables that every structure file has, whether its structure comes from a mesh or from matrices.
+
+Last how well its reduced model is to hold.
+"""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
@@ -246,3 +250,26 @@ class StructureDesign(Part):
         free = (part for part in self.mass if part.free)
         chosen: tuple[Ranged | Region, ...] = (*self.parameter, *self.damage, *free, *self.control)
         return {part.name: part.range for part in chosen}
+
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """How well the reduced model of a structure is to hold; where, and both limits, its design says.
+
+    Attributes
+    ----------
+    bound_tolerance : float
+        The certified bound wanted everywhere on the training set, for each load alone, of strains relative to
+        the largest strain and of displacements relative to the largest of them.
+    most_snapshots : int
+        Limit of the greedy search.
+    mode_count : int
+        Modes that the reduced model returns.
+    ranges : dict of str to (float, float)
+        Least and largest value where it is to hold elsewhere than the design says, by name.
+    """
+
+    bound_tolerance: float = ReductionLimits().tolerance
+    most_snapshots: int = ReductionLimits().most_solutions
+    mode_count: int = 6
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)

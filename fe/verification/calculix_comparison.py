@@ -37,8 +37,7 @@ from fe.structure.affine import AffineStructure, natural_frequencies
 from fe.structure.design import Load
 from fe.structure.mesh import Body
 from fe.structure.operators import Structure
-from fe.wing.operators import AffineOperators
-from fe.wing.responses import wing_values
+from fe.wing.operators import AffineOperators, wing_values
 
 PRINTED = [0, 1, 2, 5, 4, 3]
 """Places of our strains in the order of CalculiX: xx, yy, zz, xy, xz, yz."""

@@ -17,8 +17,7 @@ from fe.structure.affine import static_response
 from fe.structure.mesh import rigid_motions
 from fe.verification.calculix_comparison import agreement, calculix_program, wing_deck
 from fe.wing.design import WingDesign
-from fe.wing.operators import AffineOperators, assemble
-from fe.wing.responses import eigenmodes
+from fe.wing.operators import AffineOperators, assemble, eigenmodes
 from reporting.progress import stage
 
 DAMAGED = (0.4, 0.6)

@@ -189,13 +189,6 @@ SKIN = 0
 _NARROW = 0.2  # of the widest cell
 
 
-class SurfacePoint(NamedTuple):
-    """A point of a skin cell: the cell's number and local coordinates (3,) in 0..1."""
-
-    cell: int
-    local: FloatArray
-
-
 @dataclass(frozen=True)
 class WingMesh(CellMesh):
     """Mesh of the wing with its named regions: 20-node hexahedra with straight edges.
@@ -255,25 +248,27 @@ class WingMesh(CellMesh):
         chord = plan.chord(distance / plan.semi_span)
         return np.array([line.at(chord) for line in self.chord_lines])
 
-    def skin_point(self, distance: float, behind_leading_edge: float, *, upper: bool = True) -> SurfacePoint:
-        """Point on the outer surface of the skin of the box, where a design has checked that it lies.
+    def skin_point(self, distance: float, behind: float, *, upper: bool = True) -> tuple[int, FloatArray]:
+        """Cell and local place (3,) of a point on the outer surface of the skin of the box.
+
+        A design has checked that it lies there.
 
         Parameters
         ----------
         distance : float
             Distance from the root [m].
-        behind_leading_edge : float
+        behind : float
             Distance from the leading edge [m].
         upper : bool
             On the upper skin, otherwise on the lower.
         """
         index, local = [], []
-        for lines, place in ((self.chord_places(distance), behind_leading_edge), (self.span_lines, distance)):
+        for lines, place in ((self.chord_places(distance), behind), (self.span_lines, distance)):
             before = int(np.clip(np.searchsorted(lines, place, side="right") - 1, 0, len(lines) - 2))
             index.append(before)
             local.append((place - lines[before]) / (lines[before + 1] - lines[before]))
         height = self.height_cells + 1 if upper else 0
-        return SurfacePoint(int(self._cell_of[*index, height]), np.array([*local, float(upper)]))
+        return int(self._cell_of[*index, height]), np.array([*local, float(upper)])
 
 
 def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:

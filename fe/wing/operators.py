@@ -4,25 +4,28 @@ K(e, z) = e K_skin + (1 - z1) K_1 + ... + K_0 and M(m) = M_0 + m_servo M_s + m_p
 skin without the damage regions: in the published model the factor e does not scale them.
 The root is a rigid rib on three springs; its held motions are eliminated, so that all matrices act on the
 free unknowns: those of the nodes outside the root section, then root heave [m], flap [rad] and yaw [rad].
-Gauge strains are weights of nodal displacements: Kapteyn et al. 2021, eq. (15).
+Gauge strains are weights of nodal displacements: Kapteyn et al. 2021, eq. (15). Last statics and modes of the
+full wing, eqs. (13), (15) and (16).
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from fe.elements import cells as elements
 from fe.elements.kinds import gauss_points
+from fe.full.factorisation import most_moved
 from fe.runtime.arrays import FloatArray, IntArray
-from fe.runtime.state import TIP_FORCE
-from fe.structure.affine import AffineStructure
+from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE, Losses, losses_of
+from fe.structure.affine import AffineStructure, StaticResponse, natural_frequencies, static_response
 from fe.structure.mesh import Body, PointMass, RigidSet, Supports, supports
 
 from .design import WingDesign, wing_structure
 from .mesh import WingMesh, build_mesh
-from .turn_load import STANDARD_GRAVITY, lift_load
+from .parts import DISTRIBUTIONS
 
 
 def patch_pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -71,11 +74,9 @@ def gauge_output(mesh: WingMesh, turned: float = 0.0) -> sparse.csr_array:
 
 def _in_skin(mesh: WingMesh, cells: IntArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Find the unit directions (p, 3) along span and chord in the skin, at one point of each of p cells."""
-    jacobian = elements.point_jacobians(mesh.kind, mesh.nodes[cells], local)
-    normal = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    direction = np.array([0.0, 1.0, 0.0]) - normal[:, 1:2] * normal
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    jacobian = mesh.jacobians_at(cells, local)
+    normal = elements.unit_vector(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]))
+    direction = elements.unit_vector(np.array([0.0, 1.0, 0.0]) - normal[:, 1:2] * normal)
     return direction, np.cross(direction, normal)
 
 
@@ -171,9 +172,8 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
 def cell_axes(mesh: WingMesh) -> FloatArray:
     """Local material axes (nc, 3, 3): rows chordwise, spanwise and across the surface of the cell."""
     jacobian = elements.jacobians(mesh.kind, mesh.nodes, np.array([[0.5, 0.5, 0.5]]))[:, 0]
-    across = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    along = jacobian[:, :, 1] / np.linalg.norm(jacobian[:, :, 1], axis=1, keepdims=True)
+    across = elements.unit_vector(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]))
+    along = elements.unit_vector(jacobian[:, :, 1])
     return np.stack([np.cross(along, across), along, across], axis=1)
 
 
@@ -250,8 +250,8 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
     behind = chord_fraction * mesh.design.planform.chord(distance / mesh.design.planform.semi_span)
     weights = np.zeros(len(mesh.points))
     for upper in (True, False):
-        point = mesh.skin_point(distance, behind, upper=upper)
-        weights[mesh.cells[point.cell]] += 0.5 * mesh.kind.shape_functions(point.local[None])[0][0]
+        cell, local = mesh.skin_point(distance, behind, upper=upper)
+        weights[mesh.cells[cell]] += 0.5 * mesh.kind.shape_functions(local[None])[0][0]
     return weights
 
 
@@ -277,6 +277,35 @@ def wing_body(mesh: WingMesh) -> Body[WingMesh]:
         tuple(PointMass(f"{kind}_mass", nominal[kind], np.vstack(own)) for kind, own in shares.items()),
         modulus_variation(mesh),
     )
+
+
+def lift_load(mesh: WingMesh) -> FloatArray:
+    """Load (full,) [N] at load factor 1: up and forward, half on each skin.
+
+    Along the span the design's distribution, along the chord (1 - xi)^p with the design's exponent p; each
+    skin cell is loaded on its outer face. The sums are exactly those of the design, without the inertia.
+    """
+    design, plan = mesh.design, mesh.design.planform
+    face, weight = gauss_points(4, 2)
+    load = np.zeros(len(mesh.points))
+    for upper in (True, False):
+        cells = np.flatnonzero(mesh.grid_index[:, 2] == (mesh.height_cells + 1 if upper else 0))
+        local = np.column_stack([face, np.full(len(face), 1.0 if upper else 0.0)])
+        values, _ = mesh.kind.shape_functions(local)
+        place = mesh.positions(cells, local)
+        jacobian = elements.jacobians(mesh.kind, mesh.nodes[cells], local)
+        area = np.linalg.det(jacobian[..., :2, :2])  # in the plan view
+        station = np.clip(place[..., 1] / plan.semi_span, 0.0, 1.0)
+        chord = plan.chord(station)
+        xi = place[..., 0] / chord + plan.straight_chord_line
+        along_span = DISTRIBUTIONS[design.lift.distribution](plan, station)
+        pressure = along_span * (1.0 - xi) ** design.lift.chordwise_exponent / chord
+        np.add.at(load, mesh.cells[cells], (pressure * area * weight) @ values)
+    load /= load.sum() * design.lift.load_factor
+    full = np.zeros(mesh.unknowns)
+    full[2::3] = design.lift.force * load
+    full[0::3] = -design.lift.forward_force * load
+    return full
 
 
 def turn_load(body: Body[WingMesh]) -> FloatArray:
@@ -307,3 +336,90 @@ def assemble(design: WingDesign) -> AffineOperators:
     return AffineOperators(
         **body.assembled(named, loads, outputs(gauge_output(mesh), at_tip)), design_hash=design.hash
     )
+
+
+def wing_values(
+    wing: AffineWing, young_modulus_factor: float, stiffness_loss: Losses, **others: float
+) -> dict[str, float]:
+    """Return values by the names of all that can be chosen of a wing."""
+    losses = dict(zip(wing.regions, losses_of(stiffness_loss, wing.regions), strict=True))
+    return {"young_modulus_factor": young_modulus_factor, **losses, **others}
+
+
+def solve_static(
+    operators: AffineWing,
+    young_modulus_factor: float = 1.0,
+    stiffness_loss: Losses = (),
+    load_factor: float = 1.0,
+    tip_force: float = 0.0,
+) -> StaticResponse:
+    """Solve K(e, z) u = f, Kapteyn et al. 2021, eq. (13), and evaluate the gauge strains, eq. (15).
+
+    Strains are positive in compression; the output is the upward displacement at the tip [m].
+
+    Parameters
+    ----------
+    operators : AffineWing
+        The model.
+    young_modulus_factor, stiffness_loss
+        As of `fe.runtime.state.DigitalState`.
+    load_factor : float
+        Load factor of the turn [1].
+    tip_force : float
+        Upward force at the place of the static test [N].
+
+    Raises
+    ------
+    SolutionError
+        If the solution is not accurate.
+    """
+    loads = {"load_factor": load_factor, "tip_force": tip_force}
+    return static_response(operators, wing_values(operators, young_modulus_factor, stiffness_loss, **loads))
+
+
+class Eigenmodes(NamedTuple):
+    """Undamped modes in the order of their frequencies.
+
+    Attributes
+    ----------
+    frequency : (m,) Hz
+    shape : (n, m)
+        Mass-normalised shapes of the free unknowns, in which the tip moves up.
+    flapwise_bending : (2,)
+        Indices of the first and second flapwise bending mode: those that a force near the tip moves most.
+    """
+
+    frequency: FloatArray
+    shape: FloatArray
+    flapwise_bending: IntArray
+
+
+def eigenmodes(
+    operators: AffineWing,
+    young_modulus_factor: float,
+    stiffness_loss: Losses,
+    servo_mass: float,
+    pitot_mass: float,
+    count: int = 6,
+) -> Eigenmodes:
+    """Lowest modes of K(e, z) phi = omega^2 M(m) phi, Kapteyn et al. 2021, eq. (16).
+
+    Parameters
+    ----------
+    operators : AffineWing
+        The model.
+    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+        As of `fe.runtime.state.DigitalState`.
+    count : int
+        Number of modes, at least 3.
+
+    Raises
+    ------
+    SolutionError
+        If the iteration did not converge to `MODE_RESIDUAL_LIMIT`.
+    """
+    masses = {"servo_mass": servo_mass, "pitot_mass": pitot_mass}
+    values = wing_values(operators, young_modulus_factor, stiffness_loss, **masses)
+    frequency, shapes = natural_frequencies(operators, count, values)
+    shapes = shapes * np.where(operators.tip_row @ shapes < 0.0, -1.0, 1.0)
+    return Eigenmodes(frequency, shapes, most_moved(operators.load_tip, frequency**2, shapes))

@@ -1,7 +1,13 @@
 """The parts of a wing design: the sections of its TOML file, in SI units, each checked on its own.
 
 The shape of the section is of the symmetric four-digit family of NACA Report 460 (Jacobs, Ward and Pinkerton,
-1933).
+1933). Last the lift along the span: the shape of the lift of a symmetrically loaded wing as a function that
+integrates to one over the half-wing; the amount is the design's.
+
+References
+----------
+O. Schrenk, "A simple approximation method for obtaining the spanwise lift distribution", NACA TM 948 (1940).
+H. Glauert, "The Elements of Aerofoil and Airscrew Theory" (1926), chapter XI.
 """
 
 import math
@@ -262,3 +268,47 @@ class MeshSettings(Part):
     chord_size: float = Field(gt=0.005, le=1.0)
     edge_size: float | None = Field(default=None, gt=1e-3, lt=1.0)
     refinement: float = Field(default=1.0, ge=0.25, le=8.0)
+
+
+def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
+    """Mean of the chord and of the elliptic distribution of the same area.
+
+    Parameters
+    ----------
+    planform : Planform
+        The half-wing.
+    station : array_like (...,)
+        Fractions of the semi-span.
+
+    Returns
+    -------
+    ndarray (...,)
+        Lift per length over total lift [1/m].
+    """
+    eta = np.asarray(station, dtype=float)
+    trapezoid = 2.0 * planform.chord(eta) / (planform.root_chord + planform.tip_chord)
+    ellipse = 4.0 / np.pi * np.sqrt(np.clip(1.0 - eta**2, 0.0, None))
+    return np.asarray(0.5 * (trapezoid + ellipse) / planform.semi_span)
+
+
+def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> FloatArray:
+    """Prandtl's lifting line solved by Glauert's sine series, the lift slope of the section 2 pi.
+
+    With y = -(b/2) cos(theta), the circulation is 2 b V sum A_n sin(n theta), n odd; collocation at
+    `terms` angles solves sum A_n sin(n theta) (n mu + sin theta) = mu alpha sin theta,
+    mu = c a0 / (4 b). The wing is untwisted and symmetric; `terms` is the number of odd harmonics, the rest
+    as of `schrenk`.
+    """
+    theta = (np.arange(terms) + 1.0) * np.pi / (2.0 * terms)  # half-wing, tip excluded, root included
+    order = 2.0 * np.arange(terms) + 1.0
+    mu = (planform.chord(np.cos(theta)) * 2.0 * np.pi / (8.0 * planform.semi_span))[:, None]
+    sine = np.sin(np.outer(theta, order))
+    amplitude = np.linalg.solve(sine * (order * mu + np.sin(theta)[:, None]), mu[:, 0] * np.sin(theta))
+    # Integral of sum A_n sin(n theta) over the half-wing: only n = 1 contributes, A_1 pi/4 * semi-span.
+    scale = 1.0 / (amplitude[0] * np.pi / 4.0 * planform.semi_span)
+    angle = np.arccos(np.clip(np.asarray(station, dtype=float), 0.0, 1.0))
+    return np.asarray(scale * np.tensordot(np.sin(angle[..., None] * order), amplitude, axes=1))
+
+
+DISTRIBUTIONS = {"schrenk": schrenk, "lifting_line": lifting_line}
+"""Lift distributions by their name in a design."""

@@ -14,17 +14,17 @@ import numpy as np
 from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
+from fe.runtime.state import STANDARD_GRAVITY
 
 from . import operators as full
 from .design import WingDesign
-from .turn_load import STANDARD_GRAVITY
 
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
 
 
 class PatchOperators(NamedTuple):
-    """What `fe.runtime.patch_arrays.PatchArrays` hold of a wing, on its n free unknowns, by the same names.
+    """What `fe.runtime.wing_rows.PatchArrays` hold of a wing, on its n free unknowns, by the same names.
 
     Attributes
     ----------

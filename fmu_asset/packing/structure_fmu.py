@@ -16,12 +16,12 @@ from typing import Any, Literal, TypedDict, Unpack
 from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensors import needs_structure
 from fe.runtime.state import DigitalState
 from fe.runtime.transient import ModalIntegrator
+from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler

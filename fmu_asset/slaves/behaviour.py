@@ -263,7 +263,7 @@ def load_contents(resources: Path) -> Contents:
     if not (resources / "effects.json").is_file():
         return Contents(table, behaviour, later)
     # a plain structure needs nothing of these
-    from fe.runtime.patch_arrays import PatchArrays
+    from fe.runtime.wing_rows import PatchArrays
 
     from .effects import Effects, effect_rows
 

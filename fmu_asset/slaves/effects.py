@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES, HighPass, ModelPatch
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
 from fe.runtime.transient import ModalIntegrator
+from fe.runtime.wing_rows import PatchArrays
 
 from .base import UnacceptableValuesError
 from .variables import FmuVariable, Table
@@ -244,6 +244,7 @@ class Effects:
 
     def integrator(self, vector: FloatArray, damping: tuple[float, float], acting: Acting) -> ModalIntegrator:
         """Return the wing for patches in time, the last one where nothing changed."""
+        assert self.wing is not None
         key = (vector[:-2].tobytes(), damping, acting.values)
         if self._last is None or self._last[0] != key:
             made = ModalIntegrator(self.wing, vector, *damping, acting.patch, acting.temperature)

@@ -1,11 +1,11 @@
 import pytest
 from threadpoolctl import threadpool_limits
 
-from fe.reduction.fields import WingFields, field_basis
+from fe.reduction.model_cache import WingFields, field_basis
 from fe.reduction.reduced_basis import Reduction, reduce_structure
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators
 from tests.kept import FE, kept

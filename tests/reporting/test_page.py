@@ -1,10 +1,14 @@
-"""A page is self-contained, escaped, numbered and well-formed; its figures say the values that were drawn."""
+"""A page is self-contained, escaped, numbered and well-formed; its figures say the values that were drawn.
+
+Figures are of one style, with reproducible bytes, and change nothing global.
+"""
 
 import base64
 import hashlib
 import re
 from html.parser import HTMLParser
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 
@@ -65,30 +69,21 @@ def page(title: str = "Title") -> Page:
     return result
 
 
-@pytest.fixture(scope="module")
-def text() -> str:
-    return page("Title <img src=x>").render()
-
-
-def test_page_is_well_formed_and_escaped(text):
-    tags = [tag for tag, _ in parse(text).seen]
+def test_a_page_is_well_formed_and_escaped_and_asks_nothing_of_any_server():
+    """Its links lead somewhere, and a server can allow its script and no other."""
+    text = page("Title <img src=x>").render()
+    seen = parse(text).seen
+    tags = [tag for tag, _ in seen]
     assert tags.count("script") == 1  # what shows values under the pointer
-    assert "img" not in tags
     assert "b" in tags  # the numbers of figures and tables only
     assert "one &lt;b&gt;line&lt;/b&gt;" in text
-    assert tags.count("figure") == 2
-    assert tags.count("section") == 2
+    assert (tags.count("figure"), tags.count("section")) == (2, 2)
     assert "3.5\u00a0%" in text  # units and figures stay on one line
     assert "<small>N/mm</small>" in text
-    assert page("Title <img src=x>").render() == text
-
-
-def test_page_asks_nothing_of_any_server_and_its_links_lead_somewhere(text):
-    seen = parse(text).seen
     identifiers = [attributes["id"] for _, attributes in seen if "id" in attributes]
     assert len(identifiers) == len(set(identifiers))
     for tag, attributes in seen:
-        assert tag not in {"link", "iframe", "object", "embed"}
+        assert tag not in {"img", "link", "iframe", "object", "embed"}
         assert "src" not in attributes
         for value in (attributes.get(name) for name in ("href", "xlink:href") if name in attributes):
             assert value
@@ -97,24 +92,24 @@ def test_page_asks_nothing_of_any_server_and_its_links_lead_somewhere(text):
     assert not re.search(r"@import|url\((?!#)", text)
     assert set(re.findall(r"url\(#(.*?)\)", text)) <= set(identifiers)
     assert 'What & "whose" <size>' in [attributes.get("aria-label") for _, attributes in seen]
-
-
-def test_a_server_can_allow_the_script_and_no_other(text):
     (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert script_source() == f"'sha256-{digest}'"
+    empty = Page("Empty").render()
+    parse(empty)
+    assert "<nav>" not in empty
+    assert "<script" not in empty
 
 
-def test_a_ragged_table_is_refused():
+def test_what_can_be_no_part_of_a_page_is_refused():
+    for data in (b"", b"not a drawing", b"<svg", b"<svg width='3'></svg>"):
+        with pytest.raises(InvalidFigureError):
+            figures.inline_svg(data, "f1", "x")
+    for size in (0.0, -1.0, float("nan")):
+        with pytest.raises(InvalidFigureError, match="positive size"):
+            figures.new_figure(size)
     with pytest.raises(InvalidFigureError, match="Row 1 of a table has 1 cells"):
         Table((Column("a"), Column("b")), [("1", "2"), ("3",)])
-
-
-def test_an_empty_page_is_still_a_page():
-    text = Page("Empty").render()
-    parse(text)
-    assert "<nav>" not in text
-    assert "<script" not in text
 
 
 def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_there():
@@ -184,14 +179,41 @@ CELLS = {
 """What is said in maps: number of the panel, share of its width and height; None where there is no value."""
 
 
-def test_drawing_changes_nothing_of_a_figure():
-    figure = drawing()
-    first = figures.to_svg(figure)
-    assert figures.to_svg(figure) == first
+def test_bytes_follow_from_the_data_alone():
+    """No setting of a user's, no date, no program; and nothing of the user's or the figure is changed."""
+    import matplotlib.pyplot as pyplot
+
+    before, known, figure = dict(mpl.rcParams), pyplot.get_fignums(), drawing()
+    svg, png = figures.to_svg(figure), figures.to_png(figure, 60)
+    assert dict(mpl.rcParams) == before
+    assert pyplot.get_fignums() == known
+    with mpl.rc_context({"font.size": 30, "svg.fonttype": "none", "axes.edgecolor": "red", "savefig.dpi": 7}):
+        assert (figures.to_svg(drawing()), figures.to_png(drawing(), 60)) == (svg, png)
+    assert figures.to_svg(figure) == svg
     assert all(artist.get_gid() is None for axes in figure.axes for artist in (axes, *axes.get_children()))
-    assert first.count(b"data-axes=") == 5  # the scale of colours is none
-    assert first.count(b"data-series=") == len(SEEN)  # a limit has no points
-    assert not re.search(rb'id="hover', first)
+    assert png.startswith(b"\x89PNG")
+    assert b"Software" not in png
+    assert not re.search(rb"<!DOCTYPE|metadata|date|http(?!://www\.w3\.org/)", svg)
+    assert svg.count(b"data-axes=") == 5  # the scale of colours is none
+    assert svg.count(b"data-series=") == len(SEEN)  # a limit has no points
+    assert not re.search(rb'id="hover', svg)
+
+
+DOLLAR = b'-7"'
+"""End of the name of the dollar sign's outline in DejaVu Sans."""
+
+
+@pytest.mark.parametrize("said", [{}, {"parse_math": True}], ids=["a user", "the program"])
+def test_text_is_mathematics_where_the_program_says_so(said):
+    """Broken mathematics of a user would end the drawing, and whole one would not be what was written."""
+    with figures.publication_style():
+        figure = figures.new_figure(2.0)
+        axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
+        axes.loglog([1, 1e4], [1, 1e4], label="seen" if said else "$_{$")
+        axes.set_title("of $x^2$" if said else r"of $\frac{1$ and of $x^2$", **said)
+        axes.legend()
+    assert (DOLLAR in figures.to_svg(figure)) == (not said)
+    assert figures.to_png(figure, 40)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")

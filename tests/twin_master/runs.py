@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 import uav_twin
+from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.reduced_model import ReducedModelSource
@@ -121,6 +122,13 @@ def cut_off_after(turns: int, *, ends: bool = True) -> Iterator[None]:
         patch.setattr(JournalFile, "append", dying)
         with pytest.raises(KeyboardInterrupt) if ends else nullcontext():
             yield
+
+
+def noted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return where what is said to those who look at the progress is kept."""
+    said = list[str]()
+    monkeypatch.setattr(SilentProgress, "note", lambda _progress, text: said.append(text))
+    return said
 
 
 def check_same(first: Path, second: Path, *names: str) -> None:

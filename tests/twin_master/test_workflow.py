@@ -15,11 +15,10 @@ import pytest
 
 from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
-from reporting.progress import SilentProgress
-from tests.twin_master.runs import check_same, cut_off_after, text_of, written
+from tests.twin_master.runs import check_same, cut_off_after, noted, written
 from twin_master import workflow
-from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import MissionInputError, NotResumableError, RunFolderError, ScenarioError
+from twin_master.assets.resolution import Overrides
+from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.run_folder import (
     FIELD_NAME,
     KIND,
@@ -47,13 +46,6 @@ def fly(
 ) -> RunOutcome:
     overrides = Overrides(strain_library=library, **options)
     return new_run(load_scenario(scenario), folder, overrides, replace=replace)
-
-
-def noted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return where what is said to those who look at the progress is kept."""
-    said = list[str]()
-    monkeypatch.setattr(SilentProgress, "note", lambda _progress, text: said.append(text))
-    return said
 
 
 @pytest.fixture(scope="module")
@@ -228,15 +220,6 @@ def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flo
     assert resume_run(whole).report.is_file()
 
 
-def test_a_seed_that_cannot_be_stored_is_refused_before_the_flight(tmp_path, library_file):
-    with pytest.raises(ScenarioError, match=r"mission.seed: .*at most 9223372036854775807"):
-        fly(tmp_path / "run", library_file, seed=10**40)
-    huge = written(tmp_path, text_of("level_turns", ("seed = 2021", f"seed = {10**40}")))
-    with pytest.raises(ScenarioError, match=r"64 bits|seed"):
-        fly(tmp_path / "run", library_file, huge)
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_full_disk_loses_nothing(flown, tmp_path, library_file, monkeypatch):
     """Nor does it leave half a line, though it takes one in pieces."""
     write, journal = os.write, tmp_path / "part" / "journal.jsonl"
@@ -309,13 +292,3 @@ def test_an_error_before_the_first_turn_says_how_to_begin_anew(tmp_path, library
     with pytest.raises(MissionInputError) as caught:
         fly(tmp_path / "run", library_file)
     assert caught.value.__notes__ == ["Nothing was flown yet: once this is mended, fly again with --replace."]
-
-
-def test_overrides(tmp_path):
-    loaded, fmu = load_scenario("level_turns"), tmp_path / "x.fmu"
-    scenario = resolve_scenario(loaded, Overrides(seed=4, fmu=fmu, in_process=True))
-    assert (scenario.mission.seed, scenario.asset.binding) == (4, "uav_wing")
-    assert (scenario.asset.file, scenario.asset.isolated) == (str(fmu), False)
-    path = written(tmp_path, text_of("level_turns", ('binding = "uav_wing"', 'binding = "mine.toml"')))
-    moved = resolve_scenario(load_scenario(path), Overrides())
-    assert moved.asset.binding == str(tmp_path / "mine.toml")

@@ -1,15 +1,12 @@
-"""`uav-twin calibrate campaign`, also of an FMU that is flown then, and `calibrate ringdown`."""
+"""`uav-twin calibrate campaign`, also of an FMU that is flown then."""
 
-import csv
 import json
-import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from calibration.result.file import result_bytes, save_calibration
 from fmu_asset.door.binding import load_binding
@@ -20,7 +17,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, edited
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
-from uav_twin import FmiAsset, fly, load_calibration
+from uav_twin import FmiAsset, fly, load_calibration, open_run
 
 INPUTS = Inputs(__file__)
 
@@ -108,38 +105,6 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(lab, old, new, sen
     assert not (lab.parent / "out").exists()
 
 
-@pytest.fixture
-def plots(tmp_path: Path) -> Path:
-    """Three records read off a plot, in the authors' layout."""
-    folder, width = tmp_path / "data" / "step3", 0.0081
-    folder.mkdir(parents=True)
-    fine = np.arange(0.0, 6.4, width / 32.0)
-    signal = sum(
-        amplitude * np.exp(-rate * fine) * np.cos(2.0 * math.pi * frequency * fine + 1.0)
-        for frequency, rate, amplitude in ((5.65, 1.0, 0.0115), (29.9, 13.0, 0.018))
-    )
-    columns = fine.size // 32
-    table = np.asarray(signal)[: 32 * columns].reshape(columns, 32)
-    low, high = table.min(axis=1) - 2e-4, table.max(axis=1) + 2e-4
-    rows = np.column_stack([width * (np.arange(columns) + 0.5), low, 0.5 * (low + high), high])
-    for trial in (1, 2, 3):
-        file = folder / f"ringdown_trial{trial}_digitised.csv"
-        np.savetxt(file, rows, delimiter=",", header="t_s,V_low,V_mid,V_high  (drawn)")
-    return tmp_path / "data"
-
-
-@pytest.mark.parametrize("options", [(), ("--extremes",), ("--fitted",)])
-def test_ringdown(plots, tmp_path, options):
-    out = tmp_path / "out"
-    said("calibrate", "ringdown", "--data", plots, "--out", out, *options)
-    with (out / "ringdown.csv").open(encoding="utf-8", newline="") as stream:
-        found = {row["figure"]: float(row["found"]) for row in csv.DictReader(stream)}
-    assert all(len(str(value)) > 8 for value in found.values())  # the console has five digits
-    assert found["mode 1, natural frequency"] == pytest.approx(5.65, rel=5e-3)
-    assert found["mode 2, natural frequency"] == pytest.approx(29.9, rel=2e-2)
-    assert {path.name for path in (out / "figures").iterdir()} >= {"ringdown.svg", "ringdown.png"}
-
-
 TRUTH = 1.04
 NOISE = np.array([0.04, 0.05, 0.06, 0.015])
 
@@ -176,8 +141,7 @@ def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench, tmp_path):
 
     scenario = changed_scenario("pump_wear", INPUTS.table("pump_mission.toml"))
     folder = fly(scenario, tmp_path / "run", Overrides(calibration=file), report=False).folder
-    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = open_run(folder)
     assert set(tree["calibration"]["draw_value"].values) <= set(found.draws_of("viscosity_factor"))
     binding = load_binding(binding_files()["gear_pump"])
     with FmiAsset(bench / "gear_pump.fmu", binding, isolated=False) as pump:

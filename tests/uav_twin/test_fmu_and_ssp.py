@@ -20,7 +20,6 @@ from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from scenarios import binding_files
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import text_of, written
 
 INPUTS = Inputs(__file__)
 HISTORIES = INPUTS.table("histories.toml")["refused"]
@@ -75,9 +74,6 @@ def test_an_fmu_alone(foreign_fmu, tmp_path):
     assert rows["h"][0] == 1.0
 
 
-SIZED = INPUTS.text("sized.toml")
-
-
 def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path):
     """Each element sums its weight times its input: n of them, set in configuration mode; it may be none."""
     fmu, out = foreign_fmu("resize3"), tmp_path / "x.csv"
@@ -89,33 +85,16 @@ def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path):
         assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
     said(*wanted, "--in-process", "--set", "n=0")
     assert out.read_text(encoding="utf-8").splitlines()[:3] == ["time,total", "0.0,0.0", "1.0,0.0"]
-    bound, given = tmp_path / "empty.toml", tmp_path / "u.csv"
-    bound.write_text(SIZED.replace("n = 3", "n = 0"), encoding="utf-8")
-    given.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
-    words = ("fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--in-process")
-    assert "control.u must be 0 values" in refused(*words)
-
-
-def test_histories_of_an_array_of_another_size(foreign_fmu, tmp_path):
-    """Weights 1, 2, 3; the two start values of the FMU are no longer of use. A state holds them, too.
-
-    Columns stand in any order.
-    """
-    bound, given, out = tmp_path / "b.toml", tmp_path / "u.csv", tmp_path / "x.csv"
-    bound.write_text(SIZED, encoding="utf-8")
+    # By a binding, with weights 1, 2, 3 and histories whose columns stand in any order.
+    bound, given = tmp_path / "b.toml", tmp_path / "u.csv"
+    words = ("fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--out", out, "--in-process")
+    bound.write_text(INPUTS.text("sized.toml"), encoding="utf-8")
     given.write_text("u[2],time,u[1],u[3]\n2,0,1,3\n0,1,0,1\n", encoding="utf-8-sig")
-    fmu = foreign_fmu("resize3")
-    said("fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--out", out, "--in-process")
+    said(*words, "--replace")
     assert out.read_text(encoding="utf-8").splitlines()[1:] == ["1.0,1.0,4.0,9.0", "2.0,1.0,4.0,12.0"]
-    with closing(FmiAsset(fmu, bound, isolated=False)) as asset:
-        assert asset.step({"u": [1.0, 2.0, 3.0]}).values.tolist() == [1.0, 4.0, 9.0]
-        asset.restore_state(asset.save_state())
-        assert asset.step({"u": [0.0, 0.0, 1.0]}).values.tolist() == [1.0, 4.0, 12.0]
-        asset.renew(control={"u": [1.0, 0.0, 0.0]})
-        assert asset.step().values.tolist() == [1.0, 0.0, 0.0]
-    other = FmiAsset(fmu, bound, isolated=False)
-    with closing(other), pytest.raises(FmuFileError, match="3 elements but 2 start values"):
-        other.step()
+    bound.write_text(INPUTS.text("sized.toml", ("n = 3", "n = 0")), encoding="utf-8")
+    given.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
+    assert "control.u must be 0 values" in refused(*words, "--replace")
 
 
 def test_structural_parameters_of_a_binding(foreign_fmu):
@@ -125,6 +104,7 @@ def test_structural_parameters_of_a_binding(foreign_fmu):
         for _ in range(2):
             asset.reset({"w": [1.0, 1.0, 4.0]}, control={"u": [1.0, 2.0, 3.0]})
             assert asset.step().values.tolist() == [1.0, 2.0, 12.0]
+        asset.restore_state(asset.save_state())
         with asset.fork() as other:
             assert other.step(control={"u": [0.0, 0.0, 1.0]}).values.tolist() == [1.0, 2.0, 16.0]
         with pytest.raises(FmuFileError, match=r"'w' of .* has 3 elements but 2 start values"):
@@ -259,26 +239,6 @@ def test_from_a_script_to_a_library(tmp_path):
         assert out.read_bytes() == content
 
 
-@pytest.mark.long
-def test_a_run_of_the_pump_speaks_of_pumps(tmp_path):
-    text = text_of("pump_wear", ("steps = 60", "steps = 12"), ("draws = 40", "draws = 6"))
-    scenario = written(tmp_path, text)
-    folder = tmp_path / "run"
-    shown = said("run", scenario, "--out", folder, "--in-process")
-    assert "twin, per shift" in shown
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    words = re.sub(r"<svg.*?</svg>|<style.*?</style>", " ", page, flags=re.S)
-    words = re.sub(r"<[^>]+>", " ", words) + shown
-    words += "".join(file.read_text(encoding="utf-8") for file in (folder / "csv").iterdir())
-    for word in ("wing", "strain", "gauge", "stiffness", "turn", "µε", "flight"):
-        assert not re.search(rf"\b{word}s?\b", words, flags=re.I), word
-    for word in ("shift 11", "oil temperature", "0.15 bar", "growth of the clearances", "L/min"):
-        assert word in words.replace("\u00a0", " ")
-    drawings = "".join(path.read_text(encoding="utf-8") for path in (folder / "figures").glob("*.svg"))
-    assert "microstrain" not in drawings
-    assert "Gauge" not in drawings
-
-
 END = "</ssm:ParameterMapping>"
 
 
@@ -312,20 +272,11 @@ def mapped(*entries: tuple[str, str]) -> dict[str, str]:
     return {END: "".join(texts) + END}
 
 
-def test_export_check_and_run(monkeypatch, scenario, system, tmp_path):
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
-    text, out = said("ssp", "check", system), tmp_path / "run"
+def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(scenario, system, tmp_path):
+    """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
+    text = said("ssp", "check", system)
     assert "no problem found; 8 connections, 2 parameters" in text
     assert "evaluated in the order heat_exchanger (HeatExchanger)" in text
-    exists = "exists: choose another --out or give --replace"
-    assert exists in refused("ssp", "export", scenario, "--out", system)
-    said("run", system, "--scenario", scenario, "--out", out, "--in-process", "-q")
-    assert (out / "asset" / "system.ssp").read_bytes() == system.read_bytes()
-    assert (out / "csv" / "observed.csv").is_file()
-
-
-def test_a_system_is_simulated_as_it_lies_there(system, tmp_path):
-    """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
     table, picture = tmp_path / "x.csv", tmp_path / "x.svg"
     simulate = ("ssp", "simulate", system, "--stop-time", "3", "--step-size", "1", "--in-process")
     assert "3 steps to t = 3 s, every 1 s." in said(*simulate, "--out", table, "--plot", picture)
@@ -343,6 +294,10 @@ def test_a_system_is_simulated_as_it_lies_there(system, tmp_path):
     assert "no parameter or input" in refused(*simulate, "--set", "heat_exchanger.outlet=1")
     asked = "asks for linear interpolation of inputs, but no component"
     assert asked in refused(*simulate, "--interpolation", "linear")
+    out = tmp_path / "run"
+    said("run", system, "--scenario", scenario, "--out", out, "--in-process", "--no-report", "-q")
+    assert (out / "asset" / "system.ssp").read_bytes() == system.read_bytes()
+    assert (out / "csv" / "observed.csv").is_file()
 
 
 def test_what_nothing_takes_is_a_warning_and_not_flown(scenario, system, tmp_path):

@@ -7,9 +7,9 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
-import xarray as xr
 from fmpy.validation import validate_fmu
 
+from calibration.errors import CalibrationRecordError
 from fe.full.factorisation import Factorisation
 from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_comparison import calculix_program
@@ -18,13 +18,13 @@ from reporting.progress import SilentProgress
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import changed_scenario, loaded_from
+from tests.twin_master.runs import changed_scenario, loaded_from, noted, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.watch.opening import begun_watch
-from uav_twin import fly, load_calibration, structure_files
+from uav_twin import fly, load_calibration, open_run, structure_files
 
 INPUTS = Inputs(__file__)
 
@@ -169,16 +169,17 @@ def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(matrices, tm
 @needs_calculix
 def test_a_twin_finds_the_patch_that_calculix_weakened(matrices, tmp_path):
     """The strains flown are CalculiX' with that patch."""
-    table = INPUTS.table("skin_mission.toml")
-    scenario = LoadedScenario(parse_scenario(table, "mission"), matrices.with_name("mission.toml"), "0" * 64)
-    folder = fly(scenario, tmp_path / "run", report=False).folder
-    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
-    truth = tree["truth"]
-    assert truth["state"].values[-1] == pytest.approx([0.4])
+    scenario = parse_scenario(INPUTS.table("skin_mission.toml"), "mission")
+    loaded = LoadedScenario(scenario, matrices.with_name("mission.toml"), "0" * 64)
+    folder = fly(loaded, tmp_path / "run", report=False).folder
+    tree = open_run(folder)
+    assert tree["truth"]["state"].values[-1] == pytest.approx([0.4])
     strain, _ = calculix(tmp_path / "calculix", 1.03, 0.4)
-    wanted = float(tree["observed"]["push"][-1]) * np.array([*strain.values()])
-    np.testing.assert_allclose(truth["strain"].values[-1], wanted, rtol=0.0, atol=1e-3 * np.abs(wanted).max())
+    wanted, flown = (
+        float(tree["observed"]["push"][-1]) * np.array([*strain.values()]),
+        tree["truth"]["strain"],
+    )
+    np.testing.assert_allclose(flown.values[-1], wanted, rtol=0.0, atol=1e-3 * np.abs(wanted).max())
     assert tree["filtered"]["mean"].values[-1] == pytest.approx([0.4], abs=0.1)
     copies = {path.name for path in (folder / "asset" / "flown").iterdir()}
     assert {"whole.sti", "whole.mas", "whole.dof", "patch_half.sti", "skin_half.sti"} <= copies
@@ -223,22 +224,18 @@ def mission(**calibration: object) -> LoadedScenario:
     return changed_scenario("bracket", changes | {"truth": {"gains": []}, "calibration": calibration})
 
 
-def test_the_twin_flies_with_it(calibrated, tmp_path):
+def test_the_twin_flies_with_it(calibrated, tmp_path, monkeypatch):
     """The campaign tells the modulus and not the mass, which follows it; what flies stands at the means."""
-    found, told = load_calibration(calibrated), list[str]()
+    found, told, given = load_calibration(calibrated), noted(monkeypatch), Overrides(calibration=calibrated)
     assert abs(found.mean("e") - TRUTH["e"]) < 3.0 * found.standard_deviation("e") < 0.03
     assert found.explained is True
     assert any("does not tell pump" in sentence for sentence in found.findings)
-    folder = fly(mission(), tmp_path / "run", Overrides(calibration=calibrated), progress=_Noted(told)).folder
+    folder = fly(mission(), tmp_path / "run", given, report=False).folder
     wanted_words = f"Calibrated was the model {found.model}; flown is the FMU of the structure bracket, and"
     assert found.design_hash == packed_design_hash(calibrated.parents[1] / "bracket.fmu")
     believed = f"The twin believes the design that was calibrated, {found.design_hash[:12]}."
     assert any(note.startswith(wanted_words) and note.endswith(believed) for note in told)
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    assert wanted_words in page
-    assert believed in page
-    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = open_run(folder)
     draws = tree["calibration"]["draw_value"].values
     assert set(draws) <= set(found.draws_of("e"))
     np.testing.assert_allclose(draws.mean(), found.mean("e"), atol=0.1 * found.standard_deviation("e"))
@@ -249,12 +246,13 @@ def test_the_twin_flies_with_it(calibrated, tmp_path):
     np.testing.assert_allclose(tree["truth"]["strain"].values[0], wanted, rtol=5e-4)
 
     told.clear()
-    own = resolve_scenario(mission(), Overrides(calibration=calibrated))
-    with begun_watch(own, mission().file, tmp_path / "watch", _Noted(told)):
+    with begun_watch(
+        resolve_scenario(mission(), given), mission().file, tmp_path / "watch", SilentProgress()
+    ):
         pass
     assert any("flown is the watched asset" in note and note.endswith(believed) for note in told)
 
-    scenario = resolve_scenario(mission(draws=3), Overrides(calibration=calibrated))
+    scenario = resolve_scenario(mission(draws=3), given)
     source = asset_source(scenario)
     source.prepare(tmp_path, SilentProgress())
     drawn = source.draws(scenario.mission.seed)
@@ -267,36 +265,21 @@ def test_the_twin_flies_with_it(calibrated, tmp_path):
     np.testing.assert_allclose(ratio, 1.0 + arm, rtol=1e-3)
 
 
-class _Noted(SilentProgress):
-    """Keeps what is said."""
-
-    def __init__(self, said: list[str]) -> None:
-        self._said = said
-
-    def note(self, message: str) -> None:
-        self._said.append(message)
-
-
 def test_what_the_calibration_does_not_fit_is_refused(calibrated, tmp_path):
-    with pytest.raises(Exception, match="has no samples of `pomp`; it has e, pump"):
-        fly(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
+    given = Overrides(calibration=calibrated)
+    with pytest.raises(CalibrationRecordError, match="has no samples of `pomp`; it has e, pump"):
+        fly(mission(parameter="pomp"), tmp_path / "run", given, report=False)
     source = structure_files()["bracket"]
     shutil.copy(source.with_suffix(".inp"), tmp_path)
     text, table = source.read_text(encoding="utf-8"), mission().scenario.to_dict()
     for tables, change, words in (
-        (
-            ("asset", "belief"),
-            ("free = true", ""),
-            "parameter pump, which the structure bracket does not know",
-        ),
+        (("asset", "belief"), ("free = true", ""), "pump, which the structure bracket does not know"),
         (("belief",), ("density = ", "density = 1"), "bracket, which the twin believes, has the design"),
     ):
-        (tmp_path / "other.toml").write_text(text.replace(*change), encoding="utf-8")
-        own = {name: table[name] | {"structure": str(tmp_path / "other.toml")} for name in tables}
+        own = {name: table[name] | {"structure": str(written(tmp_path, text, change))} for name in tables}
         other = loaded_from(table | own, "bracket")
         with pytest.raises(MissionInputError, match=words):
-            fly(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
+            fly(other, tmp_path / "run", given, report=False)
         assert not (tmp_path / "run").exists()
-    own = {"asset": table["asset"] | {"structure": str(tmp_path / "other.toml")}}  # the truth may be another
-    other = loaded_from(table | own, "bracket")
-    asset_source(resolve_scenario(other, Overrides(calibration=calibrated))).check()
+    other = loaded_from(table | {"asset": own["belief"]}, "bracket")  # the truth may be another
+    asset_source(resolve_scenario(other, given)).check()

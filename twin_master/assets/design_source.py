@@ -38,8 +38,8 @@ from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, BeliefSection
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
-    from fe.runtime.patch_arrays import PatchArrays
     from fe.runtime.reduced import ReducedModel
+    from fe.runtime.wing_rows import PatchArrays
     from fmu_asset.packing.patch_file import PatchFile
 
 DESIGN_COPY, FLOWN_DESIGN_COPY = "asset/design.toml", "asset/flown_design.toml"
@@ -217,8 +217,7 @@ class _Wing(NamedStructure):
         FileNotWrittenError
             The disk is full or the folder cannot be written.
         """
-        from fe.reduction.fields import write_wing_vtu
-        from fe.reduction.model_cache import wing_fields
+        from fe.reduction.model_cache import wing_fields, write_wing_vtu
 
         name, asset = "young_modulus_factor", self._scenario.asset
         if not {*state, *control} <= {*wing_names(self.wing_design.regions)}:

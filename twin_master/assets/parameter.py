@@ -116,7 +116,7 @@ def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedMode
         ScalarPosterior,
         stiffness_curve_of,
     )
-    from reporting.record_json import plain
+    from reporting.json_file import plain
 
     sequence, pairs = seed_sequence(seed, "calibration"), published_measurements()
     curve = (

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fe.reduction.settings import StructureSettings
 from fe.runtime.modal_system import rayleigh_damping_ratio
-from fe.structure.tables import StructureDesign
+from fe.structure.tables import StructureDesign, StructureSettings
 from fmu_asset.door.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress

@@ -21,7 +21,7 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.files import synchronise, write_error, written
-from reporting.record_json import plain
+from reporting.json_file import plain
 from twin_master.errors import NotResumableError, said
 from twin_master.mission.turns import Happened, Reading, Turn
 

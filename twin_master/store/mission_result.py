@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.record_json import plain
+from reporting.json_file import plain
 from reporting.words import capital, parameter_title
 from twin_master.mission.loop import BelievedModel, in_turn
 from twin_master.mission.preparation import Knowledge

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.groups import Group, Variable
+from reporting.netcdf import Group, Variable
 from reporting.table_file import table_text
 from twin_master.learning.expectation import joined
 from twin_master.mission.loop import expected_in

@@ -11,9 +11,8 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text
 from reporting.folders import restore_folder
-from reporting.groups import Group, write_groups
 from reporting.json_file import read_json
-from reporting.netcdf import read_groups
+from reporting.netcdf import Group, read_groups, write_groups
 from reporting.provenance import hash_record
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError, said

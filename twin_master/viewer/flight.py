@@ -25,8 +25,7 @@ from pydantic import BaseModel
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError, ReportingError
-from reporting.json_file import read_json
-from reporting.record_json import plain
+from reporting.json_file import plain, read_json
 from twin_master.errors import RunFolderError, TwinMasterError, said
 from twin_master.learning.expectation import Expected, expected_of, joined
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of

@@ -23,8 +23,7 @@ from fe.runtime.patch import (
     PowerDamping,
     RootCompliance,
 )
-from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.wing_rows import strain_gauge
+from fe.runtime.wing_rows import PatchArrays, strain_gauge
 from fe.wing.design import load_design
 from tests.discrepancy.asking import FloatArray, integrated, trial
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import TrialKind
@@ -16,8 +15,8 @@ from discrepancy.model_choice import load_model
 from discrepancy.sources.measured_rigs import READING_ERROR, SIGNAL, TIP, write_rig_campaign
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
+from tests.command_line import said
 from tests.discrepancy.rigs import chosen
-from uav_twin.cli import app
 
 PUBLISHED = Path(__file__).parents[3].parent / "shared" / "reference" / "measured"
 
@@ -59,9 +58,7 @@ def write_falls(folder, size=400):
 def test_only_the_fall_is_taken_without_its_ends_and_run_reads_it(tmp_path):
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
     words = ["discrepancy", "convert", str(out), "--rig", "falling_phone", "--data", str(data)]
-    said = CliRunner().invoke(app, words)
-    assert said.exit_code == 0, said.output
-    assert "2 trials" in said.output
+    assert "2 trials" in said(*words)
     read = read_campaign(out)
     assert is_sound(read, load_model(out / "model.toml"))
     assert [trial.name for trial in read.trials] == ["fall_2", "fall_10"]

@@ -6,8 +6,7 @@ from evidence.identification.parameters import deviations, values_of, with_value
 from evidence.identification.pieces import reduced, wing_pieces
 from evidence.identification.residuals import fitted_residuals
 from evidence.identification.targets import Weights
-from fe.wing.operators import assemble
-from fe.wing.responses import eigenmodes, solve_static
+from fe.wing.operators import assemble, eigenmodes, solve_static
 from tests.wings import tip_stiffness
 
 

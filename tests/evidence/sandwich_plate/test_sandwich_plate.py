@@ -18,9 +18,9 @@ from evidence.sandwich_plate.plate_known_answers import (
 from evidence.sandwich_plate.plate_layout import PlateLayout
 from evidence.sandwich_plate.sandwich_plate import assemble_plate
 from fe.full.factorisation import Factorisation
+from fe.runtime.state import STANDARD_GRAVITY
 from fe.verification.wing_checks import wing_balance
 from fe.wing.operators import point_masses
-from fe.wing.turn_load import STANDARD_GRAVITY
 from tests import command_line
 
 CHECKS = (square_plate_deflection, square_plate_frequency, cantilever_strip)

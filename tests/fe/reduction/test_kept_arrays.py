@@ -27,10 +27,10 @@ from fe.compilation import compiled
 from fe.reduction import model_cache
 from fe.reduction.built_once import built_once, cache_folder
 from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
-from fe.reduction.settings import StructureSettings
 from fe.runtime import arrays as array_records
 from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
+from fe.structure.tables import StructureSettings
 from fe.wing.design import WingDesign
 from tests.refusals import Inputs, refused
 

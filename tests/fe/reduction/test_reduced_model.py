@@ -19,10 +19,8 @@ from pymor.reductors.coercive import CoerciveRBReductor
 from scipy import sparse
 
 from benchmarks.study_regions import bracket, plate, tube
-from fe.reduction.fields import write_modes_vtu, write_wing_vtu
-from fe.reduction.model_cache import reduced_structure
+from fe.reduction.model_cache import reduced_structure, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import Reduction, measured_errors, reduce_structure
-from fe.reduction.settings import StructureSettings
 from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, OutsideModelError
 from fe.runtime.reduced import ReducedModel
@@ -37,9 +35,9 @@ from fe.structure.affine import (
 )
 from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import load_and_assemble
+from fe.structure.tables import StructureSettings
 from fe.wing.design import wing_structure
-from fe.wing.operators import AffineWing, outputs, stiffness_parts
-from fe.wing.responses import eigenmodes, solve_static
+from fe.wing.operators import AffineWing, eigenmodes, outputs, solve_static, stiffness_parts
 from reporting.errors import FileNotWrittenError
 from tests.kept import FE, kept
 from tests.refusals import Inputs, refused

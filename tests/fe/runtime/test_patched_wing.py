@@ -1,5 +1,6 @@
 """The patched wing, and structures in motion, against full models that are changed in their own way."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,17 +14,18 @@ from fe.runtime.errors import InvalidPatchError, InvalidStateError, OutsideModel
 from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patched_wing import HOLDING, PatchedWing
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import TIP_FORCE
+from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE
 from fe.runtime.transient import ModalIntegrator, TransientState
 from fe.wing.operators import (
     AffineOperators,
     assemble,
     gauge_output,
+    lift_load,
     point_masses,
     section_displacement,
     upward,
 )  # fmt: skip
-from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
+from fe.wing.parts import DISTRIBUTIONS
 from tests.fe.runtime.stepping import exact, second_order
 from tests.refusals import Inputs, refused
 from tests.wings import wing_integrator
@@ -215,13 +217,13 @@ def placed(
 def washed(both: Compared, exponent: float) -> tuple[FloatArray, FloatArray]:
     """A washout is another distribution of the lift."""
     coefficient, factor, lift = 0.15, 3.0, both.design.lift
-    course = DISTRIBUTIONS[lift.distribution](both.design.planform)
+    course = partial(DISTRIBUTIONS[lift.distribution], both.design.planform)
     points, weights = np.polynomial.legendre.leggauss(400)
     eta = 0.5 * (points + 1.0)
     kept = weights * course(eta) @ (1.0 - coefficient * factor * eta**exponent) / (weights @ course(eta))
 
-    def less(planform: Any) -> Any:
-        return lambda station: course(station) * (1.0 - coefficient * factor * station**exponent)
+    def less(planform: Any, station: Any) -> Any:
+        return course(station) * (1.0 - coefficient * factor * station**exponent)
 
     restriction = both.operators.expansion.T
     with pytest.MonkeyPatch.context() as other:

@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from fe.elements.cells import jacobians
 from fe.elements.kinds import gauss_points
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
+from fe.runtime.state import STANDARD_GRAVITY
 from fe.wing import operators as modelled
 from fe.wing.design import SHIPPED_DESIGN, load_design, parse_design
 from fe.wing.mesh import build_mesh
-from fe.wing.operators import assemble
-from fe.wing.parts import Planform
-from fe.wing.responses import eigenmodes, solve_static
-from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load, lifting_line
+from fe.wing.operators import assemble, eigenmodes, lift_load, solve_static
+from fe.wing.parts import DISTRIBUTIONS, Planform, lifting_line
 from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
 
@@ -91,7 +90,7 @@ def test_a_distribution_integrates_to_one_over_the_half_wing(name, span, root, t
     plan = Planform(semi_span=span, root_chord=root, tip_chord=root * taper, straight_chord_line=0.25)
     angle = np.linspace(0.0, 0.5 * np.pi, 2001)
     station = np.sin(angle)
-    lift = DISTRIBUTIONS[name](plan)(station)
+    lift = DISTRIBUTIONS[name](plan, station)
     assert np.trapezoid(lift * span, station) == pytest.approx(1.0, rel=1e-4)
     assert np.all(lift[:-1] > 0.0)
 
@@ -101,7 +100,7 @@ def test_the_lifting_line_has_the_induced_drag_of_glauerts_table():
     angle, order = (np.arange(400) + 0.5) * np.pi / 800.0, np.arange(1, 20, 2)
     for ratio, beyond in ((0.75, 0.034), (1.0, 0.049), (1.25, 0.063), (1.5, 0.076), (1.75, 0.088)):
         plan = Planform(semi_span=np.pi * ratio, root_chord=1.0, tip_chord=1.0, straight_chord_line=0.25)
-        shares = np.sin(np.outer(order, angle)) @ lifting_line(plan, terms=4)(np.cos(angle))
+        shares = np.sin(np.outer(order, angle)) @ lifting_line(plan, np.cos(angle), 4)
         assert order[1:] @ (shares[1:] / shares[0]) ** 2 == pytest.approx(beyond, abs=5e-4)
 
 

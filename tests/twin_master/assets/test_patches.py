@@ -24,7 +24,7 @@ from fmu_asset.packing.patch_file import SCHEMA
 from tests.command_line import refused
 from tests.refusals import refused as refused_by
 from tests.twin_master.runs import figures_of, text_of, written
-from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.assets.resolution import Overrides
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError
 from twin_master.store.writing import open_run
@@ -87,19 +87,6 @@ def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):
         scenario = scenario_of(tmp_path, lines, parameters, belief)
         assert words in refused("run", scenario, "--out", tmp_path / "run")
         assert not (tmp_path / "run").exists()
-    with pytest.raises(MissionInputError, match=r"`asset\.patch` goes into the FMU"):
-        resolve_scenario(load_scenario(scenario_of(tmp_path, PATCH)), Overrides(fmu=tmp_path / "other.fmu"))
-
-
-def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path):
-    write_patch(tmp_path, *STRUCTURE)
-    loaded = load_scenario(scenario_of(tmp_path, PATCH, belief=PATCH))
-    source = asset_source(resolve_scenario(loaded, Overrides()))
-    source.check()
-    assert source.origin.asset.endswith("with hidden effects")
-    assert source.origin.model.endswith("with effects")
-    assert source.origin.differ
-    assert {"asset/patch.json", "asset/model_patch.json"} <= {*source.files()}
 
 
 @pytest.fixture

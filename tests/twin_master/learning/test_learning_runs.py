@@ -244,6 +244,8 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
         assert (kept["notice"] is None) is off
         assert parse_scenario(kept, name) == loaded.scenario  # as a run folder says it
         assert loaded.scenario.mission.name == name
+    for name, searched in (("watched_wing", True), ("three_regions", False), ("pump_wear", False)):
+        assert load_scenario(name).scenario.searchable is searched  # causes are looked for in wings alone
     of_its_own = ("[transition]", 'average_over_draws = "inside"\n[transition]')
     levels = "[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]"
     many = [(levels, f"{[*range(90)]}\nprior = {[1] + [0] * 89}")] * 2
@@ -259,11 +261,6 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
     asked = text_of("level_turns", of_its_own) + "[notice]\n"
     with pytest.raises(TwinMasterError, match=r"`notice` needs `observation.average_over_draws` `outside`"):
         load_scenario(written(tmp_path, asked))
-
-
-def test_the_search_for_causes_is_named_for_a_wing_alone():
-    for name, searched in (("watched_wing", True), ("three_regions", False), ("pump_wear", False)):
-        assert load_scenario(name).scenario.searchable is searched
 
 
 def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_report(tmp_path):

@@ -1,6 +1,5 @@
 """What is noticed, against sums over every course of events, an exact mean, and faults that are put in."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise, product
 
@@ -133,13 +132,13 @@ def test_shares_of_hypotheses_switch_as_their_chain_says():
 def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch):
     """Where the noise is known and gains are not learnt, against the sum over every course of events."""
     monkeypatch.setattr("twin_master.learning.monitor._REACH", (0.0,) * 4)
-    turns, seen = 4, drawn(np.random.default_rng(8), 4)
-    seen[2, 1] = np.nan
+    turns, seen = 5, drawn(np.random.default_rng(8), 5)
+    seen[2, 1] = seen[3] = np.nan  # a gauge, and a whole turn
     known = Noticing(noise_degrees=1e9, onset_turns=3.0)
     found = run(watchful(given=known), seen)[-1].suspicion
     model, sensors = small()
     to_begin = 0.5 / (1.0 + np.arange(turns) / 3.0)
-    first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of turns 0..3, and of none of them
+    first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of these turns, and of none of them
 
     def evidence(gauge: int, gain: float, begin: int) -> float:
         total = 0.0
@@ -208,7 +207,7 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
         assert mean == pytest.approx(np.exp(getattr(today.suspicion, name)), rel=1e-4)
 
 
-@pytest.mark.parametrize("width", [0.0, 1.0, 10.0])
+@pytest.mark.parametrize("width", [0.0, 10.0])
 def test_false_alarms_are_rarer_than_the_threshold_says(width):
     """The noise is what the model says, and its sums of squares are expected ones: what that costs."""
     estimator, random = watchful(width=width), np.random.default_rng(5)
@@ -236,7 +235,7 @@ def twins() -> dict[str, Twin]:
 EXTREME = st.floats(allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308, np.nan])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(rows=st.lists(st.tuples(EXTREME, EXTREME), min_size=1, max_size=6), late=st.integers(0, 6))
 def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, late):
     ordinary = drawn(np.random.default_rng(2), 4, 2)
@@ -255,29 +254,26 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, la
             line_of(turn_record(record))  # which holds no NaN and no infinity
 
 
-def test_a_turn_without_readings_changes_no_evidence():
-    seen = drawn(np.random.default_rng(4), 6)
-    seen[-1] = np.nan
-    before, after = (estimate.suspicion for estimate in run(watchful(), seen)[-2:])
-    np.testing.assert_allclose(after.log_evidence_gauge, before.log_evidence_gauge, atol=1e-6)
-    assert after.log_evidence_none == pytest.approx(before.log_evidence_none, abs=1e-6)
-
-
-def test_a_late_observation_tells_what_it_brings_to_light_in_its_turn():
+def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():
+    """The twin believes what one believes that never had the reading."""
     model, sensors = small()
-    twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful(), lag=8)
-    seen = drawn(np.random.default_rng(5), 10)
-    late = seen[5].copy()
-    late[1] = 1e9
-    for turn, row in enumerate(seen):
-        twin.turn(np.full(3, np.nan) if turn == 5 else row, 0)
-    told = twin.revise(5, late)
-    assert told.turn == 9
-    assert [(notice.kind, notice.sensors) for notice in told.notices] == [
-        ("gauge_left_out", (2,)),
-        ("gauge_back", (2,)),
-    ]
-    assert "Turn 5: gauge 2 shows 1e+09" in told.notices[0].sentence
+    twin, without = (
+        Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful(), lag=8) for _ in range(2)
+    )
+    seen, told = drawn(np.random.default_rng(5), 10), []
+    late, absurd = seen[5].copy(), seen.copy()
+    late[1], seen[5] = 1e9, np.nan
+    absurd[1:4, 2], seen[1:4, 2], absurd[5] = [1e9, np.nan, 1e16], np.nan, np.nan
+    for turn, row in enumerate(absurd):
+        found, expected = twin.turn(row, 0), without.turn(seen[turn], 0)
+        told += [(turn, notice.kind, notice.sensors) for notice in found.notices]
+        assert bool(found.suspicion.left_out[2]) == (1 <= turn < 4)
+        np.testing.assert_allclose(found.filtered, expected.filtered, rtol=1e-9)
+    assert told == [(1, "gauge_left_out", (3,)), (4, "gauge_back", (3,))]
+    revised = twin.revise(5, late)
+    assert revised.turn == 9
+    assert [(n.kind, n.sensors) for n in revised.notices] == [("gauge_left_out", (2,)), ("gauge_back", (2,))]
+    assert "Turn 5: gauge 2 shows 1e+09" in revised.notices[0].sentence
 
 
 def test_a_model_that_takes_the_place_of_another_begins_without_suspicion():
@@ -308,20 +304,6 @@ def wing() -> Knowledge:
     return prepare_twin("paper_level_turns")
 
 
-def fly(
-    wing: Knowledge, turns: int, spoil: Callable[[int, Float], None], words: Words | None = None
-) -> list[Estimate]:
-    """Return 3g turns of the wing whose gauges show what `spoil` makes of it."""
-    estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values, words=words)
-    random, before, estimates = np.random.default_rng(1), None, []
-    for turn in range(turns):
-        shown = wing.sensor_model.mean[0, 1].copy()
-        spoil(turn, shown)
-        estimates.append(estimator.turn(before, shown + 150e-6 * random.normal(size=24), 1, turn))
-        before = estimates[-1].carried
-    return estimates
-
-
 PLACES = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
 SEARCH = "; to find the cause: uav-twin discrepancy run --from-run DIR"
 
@@ -335,10 +317,13 @@ SEARCH = "; to find the cause: uav-twin discrepancy run --from-run DIR"
     ],
 )
 def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, words, shows, search):
-    def spoil(turn: int, shown: Float) -> None:
+    estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values, words=words)
+    random, before, estimates = np.random.default_rng(1), None, []
+    for turn in range(begin + 25):
+        shown = wing.sensor_model.mean[0, 1].copy()
         shown[gauge - 1] *= 1.0 + gain * (turn >= begin)
-
-    estimates = fly(wing, begin + 25, spoil, words)
+        estimates.append(estimator.turn(before, shown + 150e-6 * random.normal(size=24), 1, turn))
+        before = estimates[-1].carried
     (alarm,) = (notice for one in estimates for notice in one.notices if notice.kind == "alarm")
     assert alarm.sensors == (gauge,)
     assert f"{shows}, " in alarm.sentence
@@ -347,20 +332,6 @@ def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, words, shows, se
     assert abs(alarm.since - begin) <= 6
     assert not any(estimate.notices for estimate in estimates[:begin])
     assert estimates[-1].suspicion.gauge_off > 0.5
-
-
-def test_an_absurd_gauge_is_left_out_with_a_word(wing):
-    def spoil(turn: int, shown: Float) -> None:
-        if 3 <= turn < 10:
-            shown[11] = np.nan if turn == 6 else 1e8 * (turn - 2)  # 1e14 microstrain a turn
-
-    estimates = fly(wing, 12, spoil)
-    assert [(turn, n.kind, n.sensors) for turn, e in enumerate(estimates) for n in e.notices] == [
-        (3, "gauge_left_out", (12,)), (10, "gauge_back", (12,)),
-    ]  # fmt: skip
-    left_out = [bool(e.suspicion.left_out[11]) for e in estimates if e.suspicion is not None]
-    assert left_out == [3 <= turn < 10 for turn in range(12)]
-    assert estimates[-1].filtered[0] > 0.3  # today's twin: 80 % damage, with certainty
 
 
 @pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 10)])

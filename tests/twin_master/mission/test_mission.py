@@ -1,12 +1,17 @@
 """The mission loop, its truth and its journal: timing, faults, resuming at every turn, what is refused."""
 
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
-from tests.twin_master.runs import flight_of, journal, of_library, table_of
+from tests.command_line import said
+from tests.kept import ROOT
+from tests.twin_master.runs import flight_of, journal, of_library, table_of, text_of, written
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import MissionInputError, NotResumableError
@@ -19,6 +24,7 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import PURPOSES, generator
+from twin_master.store.writing import open_run
 
 Known = tuple[Knowledge, StrainLibrarySource]
 ARRAYS = (
@@ -58,6 +64,23 @@ def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
         for array in ARRAYS:
             np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
     assert whole.notices or name != "failing_gauges"
+
+
+WITHOUT = "import sys; sys.modules['numba'] = None; from uav_twin import cli; cli.main()"
+
+
+def test_a_mission_without_numba_is_the_same(library_file, tmp_path):
+    """The same loops as plain Python, and one sentence about it."""
+    short = written(tmp_path, text_of("level_turns", ("steps = 50", "steps = 8")))
+    words = "run", str(short), "--strain-library", str(library_file), "--no-report", "--out"
+    said(*words, tmp_path / "fast")
+    line = [sys.executable, "-c", WITHOUT, *words, str(tmp_path / "plain")]
+    plain = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert plain.returncode == 0, plain.stderr
+    assert plain.stderr.count("pip install 'uav-twin[fast]'") == 1
+    found, expected = (open_run(tmp_path / name) for name in ("plain", "fast"))
+    for group in ("observed", "filtered", "smoothed", "predicted"):
+        xr.testing.assert_allclose(found[group].to_dataset(), expected[group].to_dataset(), rtol=1e-9)
 
 
 def test_timing_of_a_turn(paper):

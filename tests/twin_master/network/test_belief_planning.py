@@ -1,7 +1,5 @@
 """Planning on the belief against enumeration, a fine grid of beliefs, and values that were published."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -111,17 +109,3 @@ def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypat
     found = leaving_probability(problem, policy, beliefs, 1, 4, rng)
     np.testing.assert_allclose(found, exact, atol=0.03)
     assert sum(0.05 < value < 0.95 for value in exact) > 1
-
-
-def test_a_product_of_tables_is_planned_as_the_table_of_all_states():
-    rng = np.random.default_rng(7)
-    factors = tuple(rng.dirichlet(np.ones(3), (2, 3)) for _ in range(2))
-    product = TransitionModel(factors)
-    seen = tuple(rng.dirichlet(np.full(4, 0.5), 9).T for _ in range(2))
-    problem = DecisionProblem(
-        product, rng.normal(size=(9, 2)), np.full(2, 0.7), seen, rng.dirichlet(np.ones(9))
-    )
-    whole = replace(problem, transition=TransitionModel((product.matrix,)))
-    first, second = plan_on_belief(problem, gap=1e-3), plan_on_belief(whole, gap=1e-3)
-    assert first.lower == pytest.approx(second.lower, rel=1e-9)
-    assert first.upper == pytest.approx(second.upper, rel=1e-9)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reporting.errors import FileNotWrittenError
 from tests.twin_master.runs import changed_scenario, flight_of, of_library, table_of
 from twin_master.errors import InvalidModelError, RunFolderError
 from twin_master.fleet.store import in_credible_set
@@ -45,6 +44,9 @@ def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_
             np.testing.assert_array_equal(node[key], variable.values)
             assert (node[key].dims, node[key].attrs) == (variable.dims, variable.attrs)
     np.testing.assert_array_equal(read["observed"]["strain"], result.flight.observed)
+    (tmp_path / "a/run.nc").write_bytes(first[:1000])
+    with pytest.raises(RunFolderError, match="not a whole run"):
+        open_run(tmp_path / "a")
 
 
 def test_what_is_stored_agrees_with_itself(result, tmp_path):
@@ -88,17 +90,6 @@ def test_tables_are_in_the_units_of_their_headers(result):
     decisions = list(csv.DictReader(tables["decisions"].splitlines()))
     assert decisions[0]["control"] == "3g"
     assert decisions[36]["error_reward"] == ""
-
-
-def test_damaged_and_unwritable(result, tmp_path):
-    write_run(tmp_path, groups_of(result), {})
-    content = (tmp_path / "run.nc").read_bytes()
-    (tmp_path / "run.nc").write_bytes(content[:1000])
-    with pytest.raises(RunFolderError, match="not a whole run"):
-        open_run(tmp_path)
-    (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(FileNotWrittenError):
-        write_run(tmp_path / "file", groups_of(result), {})
 
 
 SCENARIO = load_scenario("level_turns").scenario

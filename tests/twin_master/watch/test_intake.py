@@ -191,34 +191,35 @@ def taken_up(knowledge: Knowledge, state: object, line: bytes) -> Intake:
 RIGHT = [1.7e9 + 0.5 * turn for turn in range(8)]
 
 
+JITTERED = [time + 0.1 * (turn % 3 - 1) for turn, time in enumerate(RIGHT)]
+
+
 @pytest.mark.parametrize(
-    "times", [[0.0, *RIGHT[1:]], [1.7e308, *RIGHT[1:]], [1.7e9, 4e9, *RIGHT[2:]]]
-)  # whose clock was not yet set
-def test_a_clock_that_is_set_after_the_first_turn_spoils_none(timed, strains, clean, times):
+    "times", [[0.0, *RIGHT[1:]], [1.7e308, *RIGHT[1:]], [1.7e9, 4e9, *RIGHT[2:]], JITTERED]
+)  # the first three of a clock that was not yet set
+def test_times_stand_for_turns_and_a_clock_that_is_set_after_the_first_spoils_none(
+    timed, strains, clean, times
+):
     lines = [message(row, time=time) for time, row in zip(times, strains, strict=False)]
     twin, intake = watched(timed, lines)
     assert (twin.turns, intake.counts.rejected, intake.counts.missing) == (8, 0, 0)
     assert same(twin, watched(timed, clean[:8])[0])
+    gap, counted = watched(timed, [*lines[:4], *lines[5:]])
+    assert (gap.turns, counted.counts.missing) == (8, 1)
+    np.testing.assert_array_equal(gap.observed(7), strains[7])
     # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up.
-    later = b'{"time": 1700000500, "strain_1": 1e-4}\n'  # near enough that a missing limit ends, too
-    again = taken_up(timed, intake.state(), later)
-    assert again.read(twin) is None
-    assert again.counts.rejected == 1
+    for later in (
+        b"1700000500",
+        b"1.6e9",
+        b"1.7e308",
+    ):  # the first near enough that a missing limit ends, too
+        again = taken_up(timed, intake.state(), b'{"time": %s, "strain_1": 1e-4}\n' % later)
+        assert again.read(twin) is None
+        assert again.counts.rejected == 1
     twin, intake = watched(timed, lines[:1])  # taken up after its first turn the clock may still be set
     reading = taken_up(timed, intake.state(), lines[1]).read(twin)
     assert reading.revises is None
     np.testing.assert_array_equal(reading.observed, strains[1])
-
-
-def test_times_stand_for_turns(timed, strains):
-    times = [1.7e9 + 0.5 * turn + 0.1 * (turn % 3 - 1) for turn in range(10)]
-    lines = [message(row, time=time) for time, row in zip(times, strains, strict=False)]
-    del lines[4]
-    twin, intake = watched(timed, lines)
-    assert (twin.turns, intake.counts.missing) == (10, 1)
-    np.testing.assert_array_equal(twin.observed(9), strains[9])
-    early, endless = (b'{"time": %s, "strain_1": 1e-4}\n' % time for time in (b"1.6e9", b"1.7e308"))
-    assert watched(timed, [*lines, early, endless])[1].counts.rejected == 2
 
 
 def test_units_and_names(knowledge):
