@@ -256,17 +256,6 @@ def test_siblings_have_parameters_of_their_own(foreign_fmu) -> None:
     np.testing.assert_allclose(seen, (1.0 - np.exp(-0.3)) * np.array([[2.0], [3.0]]), rtol=1e-12)
 
 
-def test_after_a_crash_the_files_are_extracted_again(foreign_fmu, scratch) -> None:
-    with FmiAsset(foreign_fmu("hostile2", "ABORT"), HOSTILE) as asset, asset.fork() as fork:
-        asset.step(), asset.step()
-        saved = asset.save_state()
-        with pytest.raises(Exception, match="SIGABRT"):
-            asset.step()
-        asset.restore_state(saved)
-        assert len([*scratch.rglob("modelDescription.xml")]) == 2
-        assert fork.step().values[0] == 1.0
-
-
 # ---------------------------------------------------------------------- what others' FMUs do
 
 LAG, FIXED, ARRAY, BALL = (BINDINGS[name] for name in ("lag1", "fixed2", "array3", "ball2"))

@@ -84,18 +84,19 @@ def flown(fmu: Path, rows: Sequence[Sequence[float]], start: float = 0.0, **para
 # ---------------------------------------------------------------------- files
 
 
-def test_the_table_only_grows_at_its_end(fmu, sensing) -> None:
-    plain, more = (read_model_description(str(path)).modelVariables for path in (fmu, sensing))
-    for one, other in zip(plain, more, strict=False):
-        assert (one.name, one.valueReference, one.start) == (other.name, other.valueReference, other.start)
-    assert len(more) > len(plain)
-
-
-def test_what_is_on_and_how_much_show_in_the_guid(model, sensing, tmp_path) -> None:
-    active = build_fmu(model, tmp_path / "on.fmu", patch=parse_patch(content()), activate=True)
+def test_the_table_only_grows_at_its_end_and_the_guid_tells_what_is_on(fmu, sensing, model, tmp_path) -> None:
+    active = build_fmu(model, tmp_path / "on.fmu", patch=parse_patch(content()), activate=True).path
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
-    other = build_fmu(model, tmp_path / "other.fmu", patch=changed)
-    assert len({read_model_description(str(path)).guid for path in (sensing, active.path, other.path)}) == 3
+    other = build_fmu(model, tmp_path / "other.fmu", patch=changed).path
+    plain, *more = (read_model_description(str(path)) for path in (fmu, sensing, active, other))
+    for one, another in zip(plain.modelVariables, more[0].modelVariables, strict=False):
+        assert (one.name, one.valueReference, one.start) == (
+            another.name,
+            another.valueReference,
+            another.start,
+        )
+    assert len(more[0].modelVariables) > len(plain.modelVariables)
+    assert len({each.guid for each in more}) == 3
 
 
 def test_the_patch_of_a_verdict_has_channels_that_are_outputs() -> None:
