@@ -32,7 +32,7 @@ from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.packing.structure_fmu import build_fmu
-from fmu_asset.structures.rig import rig_text
+from fmu_asset.structures import rig_text
 from scenarios import structure_files
 
 FloatArray = NDArray[np.float64]

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.dynamics.records import RingDownRecord
 from calibration.errors import said
@@ -25,11 +24,10 @@ from calibration.static.posterior import Seed, child_seed
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState, Geometry
+from reporting.arrays import Float
 
 from .errors import ExperimentDataError
 from .geometry import READING_UNCERTAINTY, Lengths, MeasuredLength, published_lengths
-
-FloatArray = NDArray[np.float64]
 
 SENSITIVITY = 50.0
 """Volts per unit strain: a quarter bridge of gauge factor 2 at 5 V, amplified 20 times [V]."""
@@ -44,7 +42,7 @@ MOST_SAMPLES = 10_000_000
 _PURPOSES = {"load": 31, "ring_down": 32, "geometry": 33, "weighing": 34}
 
 
-RingDownSignal = tuple[FloatArray, FloatArray]
+RingDownSignal = tuple[Float, Float]
 """What a recorder saw: instants (N,) from the release on [s] and signal (N,) [V]."""
 
 
@@ -72,7 +70,7 @@ def check_recorded(gauges: int) -> None:
         raise ExperimentDataError(said("virtual.gauges", gauges=gauges, recorded=RECORDED_GAUGE))
 
 
-def sampling_times(duration: float, sampling_rate: float) -> FloatArray:
+def sampling_times(duration: float, sampling_rate: float) -> Float:
     """Return the instants of a record [s], from 0 to `duration`.
 
     Raises
@@ -142,7 +140,7 @@ class VirtualWing:
         return time, SENSITIVITY * initial_tip_displacement * signal
 
 
-def _free_decay(omega: float, zeta: float, time: FloatArray) -> FloatArray:
+def _free_decay(omega: float, zeta: float, time: Float) -> Float:
     """Return q(t) of q'' + 2 zeta omega q' + omega^2 q = 0 with q(0) = 1, q'(0) = 0."""
     root = np.sqrt(complex(zeta**2 - 1.0))
     if abs(root) < 1e-8:

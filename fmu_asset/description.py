@@ -1,6 +1,5 @@
 """What an FMU declares, and the texts that are made of it by the templates of this package."""
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -13,6 +12,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable
+from reporting.toml_file import toml_value
+from reporting.units import BASE_UNITS, meaning_of
 
 _ELEMENT = re.compile(r"(?P<stem>.+)(?:\[(?P<index>[0-9]+)\]|\.(?P<label>[^.]+))")
 LOG_CATEGORIES = {
@@ -39,8 +40,6 @@ class Declaration:
         One sentence for people.
     table : tuple of FmuVariable
         The variables, in order of their value reference. Local ones are states, and then as many derivatives.
-    units : mapping of str to (mapping, mapping)
-        For each unit of the table exponents, factor and offset to SI, and factors of display units by name.
     dependencies : mapping of str to sequence of str
         For each output, the inputs that it depends on directly; an output that is missing depends on all.
     """
@@ -48,8 +47,25 @@ class Declaration:
     name: str
     description: str
     table: tuple[FmuVariable, ...]
-    units: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]]
     dependencies: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def units(self) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
+        """For each unit of the table exponents, factor and offset to SI, and factors of display units.
+
+        What a text does not say is left out: of a unit that is not understood no more than its name is told.
+        """
+        units: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
+        for row in self.table:
+            meaning, shown = meaning_of(row.unit or ""), meaning_of(row.display_unit or "")
+            base, displays = units.setdefault(row.unit, ({}, {})) if row.unit else ({}, {})
+            if meaning is not None:
+                base |= {symbol: n for symbol, n in zip(BASE_UNITS, meaning.exponents, strict=True) if n}
+                if meaning[1:] != (1.0, 0.0):
+                    base |= {"factor": meaning.factor, "offset": meaning.offset}
+                if shown is not None and row.display_unit:
+                    displays[row.display_unit] = meaning.factor / shown.factor
+        return units
 
     @property
     def enumerations(self) -> tuple[EnumerationType, ...]:
@@ -72,14 +88,9 @@ def _templates() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"c_text": _c_text, "c_number": _c_number, "quoted": _quoted}
-    environment.filters["written"] = _written
+    own = {"c_text": _c_text, "c_number": _c_number, "quoted": toml_value, "written": _written}
+    environment.filters |= own
     return environment
-
-
-def _quoted(text: str) -> str:
-    """Return a text as JSON and TOML have it."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def rendered(name: str, /, **values: Any) -> bytes:

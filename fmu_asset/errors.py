@@ -59,10 +59,6 @@ class CouplingError(FmuError, ValueError):
     """FMUs cannot be connected as they were told to: an end is unknown, taken twice, or of another type."""
 
 
-class AlgebraicLoopError(CouplingError):
-    """Connections and direct feedthrough close a loop, and nothing says how it is to be solved."""
-
-
 class IterationError(FmuError, RuntimeError):
     """The values of a loop of FMUs did not settle within the iterations that were allowed."""
 

@@ -103,20 +103,21 @@ def _lines(table: dict[str, Any]) -> str:
 
 
 def _pairs(table: dict[str, Any]) -> list[tuple[str, str]]:
-    return [(_key(key), _shown(item)) for key, item in table.items() if item is not None]
+    return [(_key(key), toml_value(item)) for key, item in table.items() if item is not None]
 
 
 def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _shown(name)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
 
 
-def _shown(item: Any) -> str:
+def toml_value(item: Any) -> str:
+    """Return a value as TOML has it."""
     if isinstance(item, str):  # the escapes of JSON are TOML's, but for DEL
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(item, bool):
         return str(item).lower()
     if isinstance(item, list | tuple):
-        shown = list(map(_shown, item))
+        shown = list(map(toml_value, item))
         if sum(map(len, shown)) > LONGEST_ARRAY:
             return "[\n" + "".join(f"    {one},\n" for one in shown) + "]"
         return f"[{', '.join(shown)}]"

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from fe.reduction.built_once import built_once, cache_folder
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.compiled.compiler import COMPILERS
+from fmu_asset.compiled.package import COMPILERS
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 

@@ -117,7 +117,7 @@ def calibrate_wing(
             terminal.say(f"Step {origin.step}: {origin.text}.")
     calibration = parts.calibrate(lab, drawn, asset=name, procedure=procedure, seed=seed)
     if not json:
-        from calibration.paper.table_1 import WORDS
+        from calibration.paper.figures import WORDS
 
         columns, rows = WORDS.table("table_1", calibration.table_1)
         terminal.print_table([column.name for column in columns], rows)

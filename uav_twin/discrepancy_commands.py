@@ -190,19 +190,15 @@ def _record(
         "trials": [{"name": trial.name, "held_out": trial.held_out} for trial in data.trials],
         "channels": list(data.channels),
         "passed": able is not None,
-        "faults": [
-            {"kind": fault.kind.value, "fatal": fault.fatal, "sentence": fault.sentence,
-             "channel": fault.channel, "trial": fault.trial}
-            for fault in faults
-        ],
-        "remarks": list(data.remarks),
+        "faults": [dataclasses.asdict(fault) | {"fatal": fault.fatal} for fault in faults],
+        "remarks": data.remarks,
         "effects": [] if able is None else [
             {"effect": item.effect.identifier, "testable": not item.reason, "reason": item.reason,
              "place": item.place, "parameter": item.parameter, "detectable_from": item.detectable,
              "prior_median": item.typical, "unit": item.unit}
             for item in able.detectability
         ],
-        "confusion_groups": [] if able is None else [list(group) for group in able.groups],
+        "confusion_groups": [] if able is None else able.groups,
     }  # fmt: skip
 
 
@@ -281,13 +277,7 @@ def effects(*, show: str | None = None, add: list[Path] | None = None) -> None:
 
 
 def _show_effect(effect: "parts.Effect") -> None:
-    from rich.table import Table
-
-    facts = Table(box=None, show_header=False)
-    facts.add_column(no_wrap=True)
-    facts.add_column(overflow="fold")
-    for name, value in (
-        ("id", effect.identifier),
+    facts = (
         ("name", effect.name),
         ("family", effect.family),
         ("equation", parts.formula(effect.equation)),
@@ -295,9 +285,8 @@ def _show_effect(effect: "parts.Effect") -> None:
         ("acts on", ", ".join(sorted(kind.value for kind in effect.acts_on))),
         ("confusable with", ", ".join(effect.confusable) or "nothing in general"),
         ("reference", effect.reference),
-    ):
-        facts.add_row(name, value)
-    terminal.console().print(facts)
+    )
+    terminal.print_table(("id", effect.identifier), facts)
     options.show("effect", effect=effect, unit_text=parts.unit_text)
 
 

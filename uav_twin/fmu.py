@@ -1,4 +1,7 @@
-"""`uav-twin fmu build`, `info`, `bind`, `check` and `simulate`, and `uav-twin ssp simulate`."""
+"""`uav-twin fmu ...`, `uav-twin ssp ...`, the scenarios that fly FMUs, and libraries of what FMUs show.
+
+`uav-twin scenarios`, `uav-twin scenario check` and `uav-twin library sample`.
+"""
 
 import gc
 import re
@@ -10,11 +13,12 @@ from typing import Any, Literal
 
 import typer
 
-from fmu_asset.errors import FmuInputError
+from fmu_asset.errors import FmuInputError, SspError
 from reporting import terminal
+from reporting.errors import ReportingError
 from reporting.files import atomic_write_bytes, atomic_write_text, refuse_existing
 from reporting.words import counted
-from scenarios import asset_scripts
+from scenarios import asset_scripts, scenario_files
 from uav_twin import parts
 from uav_twin.options import answer, refused, said, show
 from uav_twin.structure import fmu as build_structure
@@ -61,7 +65,7 @@ def check(
         memory_limit=memory_limit,
     )
     findings = [asdict(finding) for finding in result.findings]
-    answer("fmu check", {"file": str(file), "passed": result.passed, "findings": findings}, json=json)
+    answer("fmu check", record={"file": str(file), "passed": result.passed, "findings": findings}, json=json)
     if not result.passed:
         raise refused(f"{file}: {counted(len(result.problems), 'problem')}.")
 
@@ -130,7 +134,7 @@ def info(file: Path, *, variables: bool = True, json: bool = False) -> None:
     keys = ("name", "causality", "unit", "minimum", "maximum", "start", "description")
     rows = [["" if row.get(key) is None else str(row[key]) for key in keys] for row in described["variables"]]
     record = {"file": str(file)} | described | {"obstacle": obstacle}
-    answer("fmu info", record, json=json, facts=facts, rows=rows if variables else ())
+    answer("fmu info", record=record, json=json, facts=facts, rows=rows if variables else ())
 
 
 _MOST_PANELS, _MOST_LINES = 8, 10
@@ -170,7 +174,7 @@ def simulate(
         if inputs is None:
             history = parts.fly(asset, planned)
         else:
-            history = parts.fly_histories(asset, parts.read_histories(inputs, asset.binding))
+            history = parts.fly_histories(asset, *parts.read_histories(inputs, asset.binding))
         _finish(asset, history, file, out, plot)
 
 
@@ -293,3 +297,88 @@ def _draw(path: Path, history: "parts.ObservationHistory", columns: list[tuple[s
         axes[-1].set_xlabel("time [s]")
         figure.tight_layout()
         atomic_write_bytes(path, (parts.to_svg if path.suffix == ".svg" else parts.to_png)(figure))
+
+
+def list_scenarios() -> None:
+    """List the scenarios that are shipped."""
+    files = scenario_files()
+    shown = {name: parts.load_scenario(path).scenario for name, path in files.items()}
+    show("scenarios", shown=shown, folder=next(iter(files.values())).parent)
+
+
+def check_scenario(file: str, *, calibration: Path | None = None, json: bool = False) -> None:
+    """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
+    record = parts.check_scenario(parts.load_scenario(file), {"calibration": calibration})
+    answer("scenario check", record=record, json=json)
+
+
+def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:
+    """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
+    parts.checked_target(out, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
+    if _is_design(what):
+        path = parts.export_design(None if what == "uav_wing" else Path(what), out, replace_file=replace)
+    else:
+        path = parts.export_scenario(parts.load_scenario(what), out, seed=seed, replace_file=replace)
+    terminal.say(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
+
+
+def _is_design(what: str) -> bool:
+    """Return whether a name or path is that of a wing design: a TOML file without a mission."""
+    try:
+        return what == "uav_wing" or "planform" in parts.read_toml(what, ReportingError)
+    except ReportingError:
+        return False
+
+
+def check_system(file: Path, *, json: bool = False) -> None:
+    """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""
+    result = parts.check_ssp(file)
+    for problem in result.problems:
+        typer.secho(f"problem: {problem}", fg="red", err=True)
+    answer("ssp check", record={"passed": not result.problems} | asdict(result), json=json, file=file)
+    if result.problems:
+        raise typer.Exit(1)
+
+
+def sample(
+    scenario: str | None = None,
+    *,
+    out: Path,
+    fmu: Path | None = None,
+    binding: Path | None = None,
+    grid: list[str] | None = None,
+    role: str | None = None,
+    seed: int | None = None,
+    settle: int = 0,
+    workers: int | None = None,
+    resume: bool = False,
+    replace: bool = False,
+) -> None:
+    """Ask an FMU for its observation at every draw, state and control; write an observation library."""
+    if resume and replace:
+        raise typer.BadParameter("give either --resume or --replace.", param_hint="--resume")
+    if scenario is not None and role is not None:
+        raise typer.BadParameter("the scenario says what is observed.", param_hint="--role")
+    try:
+        with tempfile.TemporaryDirectory(prefix="uav_twin_library_") as folder:
+            if scenario is not None:
+                wanted = parts.grid_of_scenario(
+                    parts.load_scenario(scenario),
+                    Path(folder),
+                    grid or (),
+                    overrides=parts.Overrides(seed=seed, fmu=fmu, binding=binding),
+                    settling_steps=settle,
+                )
+            elif fmu is None or binding is None:
+                raise typer.BadParameter("give a scenario, or --fmu and --binding.", param_hint="SCENARIO")
+            else:
+                wanted = parts.grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
+            found = parts.sample_library(
+                wanted, out, workers=workers, resume=resume, replace_existing=replace
+            )
+    except KeyboardInterrupt:
+        kept = parts.blocks_folder(out).is_dir()
+        hint = "go on with the same command and --resume" if kept else "nothing was sampled yet"
+        typer.secho(f"Interrupted; finished blocks are kept: {hint}.", fg="red", err=True)
+        raise typer.Exit(terminal.INTERRUPTED) from None
+    show("library", found=found, library=found.library)

@@ -1,26 +1,17 @@
 """What the commands of this package have in common, and why options are refused: a file of sentences."""
 
-from typing import TYPE_CHECKING, Any
+from functools import partial
 
 import typer
 
 from reporting import terminal
 from reporting.sentences import Sentences
 
-if TYPE_CHECKING:
-    from reporting.page import Words
-
 said = Sentences(__file__).said
-
-
-def show(command: str, *, words: "Words | None" = None, **values: Any) -> None:
-    """Print what a command found, see `terminal.show`; by default in the words of this package."""
-    terminal.show(command, words or "uav_twin", **values)
-
-
-def answer(command: str, record: dict[str, Any], *, json: bool, **values: Any) -> None:
-    """Print a record as JSON, or as `show` does."""
-    terminal.answer(command, "uav_twin", record, json=json, **values)
+show = partial(terminal.show, words="uav_twin")
+"""Prints what a command found, see `terminal.show`; by default in the words of this package."""
+answer = partial(terminal.answer, words="uav_twin")
+"""Prints a record as JSON, or as `show` does."""
 
 
 def refused(text: str) -> typer.Exit:

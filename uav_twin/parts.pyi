@@ -125,8 +125,8 @@ from fmu_asset.ssp.check import check_ssp as check_ssp
 from fmu_asset.ssp.check import join_ssp as join_ssp
 from fmu_asset.ssp.check import left_out_sentence as left_out_sentence
 from fmu_asset.ssp.reader import read_ssp as read_ssp
-from fmu_asset.structures.binding import structure_binding_text as structure_binding_text
-from fmu_asset.structures.rig import rig_text as rig_text
+from fmu_asset.structures import rig_text as rig_text
+from fmu_asset.structures import structure_binding_text as structure_binding_text
 from reporting.figures import FULL_WIDTH as FULL_WIDTH
 from reporting.figures import new_figure as new_figure
 from reporting.figures import publication_style as publication_style

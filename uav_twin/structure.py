@@ -47,7 +47,7 @@ def wing(*, design: Path | None = None, vtu: Path | None = None, as_json: bool =
         ],
         "written": [*map(str, written)],
     }
-    answer("wing", record, json=as_json)
+    answer("wing", record=record, json=as_json)
 
 
 def verify_wing(*, design: Path | None = None, out: Path | None = None, quick: bool = False) -> None:
@@ -113,7 +113,7 @@ def info(file: Path, *, modes: int = 6, memory_limit: float | None = None, json:
     structure = assembled_of_any(file, memory_limit)
     with stage("Solving the loads and the modes"):
         record = structure_record(structure, modes)
-    answer("structure info", record, json=json)
+    answer("structure info", record=record, json=json)
     for load in () if json else record["loads"]:
         outputs = [("gauge", name, 1e6 * value, "microstrain") for name, value in load["strain"].items()]
         outputs += [("displacement", name, 1e3 * value, "mm") for name, value in load["output"].items()]
@@ -225,7 +225,7 @@ def verify(
         "frequencies": {key: getattr(found, key).tolist() for key in ("ours", "calculix")},
         "passed": all(check.passed for check in checks),
     }
-    answer("checks", record, json=json, checks=checks)
+    answer("checks", record=record, json=json, checks=checks)
     if out is not None and not json:
         terminal.say(f"Wrote the decks and results of CalculiX to {out}")
     end_with(checks)
@@ -275,7 +275,7 @@ def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, js
         "ranges": {name: list(ends) for name, ends in model.validity.items()},
         "errors": None if errors is None else asdict(errors),
     }
-    answer("structure reduce", record, json=json, model=model, kinds=_kinds(model))
+    answer("structure reduce", record=record, json=json, model=model, kinds=_kinds(model))
 
 
 def _kinds(model: "parts.ReducedModel") -> dict[str, str]:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-FloatArray = NDArray[np.float64]
+from reporting.arrays import Float
+
 ComplexArray = NDArray[np.complex128]
 
 _GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growing waves
@@ -37,7 +38,7 @@ class RingDownMode(NamedTuple):
 
     pole: complex
     wave: complex
-    covariance: FloatArray
+    covariance: Float
 
     @property
     def frequency(self) -> float:
@@ -66,7 +67,7 @@ class RingDownMode(NamedTuple):
         return {name: math.sqrt(max(float(slope @ self.covariance @ slope), 0.0)) for name, slope in slopes}
 
 
-def modal_slopes(pole: complex) -> FloatArray:
+def modal_slopes(pole: complex) -> Float:
     """Return the derivatives (2, 2) of natural frequency [Hz] and damping ratio [1] by Re s and Im s."""
     real, imaginary, size = pole.real, pole.imag, abs(pole)
     of_ratio = np.array([-(imaginary**2), real * imaginary]) / size**3
@@ -96,10 +97,10 @@ class Solution(NamedTuple):
 
     pole: ComplexArray
     amplitude: ComplexArray
-    fitted: FloatArray
-    deviation: FloatArray
-    covariance: FloatArray
-    seen: FloatArray
+    fitted: Float
+    deviation: Float
+    covariance: Float
+    seen: Float
 
     @property
     def modes(self) -> tuple[RingDownMode, ...]:
@@ -130,14 +131,14 @@ class DampedCosines:
     """
 
     def __init__(
-        self, time: FloatArray, signal: FloatArray, averaging_width: float = 0.0, *, drift: bool = True
+        self, time: Float, signal: Float, averaging_width: float = 0.0, *, drift: bool = True
     ) -> None:
         self._time = time - time[0]
         self._signal = signal.reshape(len(time), -1)
         self._width = averaging_width
         self._line = np.column_stack([np.ones(time.size), self._time - self._time.mean()])[:, : 1 + drift]
 
-    def residual(self, pole: ComplexArray) -> FloatArray:
+    def residual(self, pole: ComplexArray) -> Float:
         """Return the residuals [V], (N C,), with the best amplitudes, offset and drift."""
         orthogonal = np.linalg.qr(self._basis(self._waves(pole)))[0]
         return np.asarray(self._signal - orthogonal @ (orthogonal.T @ self._signal)).ravel()
@@ -147,7 +148,7 @@ class DampedCosines:
         count, damped = start.size, start.imag
         scale = np.concatenate([start.real, damped] if frequencies_fitted else [start.real])
 
-        def pole(unknown: FloatArray) -> ComplexArray:
+        def pole(unknown: Float) -> ComplexArray:
             scaled = unknown * scale
             return np.asarray(scaled[:count] + 1j * (scaled[count:] if frequencies_fitted else damped))
 
@@ -202,5 +203,5 @@ class DampedCosines:
             (np.sinh(half) / half if self._width else 1.0) * np.exp(np.multiply.outer(self._time, s))
         )
 
-    def _basis(self, wave: ComplexArray) -> FloatArray:
+    def _basis(self, wave: ComplexArray) -> Float:
         return np.hstack([wave.real, -wave.imag, self._line])

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from calibration.errors import ExperimentDataError, said
+from reporting.arrays import Float
 
-from .damped_cosine import ComplexArray, DampedCosines, FloatArray, Solution, modal_slopes
+from .damped_cosine import ComplexArray, DampedCosines, Solution, modal_slopes
 
 RecordKind = Literal["ambient", "decay"]
 
@@ -51,26 +52,26 @@ class IdentifiedModes:
         Of the values of each mode; modes are taken as independent of each other.
     """
 
-    value: FloatArray
-    covariance: FloatArray
+    value: Float
+    covariance: Float
 
     @property
-    def frequency(self) -> FloatArray:
+    def frequency(self) -> Float:
         """Natural frequencies (M,) [Hz]."""
         return self.value[:, 0]
 
     @property
-    def damping_ratio(self) -> FloatArray:
+    def damping_ratio(self) -> Float:
         """Damping ratios (M,)."""
         return self.value[:, 1]
 
     @property
-    def shape(self) -> FloatArray:
+    def shape(self) -> Float:
         """Shapes (M, A - 1), divided by that at the first accelerometer."""
         return self.value[:, 2:]
 
     @property
-    def standard_error(self) -> FloatArray:
+    def standard_error(self) -> Float:
         """Of the values, (M, 1 + A)."""
         return np.asarray(np.sqrt(np.einsum("mii->mi", self.covariance)))
 
@@ -119,7 +120,7 @@ def identify_modes(
     return IdentifiedModes(value, covariance)
 
 
-def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Float, Float]:
     record = np.array(acceleration, dtype=np.float64)
     record = record[:, None] if record.ndim == 1 else record
     limits = np.array(bands, dtype=np.float64)
@@ -150,8 +151,8 @@ class _Poles(NamedTuple):
 
     pole: ComplexArray
     shape: ComplexArray
-    share: FloatArray
-    seen: FloatArray
+    share: Float
+    seen: Float
     places: int
 
     @property
@@ -165,7 +166,7 @@ class _Poles(NamedTuple):
         """Whether noise alone would hardly show so much anywhere (P,)."""
         return np.asarray(self.seen > chdtri(2 + 4 * self.shape.shape[1], _FALSE_MODE / self.places))
 
-    def values(self, chosen: int) -> FloatArray:
+    def values(self, chosen: int) -> Float:
         """Return frequency, damping ratio and relative shape of a pole."""
         s = self.pole[chosen]
         relative = (self.shape[chosen, 1:] / self.shape[chosen, 0]).real
@@ -181,11 +182,11 @@ class _Poles(NamedTuple):
         return best if self.beyond_noise[best] else None
 
 
-_Found = tuple[_Poles, Callable[[list[int]], list[FloatArray]]]
+_Found = tuple[_Poles, Callable[[list[int]], list[Float]]]
 """Poles, and what gives the covariances of the values of some of them."""
 
 
-def _hankel(correlation: FloatArray) -> FloatArray:
+def _hankel(correlation: Float) -> Float:
     """Return the block Hankel matrix (L C, L C) of correlations (2 L, C, C) from lag one on, C channels."""
     lags, count = len(correlation) // 2, correlation.shape[1]
     place = np.arange(lags)[:, None] + np.arange(lags)
@@ -195,11 +196,11 @@ def _hankel(correlation: FloatArray) -> FloatArray:
 class _Subspace:
     """What the correlations of a record (2 L, C, C) say of systems of any order."""
 
-    def __init__(self, correlation: FloatArray, rate: float) -> None:
+    def __init__(self, correlation: Float, rate: float) -> None:
         self._correlation, self._rate = correlation, rate
         _, self._singular, self._right = np.linalg.svd(_hankel(correlation))
 
-    def _modal(self, correlation: FloatArray, basis: FloatArray) -> tuple[ComplexArray, ...]:
+    def _modal(self, correlation: Float, basis: Float) -> tuple[ComplexArray, ...]:
         """Return poles (n,) [1/s], eigenvectors (n, n) and shapes (C, n) as seen on a basis (L C, n)."""
         count = correlation.shape[1]
         observability = _hankel(correlation) @ basis
@@ -207,11 +208,11 @@ class _Subspace:
         eigenvalue, vector = np.linalg.eig(transition.astype(np.complex128))
         return np.log(eigenvalue) * self._rate, vector, observability[:count] @ vector
 
-    def _basis(self, order: int) -> FloatArray:
+    def _basis(self, order: int) -> Float:
         """Return right singular vectors over the roots of their values (L C, order)."""
         return np.asarray(self._right[:order].T / np.sqrt(self._singular[:order]))
 
-    def poles(self, order: int, variance: FloatArray | float = 1.0) -> tuple[_Poles, float]:
+    def poles(self, order: int, variance: Float | float = 1.0) -> tuple[_Poles, float]:
         """Return the poles of the system of an order, and its mean square misfit over the variance.
 
         `variance` (2 L, C, C) is that of the correlations; without it nothing tells poles from noise.
@@ -228,7 +229,7 @@ class _Subspace:
         found = _Poles(pole[inside], shape.T[inside], share, seen, len(self._correlation))
         return found, float(np.mean(left**2 / variance))
 
-    def moved(self, change: FloatArray, order: int, poles: ComplexArray) -> _Poles:
+    def moved(self, change: Float, order: int, poles: ComplexArray) -> _Poles:
         """Return poles under a small change of the correlations, seen on the same basis."""
         pole, _, shape = self._modal(self._correlation + change, self._basis(order))
         nearest = np.argmin(np.abs(pole - poles[:, None]), axis=1)
@@ -236,7 +237,7 @@ class _Subspace:
         return _Poles(pole[nearest], shape.T[nearest], ones, ones, 1)
 
 
-def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
+def _ambient(record: Float, rate: float, lags: int, modes: int) -> _Found:
     length = (len(record) - 2 * lags) // BLOCKS
     size = length * BLOCKS
     blocks = record[:size].reshape(BLOCKS, length, -1)
@@ -255,7 +256,7 @@ def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
         if misfit < 1.0:
             break
 
-    def covariances(chosen: list[int]) -> list[FloatArray]:
+    def covariances(chosen: list[int]) -> list[Float]:
         poles = found.pole[chosen]
         # blocks that last as long as the modes remember, by taking some together
         memory = float(np.max(-1.0 / poles.real))
@@ -275,7 +276,7 @@ def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
     return found, covariances
 
 
-def _decay(record: FloatArray, rate: float, lags: int) -> _Found:
+def _decay(record: Float, rate: float, lags: int) -> _Found:
     size = len(record) - 2 * lags
     whole = np.stack([record[lag : lag + size].T @ record[:size] / size for lag in range(1, 2 * lags + 1)])
     start, _ = _Subspace(whole, rate).poles(LARGEST_ORDER)
@@ -297,7 +298,7 @@ def _of(solution: Solution) -> _Poles:
     return _Poles(solution.pole, solution.amplitude, share, solution.seen, len(solution.fitted))
 
 
-def _decay_covariances(solution: Solution, chosen: list[int]) -> list[FloatArray]:
+def _decay_covariances(solution: Solution, chosen: list[int]) -> list[Float]:
     count, channels = solution.amplitude.shape
     found = []
     for pole in chosen:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, ExperimentFileError, said
 from calibration.lab_folder import LAB_ERRORS, places_of
+from reporting.arrays import Float
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
 from reporting.words import counted
@@ -55,10 +55,10 @@ class RingDownRecord:
         still at an extreme for 3 ms, as a clipped one does.
     """
 
-    time: NDArray[np.float64]
-    signal: NDArray[np.float64]
-    lowest: NDArray[np.float64] | None = None
-    highest: NDArray[np.float64] | None = None
+    time: Float
+    signal: Float
+    lowest: Float | None = None
+    highest: Float | None = None
     averaging_width: float = 0.0
     source: str = "unnamed record"
 
@@ -163,7 +163,7 @@ def _named(cell: str, file: Path) -> str:
     return name
 
 
-def _column(table: TextTable, spellings: tuple[str, ...]) -> NDArray[np.float64]:
+def _column(table: TextTable, spellings: tuple[str, ...]) -> Float:
     for name in spellings:
         if name in table.columns:
             return table.numbers(name, "a ring-down")

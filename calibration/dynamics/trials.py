@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import decimate, detrend, find_peaks
 
 from calibration.errors import ExperimentDataError, said
+from reporting.arrays import Float
 
-from .damped_cosine import DampedCosines, FloatArray, RingDownMode
+from .damped_cosine import DampedCosines, RingDownMode
 from .records import MINIMUM_COUNT, RingDownRecord
 
 FIRST_PEAK = 0.00548
@@ -65,7 +65,7 @@ class RingDownFit:
 
     modes: tuple[RingDownMode, RingDownMode]
     record: RingDownRecord
-    fitted: NDArray[np.float64]
+    fitted: Float
     residual_deviation: float
     free: bool
 
@@ -104,7 +104,7 @@ def prepare(record: RingDownRecord, start: float = FIRST_PEAK) -> RingDownRecord
     return replace(record, time=time[after], signal=signal[after], lowest=lowest, highest=highest)
 
 
-def spectrum(record: RingDownRecord) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def spectrum(record: RingDownRecord) -> tuple[Float, Float]:
     """Return frequency [Hz] and amplitude [V] of the zero-padded spectrum of the detrended record."""
     size = _PADDING * record.count
     transform = np.fft.rfft(detrend(record.signal), size)
@@ -298,14 +298,14 @@ def _refine(fit: RingDownFit) -> RingDownFit:
     within = time[:, np.newaxis] + np.linspace(-0.5, 0.5, _POINTS) * record.averaging_width
     poles, waves = (np.array([getattr(mode, name) for mode in fit.modes]) for name in ("pole", "wave"))
 
-    def signal(unknown: FloatArray, when: FloatArray) -> FloatArray:
+    def signal(unknown: Float, when: Float) -> Float:
         """Return offset, drift and the decaying modes at some instants."""
         wave = np.exp(np.multiply.outer(when, unknown[4:6] + 1j * poles.imag)) @ (
             unknown[:2] + 1j * unknown[2:4]
         )
         return np.asarray(unknown[6] + unknown[7] * when + wave.real)
 
-    def residual(scaled: FloatArray) -> FloatArray:
+    def residual(scaled: Float) -> Float:
         unknown = scaled * scale
         value, half_line = signal(unknown, within), unknown[8]
         return np.hstack([value.min(axis=1) - half_line - lowest, value.max(axis=1) + half_line - highest])

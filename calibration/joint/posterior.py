@@ -18,7 +18,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import chdtri, softmax
 from scipy.stats import multivariate_t
@@ -37,6 +36,7 @@ from calibration.result.record import ParameterPrior, Reading
 from calibration.static.errors_in_variables import exact_posterior, residual_variance
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior, Seed, child_seed
+from reporting.arrays import Float
 
 MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
 """What a ring-down tells of a wing."""
@@ -178,9 +178,7 @@ trials read off the published plots, frequencies from the spectral peaks as in t
 """
 
 
-FloatArray = NDArray[np.float64]
-
-Comparison = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+Comparison = Callable[[Float], tuple[Float, Float]]
 """Parameters (N, P) within their ranges to differences (N, R) and their standard deviations (N, R)."""
 
 LEAST_EFFECTIVE_SAMPLE_SIZE = 200.0
@@ -195,7 +193,7 @@ _PURPOSE = 22  # of the seed
 
 def infer(
     priors: tuple[ParameterPrior, ...], compare: Comparison, *, seed: Seed = 0, count: int = 1000
-) -> FloatArray:
+) -> Float:
     """Return equally weighted samples (count, P) of the posterior under everything that was read [units].
 
     Proposals are Student-t densities in coordinates in which the posterior at its optimum is round, so that
@@ -224,11 +222,11 @@ def infer(
     ).T
     ends = (low - mean) / deviation, (high - mean) / deviation
 
-    def values(u: FloatArray) -> FloatArray:
+    def values(u: Float) -> Float:
         # within the range to the last digit, whatever rounding does
         return np.asarray(np.clip(mean + deviation * u, low, high))
 
-    def energy(u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def energy(u: Float) -> tuple[Float, Float]:
         """Return what is squared (N, R + P), and logs of scale (N,), at scaled parameters (N, P)."""
         difference, spread = compare(values(u))
         return np.hstack([difference / spread, u]), np.log(spread).sum(axis=1)
@@ -238,7 +236,7 @@ def infer(
     _, singular, rows = np.linalg.svd(best.jac, full_matrices=False)
     stretch = rows / singular[:, None]
 
-    def drawn(centre: FloatArray, covariance: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
+    def drawn(centre: Float, covariance: Float, size: int) -> tuple[Float, Float]:
         """Return draws in round coordinates (N, P) and their weights (N,)."""
         proposal = multivariate_t(centre, covariance, _FREEDOM)
         points = proposal.rvs(size, generator).reshape(size, -1)
@@ -272,7 +270,7 @@ def joint_posterior(
     model_error: tuple[float, float] = MODEL_ERROR,
     seed: int = 0,
     count: int = 1000,
-) -> FloatArray:
+) -> Float:
     """Return samples (count, 5) of e, masses and Rayleigh coefficients, given all measurements at once.
 
     Parameters
@@ -314,7 +312,7 @@ def joint_posterior(
     relative = np.array([errors.get(name, 0.0) for name in kept])
     places = [columns[name] for name in kept]
 
-    def compare(states: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compare(states: Float) -> tuple[Float, Float]:
         outputs = wing.outputs(states)
         stiffness, shown = outputs[:, :1], outputs[:, places]
         pairs = static.load - stiffness * static.displacement

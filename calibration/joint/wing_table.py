@@ -8,13 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebval3d, chebvander3d
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calibration.errors import OutsideValidityError, PosteriorError, said
 from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
 from calibration.static.posterior import PRIOR_DEVIATION, StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
+from reporting.arrays import Float
 
 TOTAL_MASS = 0.472
 """Weighed mass of two servos and the pitot tube [kg] (Kapteyn et al. 2021, eqs. (19) and (20))."""
@@ -81,8 +82,6 @@ def wing_priors(
     )
 
 
-FloatArray = NDArray[np.float64]
-
 QUANTITIES = (
     CalibratedFigure("tip_stiffness", "N/m", "tip stiffness"),
     CalibratedFigure("frequency_1", "Hz", "natural frequency of the first flapwise bending mode"),
@@ -117,8 +116,8 @@ class WingTable:
         Largest relative error of a frequency, found at points between the nodes [1].
     """
 
-    limits: FloatArray
-    coefficient: FloatArray
+    limits: Float
+    coefficient: Float
     stiffness: StiffnessCurve
     error: float = 0.0
 
@@ -127,7 +126,7 @@ class WingTable:
         """Range of e and the masses in which the table holds."""
         return {name: (low, high) for name, (low, high) in zip(_NAMES, self.limits.tolist(), strict=True)}
 
-    def frequency(self, states: ArrayLike) -> FloatArray:
+    def frequency(self, states: ArrayLike) -> Float:
         """Return f1 and f2 (N, 2) [Hz] at rows (N, 3 or more) of e [1] and the masses [kg].
 
         Raises
@@ -146,7 +145,7 @@ class WingTable:
         scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
         return _values(scaled, self.coefficient)
 
-    def outputs(self, states: FloatArray) -> FloatArray:
+    def outputs(self, states: Float) -> Float:
         """Return `QUANTITIES` (N, 6) of states (N, 5 or more), e, masses, alpha and beta first [SI].
 
         Raises
@@ -160,7 +159,7 @@ class WingTable:
         return np.hstack([self.stiffness.stiffness(factor), frequency, ratio, 2.0 * servo + pitot])
 
 
-def _values(scaled: FloatArray, coefficient: FloatArray) -> FloatArray:
+def _values(scaled: Float, coefficient: Float) -> Float:
     first, second, third = scaled.T
     return np.asarray(np.exp(chebval3d(first, second, third, coefficient)).T)
 
@@ -186,7 +185,7 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
     centre, half = limits.mean(axis=1), 0.5 * np.diff(limits, axis=1)[:, 0]
     from scipy.stats import qmc  # takes a second to load
 
-    def exact(points: FloatArray) -> FloatArray:
+    def exact(points: Float) -> Float:
         # a node may leave the range by a rounding error
         states = np.clip(centre + half * points, *limits.T)
         found = (model.modes(**dict(zip(_NAMES, state, strict=True))) for state in states.tolist())

@@ -5,7 +5,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from calibration.errors import OutsideValidityError, PosteriorError, said
@@ -19,6 +18,7 @@ from calibration.static.posterior import (
     StiffnessCurve,
     child_seed,
 )
+from reporting.arrays import Float
 
 DEFAULT_PARTICLE_COUNT = 1_000_000
 """Particles, and samples of each measured pair, in the authors' script."""
@@ -31,8 +31,6 @@ _KERNEL_REACH = 8.0  # bandwidths; the kernel beyond holds 1e-15
 _MEDIAN_DEVIATION_OF_GAUSSIAN = 0.6745  # of a standard Gaussian, as rounded in the rule
 _PURPOSE_PAIRS, _PURPOSE_PARTICLES = 0, 1
 _FEWEST_EFFECTIVE_PARTICLES = 10.0
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,8 +50,8 @@ class ParticlePosterior(ScalarPosterior):
         The particles' tip stiffness k(e) [N/m], in the same way.
     """
 
-    likelihood_grid: FloatArray
-    likelihood: FloatArray
+    likelihood_grid: Float
+    likelihood: Float
     stiffness: ScalarPosterior
 
 
@@ -62,7 +60,7 @@ def reference_bandwidth_factor(count: float) -> float:
     return math.exp(0.2 * math.log(4.0 / (3.0 * count)))
 
 
-def normal_reference_bandwidth(samples: FloatArray) -> float:
+def normal_reference_bandwidth(samples: Float) -> float:
     """Return the bandwidth that is optimal for Gaussian data: sigma_robust * (4 / (3 n))^(1/5).
 
     sigma_robust is the median absolute deviation from the median over 0.6745. This is the default of
@@ -73,11 +71,11 @@ def normal_reference_bandwidth(samples: FloatArray) -> float:
 
 
 def kernel_density(
-    samples: FloatArray,
+    samples: Float,
     bandwidth: float,
     window: tuple[float, float],
-    weights: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
+    weights: Float | None = None,
+) -> tuple[Float, Float]:
     """Return grid (N,) and Gaussian kernel density (N,) of samples (n,) over a window."""
     reach = _KERNEL_REACH * bandwidth
     ends = window[0] - reach, window[1] + reach
@@ -167,7 +165,7 @@ def particle_filter(
     )
 
 
-def _moments(weight: FloatArray, value: FloatArray) -> tuple[float, float]:
+def _moments(weight: Float, value: Float) -> tuple[float, float]:
     # Pairwise sums rather than dot products, whose last bits depend on the number of BLAS threads.
     mean = float(np.sum(weight * value))
     return mean, math.sqrt(float(np.sum(weight * (value - mean) ** 2)))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from calibration.dynamics.records import STEP_FOLDER
@@ -19,6 +18,7 @@ from calibration.joint.posterior import MODAL, servo_range
 from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_coefficients
+from reporting.arrays import Float
 
 RESULTS_FILE = "massoptimizationresults.csv"
 """The authors' masses and frequencies for each of their samples of e."""
@@ -28,22 +28,21 @@ _RESULT_COLUMNS = (
     "target_freq_1", "target_freq_2",
 )  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 
-FrequencyModel = Callable[[FloatArray], FloatArray]
+FrequencyModel = Callable[[Float], Float]
 """Rows of e, servo and pitot mass [kg] (N, 3) to the frequencies of the two flapwise modes (N, 2) [Hz]."""
 
 
 class PaperSamples(NamedTuple):
     """Samples of e, servo and pitot mass, alpha and beta (N, 5), and the model's frequencies (N, 2)."""
 
-    samples: FloatArray
-    frequency: FloatArray
+    samples: Float
+    frequency: Float
 
 
 def fit_masses(
     frequencies: FrequencyModel,
-    young_modulus_factor: FloatArray,
+    young_modulus_factor: Float,
     validity: Mapping[str, tuple[float, float]],
     readings: Sequence[Reading],
 ) -> PaperSamples:

@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from scipy.stats import gaussian_kde
 
 from calibration.result.record import Calibration, Reading
 from calibration.result.text import NOTICEABLE_CORRELATION
 from calibration.static.experiments import HALF_WIDTH_95
+from reporting.arrays import Float
 from reporting.figures import (
     BAND_OPACITY,
     OBSERVED,
@@ -24,8 +24,6 @@ from reporting.figures import (
     panels,
     publication_style,
 )
-
-Float = NDArray[np.float64]
 
 _COLOURS = (PAST, PRESENT, REFERENCE)
 _COLUMNS = 3

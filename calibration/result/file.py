@@ -15,11 +15,11 @@ from typing import Any, get_type_hints
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from calibration.errors import CalibrationError, CalibrationRecordError, said
 from calibration.result.record import FROM_CAMPAIGN, FROM_LABORATORY, STATE, Calibration
+from reporting.arrays import Float
 from reporting.errors import DamagedFileError, FileNotWrittenError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups
@@ -76,7 +76,7 @@ def result_bytes(calibration: Calibration) -> bytes:
     return bytes(tree.to_netcdf(engine="h5netcdf"))
 
 
-def _samples(calibration: Calibration, values: NDArray[np.float64], what: str) -> xr.Dataset:
+def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
     return xr.Dataset(
         {
             figure.name: (
@@ -267,7 +267,7 @@ def run_record(calibration: Calibration, parameter: str) -> dict[str, Any]:
     }
 
 
-def _density(values: NDArray[np.float64]) -> dict[str, list[float]]:
+def _density(values: Float) -> dict[str, list[float]]:
     """Return a Gaussian kernel density of samples; nothing if they do not vary."""
     spread = float(values.std())
     if spread <= 1e-12 * abs(float(values.mean())):

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from calibration.errors import CalibrationRecordError, said
@@ -17,9 +16,9 @@ from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
+from reporting.arrays import Float
 from reporting.words import brief
 
-Float = NDArray[np.float64]
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
 """How the samples were made: by quadrature of one parameter and the others given it, from
 the Gaussian at the optimum where the posterior is one, from Gaussians at several optima; of a wing by

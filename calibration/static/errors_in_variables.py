@@ -31,10 +31,11 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import erf
 
 from calibration.errors import OutsideValidityError, said
+from reporting.arrays import Float
 
 from .experiments import LoadDisplacementData
 from .posterior import PUBLISHED_LINE, GaussianPrior, ScalarPosterior, StiffnessCurve
@@ -52,7 +53,7 @@ _REACH = 10.0  # standard deviations
 _LARGEST_PROBABILITY_OUTSIDE = 1e-4
 
 
-def residual_variance(data: LoadDisplacementData, stiffness: ArrayLike) -> NDArray[np.float64]:
+def residual_variance(data: LoadDisplacementData, stiffness: ArrayLike) -> Float:
     """Return S = R_f + k^2 R_x [N^2], elementwise in the stiffness [N/m]."""
     k = np.asarray(stiffness, dtype=float)
     return np.asarray(data.load_standard_deviation**2 + (k * data.displacement_standard_deviation) ** 2)
@@ -63,7 +64,7 @@ def pair_log_likelihoods(
     data: LoadDisplacementData,
     young_modulus_factor: ArrayLike,
     measure: Measure = "displacement",
-) -> NDArray[np.float64]:
+) -> Float:
     """Return the log likelihood of each pair; as "ratio" the limit of the paper's kernel likelihoods.
 
     Parameters
@@ -106,7 +107,7 @@ def log_likelihood(
     *,
     measure: Measure = "displacement",
     zero_offset_standard_deviation: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Float:
     """Return the log likelihood (N,) of all pairs.
 
     Parameters
@@ -194,7 +195,7 @@ class FitQuality(NamedTuple):
         Sentences on what disagrees; empty if nothing does.
     """
 
-    standardised_residual: NDArray[np.float64]
+    standardised_residual: Float
     remarks: tuple[str, ...]
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, said
 from calibration.lab_folder import lab_table
+from reporting.arrays import Float
 from reporting.provenance import hash_record
 
 STANDARD_GRAVITY = 9.81
@@ -64,8 +65,8 @@ class LoadDisplacementData:
         If a load or a displacement is not positive.
     """
 
-    load: NDArray[np.float64]
-    displacement: NDArray[np.float64]
+    load: Float
+    displacement: Float
     run: NDArray[np.int64]
     load_standard_deviation: float = LOAD_STANDARD_DEVIATION
     displacement_standard_deviation: float = DISPLACEMENT_STANDARD_DEVIATION
@@ -147,7 +148,7 @@ def read_measurements(path: Path) -> LoadDisplacementData:
     )
 
 
-def _refuse_other_units(file: str, load: NDArray[np.float64], displacement_mm: NDArray[np.float64]) -> None:
+def _refuse_other_units(file: str, load: Float, displacement_mm: Float) -> None:
     stiffness = float(np.median(load / displacement_mm))  # N/mm
     expected = EXPECTED_TIP_STIFFNESS * 1e-3
     ratio = stiffness / expected

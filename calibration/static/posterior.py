@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import Chebyshev
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from calibration.errors import PosteriorError, said
+from reporting.arrays import Float
 
 Seed = int | np.random.SeedSequence
 """A seed: a whole number, or a SeedSequence spawned for the purpose."""
@@ -18,7 +19,7 @@ PRIOR_DEVIATION = 0.05 / 1.96
 """Half-width of the prior's 95 % interval of e (Kapteyn et al. 2021, calibration step 2)."""
 
 
-def stratified(generator: np.random.Generator, count: int) -> NDArray[np.float64]:
+def stratified(generator: np.random.Generator, count: int) -> Float:
     """Return a number from each of `count` equal parts of 0 to 1, in shuffled order (count,)."""
     return generator.permutation((np.arange(count) + generator.random(count)) / count)
 
@@ -42,16 +43,16 @@ class GaussianPrior:
     mean: float = 1.0
     standard_deviation: float = PRIOR_DEVIATION
 
-    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def log_density(self, value: ArrayLike) -> Float:
         """Return the logarithm of the density, elementwise."""
         standard = (np.asarray(value, dtype=float) - self.mean) / self.standard_deviation
         return np.asarray(-0.5 * standard**2 - math.log(self.standard_deviation * math.sqrt(2.0 * math.pi)))
 
-    def density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def density(self, value: ArrayLike) -> Float:
         """Return the density, elementwise."""
         return np.exp(self.log_density(value))
 
-    def quantile(self, probability: ArrayLike) -> NDArray[np.float64]:
+    def quantile(self, probability: ArrayLike) -> Float:
         """Return quantiles, elementwise."""
         return np.asarray(self.mean + self.standard_deviation * ndtri(np.asarray(probability, dtype=float)))
 
@@ -70,11 +71,11 @@ class ScalarPosterior:
         Of this density, unless given (a particle filter gives those of its particles).
     """
 
-    grid: NDArray[np.float64]
-    density: NDArray[np.float64]
+    grid: Float
+    density: Float
     mean: float = math.nan
     standard_deviation: float = math.nan
-    _cumulative: NDArray[np.float64] = field(init=False, repr=False)
+    _cumulative: Float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         grid, density = self.grid, self.density / np.trapezoid(self.density, self.grid)
@@ -89,11 +90,11 @@ class ScalarPosterior:
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
-    def cumulative(self, value: ArrayLike) -> NDArray[np.float64]:
+    def cumulative(self, value: ArrayLike) -> Float:
         """Return the distribution function, elementwise."""
         return np.asarray(np.interp(np.asarray(value, dtype=float), self.grid, self._cumulative))
 
-    def quantile(self, probability: ArrayLike) -> NDArray[np.float64]:
+    def quantile(self, probability: ArrayLike) -> Float:
         """Return quantiles, elementwise: the inverse of `cumulative`."""
         return np.asarray(np.interp(np.asarray(probability, dtype=float), self._cumulative, self.grid))
 
@@ -103,7 +104,7 @@ class ScalarPosterior:
         lower, upper = self.quantile([tail, 1.0 - tail])
         return float(lower), float(upper)
 
-    def samples(self, seed: Seed, count: int) -> NDArray[np.float64]:
+    def samples(self, seed: Seed, count: int) -> Float:
         """Draw one sample from each of `count` strata of equal probability, in shuffled order.
 
         Sample means have far less variance than those of independent draws.
@@ -156,17 +157,17 @@ class StiffnessCurve:
         """Largest e of the range."""
         return float(self.polynomial.domain[1])
 
-    def stiffness(self, young_modulus_factor: ArrayLike) -> NDArray[np.float64]:
+    def stiffness(self, young_modulus_factor: ArrayLike) -> Float:
         """Return k(e) [N/m], elementwise."""
         factor = np.asarray(young_modulus_factor, dtype=float)
         inside = np.clip(factor, self.lower, self.upper)
         return np.asarray(self.polynomial(inside) + (factor - inside) * self.slope(inside))
 
-    def slope(self, young_modulus_factor: ArrayLike) -> NDArray[np.float64]:
+    def slope(self, young_modulus_factor: ArrayLike) -> Float:
         """Return dk/de [N/m], elementwise."""
         return np.asarray(self.polynomial.deriv()(np.clip(young_modulus_factor, self.lower, self.upper)))
 
-    def young_modulus_factor(self, stiffness: ArrayLike) -> NDArray[np.float64]:
+    def young_modulus_factor(self, stiffness: ArrayLike) -> Float:
         """Return the inverse e(k), elementwise; `stiffness` in N/m."""
         value = np.asarray(stiffness, dtype=float)
         factors = np.linspace(self.lower, self.upper, _INVERSE_TABLE_SIZE)

@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
-from numpy.typing import NDArray
 
 from calibration.dynamics.figures import ring_down_figure
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence, average
@@ -16,11 +15,10 @@ from calibration.errors import CalibrationRecordError, said
 from calibration.geometry import Lengths, tailored_design
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import QUANTITIES, tabulate_wing, wing_priors
-from calibration.paper.figures import calibration_figure
+from calibration.paper.figures import WORDS as TABLE_1
+from calibration.paper.figures import TableRow, calibration_figure, table_1, write_table_1
 from calibration.paper.load_test import StaticCalibration, calibrate_static, push_forward
 from calibration.paper.procedure import fit_masses
-from calibration.paper.table_1 import WORDS as TABLE_1
-from calibration.paper.table_1 import TableRow, table_1, write_table_1
 from calibration.result.figures import corner_figure, drawn_parameters
 from calibration.result.file import FILE_NAME, save_calibration
 from calibration.result.folder import (
@@ -39,6 +37,7 @@ from calibration.wing.lab_data import LabData, published_data, read_lab_folder
 from fe.reduction.model_cache import WingFields, reduced_model, wing_fields, write_modes_vtu, write_wing_vtu
 from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
+from reporting.arrays import Float
 from reporting.figures import LEVELS, panels, publication_style
 from reporting.page import Page, Words
 from reporting.progress import Progress, reporter, stage
@@ -105,8 +104,6 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
 def _percent(value: float) -> str:
     return f"{100.0 * value:+.1f} %".replace("-", "−")
 
-
-Float = NDArray[np.float64]
 
 SAMPLE_COUNT = 1000
 """Samples of the joint posterior that a calibration keeps."""

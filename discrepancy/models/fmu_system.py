@@ -20,8 +20,7 @@ from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
-from fmu_asset.door.runs import FmuRuns, Run, State
-from fmu_asset.door.state_space import StateSpace, realised
+from fmu_asset.door.runs import FmuRuns, Run, State, StateSpace, realised
 from fmu_asset.errors import FmuError
 from reporting.memory import Memory
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from difflib import get_close_matches
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -229,6 +230,11 @@ class FmuDescription(FmuIdentity):
     def variable(self, name: str) -> VariableInfo | None:
         """Return the variable of that name, or None."""
         return self._by_name.get(name)
+
+    def hint(self, name: str) -> str:
+        """Return the end of a sentence on a name that is none: the nearest of its variables, if any is."""
+        near = get_close_matches(name, [variable.name for variable in self.variables], 1)
+        return f"; did you mean {near[0]!r}?" if near else "."
 
     @cached_property
     def feedthrough(self) -> dict[str, frozenset[str]]:

@@ -1,6 +1,5 @@
 """An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
 
-import hashlib
 import json
 import lzma
 import os
@@ -18,6 +17,7 @@ from fmpy import platform_tuple, read_model_description, sharedLibraryExtension
 from fmu_asset.errors import FmuFileError, FmuUnsupportedError, said
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
+from reporting.provenance import hash_file
 from reporting.words import one_line
 
 from .declared import FmuDescription, read_declared
@@ -152,8 +152,7 @@ def _size_and_hash(file: Path) -> tuple[int, str]:
     if not file.is_file():
         raise FmuFileError(f"{file} is a folder, not an FMU file.")
     try:
-        with file.open("rb") as content:
-            return file.stat().st_size, hashlib.file_digest(content, "sha256").hexdigest()
+        return file.stat().st_size, hash_file(file)
     except OSError as error:
         raise FmuFileError(f"{file} cannot be read ({error.strerror}).") from error
 

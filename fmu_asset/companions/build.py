@@ -10,7 +10,7 @@ from importlib.resources import files
 from typing import Any
 
 from fmu_asset.description import PLACEHOLDER, Declaration
-from fmu_asset.packing.contents import python_members, sealed, units_of
+from fmu_asset.packing.contents import python_members, sealed
 from fmu_asset.slaves.variables import Table
 
 _IMPORTS = """import json
@@ -65,5 +65,4 @@ def declared_companion(name: str, told: dict[str, Any]) -> Declaration:
                 if given["causality"] == "output":
                     dependencies[given["name"]] = [] if source is None else [source]
     table.add_status()
-    rows = table.rows()
-    return Declaration(name, told["description"], rows, units_of(rows), dependencies)
+    return Declaration(name, told["description"], table.rows(), dependencies)

@@ -7,7 +7,6 @@ algebraic loop. A circle of components alone is none: somewhere on it stands a s
 beginning of the step can be used.
 """
 
-import difflib
 import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,13 +30,6 @@ Feedthrough = Mapping[str, Mapping[str, Collection[str]]]
 """For each component, for each output, the inputs that it depends on directly."""
 
 
-class Link(NamedTuple):
-    """A connection between components whose value is wanted from the same moment, not delayed."""
-
-    source: Endpoint
-    target: Endpoint
-
-
 @dataclass(frozen=True)
 class Schedule:
     """How a step goes through the components.
@@ -50,7 +42,7 @@ class Schedule:
         does not.
     circles : frozenset of tuple of str
         Those of the groups that are such a circle.
-    held : tuple of Link
+    held : tuple of Connection
         Connections that, in one pass in this order, carry the value of the beginning of the step.
     loops : tuple of tuple of Endpoint
         Algebraic loops, each as a shortest circle of variables.
@@ -58,7 +50,7 @@ class Schedule:
 
     groups: tuple[tuple[str, ...], ...]
     circles: frozenset[tuple[str, ...]]
-    held: tuple[Link, ...]
+    held: tuple[Connection, ...]
     loops: tuple[tuple[Endpoint, ...], ...]
 
     @property
@@ -67,7 +59,7 @@ class Schedule:
         return tuple(name for group in self.groups for name in group)
 
 
-def schedule(names: Sequence[str], links: Sequence[Link], feedthrough: Feedthrough) -> Schedule:
+def schedule(names: Sequence[str], links: Sequence[Connection], feedthrough: Feedthrough) -> Schedule:
     """Return the order of components, and the algebraic loops.
 
     Equal cases keep the order of `names`.
@@ -76,7 +68,7 @@ def schedule(names: Sequence[str], links: Sequence[Link], feedthrough: Feedthrou
     ----------
     names : sequence of str
         The components.
-    links : sequence of Link
+    links : sequence of Connection
         Connections between them that are not delayed.
     feedthrough : mapping
         Direct dependencies of outputs on inputs.
@@ -102,9 +94,11 @@ def schedule(names: Sequence[str], links: Sequence[Link], feedthrough: Feedthrou
     )
 
 
-def algebraic_loops(links: Sequence[Link], feedthrough: Feedthrough) -> tuple[tuple[Endpoint, ...], ...]:
+def algebraic_loops(
+    links: Sequence[Connection], feedthrough: Feedthrough
+) -> tuple[tuple[Endpoint, ...], ...]:
     """Return one shortest circle of variables for each set of variables that depend on each other."""
-    graph: dict[Endpoint, set[Endpoint]] = {end: set() for link in links for end in link}
+    graph = {end: set[Endpoint]() for link in links for end in (link.source, link.target)}
     for link in links:
         graph[link.source].add(link.target)
     for name, outputs in feedthrough.items():
@@ -262,7 +256,7 @@ class Wiring:
         taken: dict[Endpoint, Endpoint] = {}
         for connection in structure.connections:
             self._connect(connection, taken)
-        links = [Link(port.end, target) for target, port in self.feeds.items() if not port.delayed]
+        links = [Connection(port.end, target) for target, port in self.feeds.items() if not port.delayed]
         self.schedule: Schedule = schedule(names, links, self._feedthrough())
 
     def _feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
@@ -291,8 +285,7 @@ class Wiring:
         declared = self.declared[end.component]
         variable = declared.variable(end.variable)
         if variable is None:
-            near = difflib.get_close_matches(end.variable, [v.name for v in declared.variables], 1, 0.6)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
+            hint = declared.hint(end.variable)
             raise CouplingError(said("coupling.no_variable", end=end, declared=declared, hint=hint))
         return variable
 

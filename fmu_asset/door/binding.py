@@ -33,7 +33,7 @@ from pydantic import BeforeValidator, Field
 from fmu_asset.errors import BindingError, said
 from fmu_asset.instances.plan import Interface
 from fmu_asset.worker.client import WorkerLimits
-from reporting.toml_file import Fault, Section, checked, read_toml
+from reporting.toml_file import Fault, Number, Positive, Section, checked, read_toml
 
 from .units import same_dimension
 
@@ -50,8 +50,6 @@ _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _LARGEST_PATTERN = 100_000
 
 _Text = Annotated[str, Field(min_length=1)]
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Texts = Annotated[tuple[_Text, ...], Field(strict=False)]
 
 
@@ -100,8 +98,8 @@ class Scalar(Section):
 class Input(Scalar):
     """An input with a range of its own, in `unit`, within that of the FMU."""
 
-    minimum: _Number | None = None
-    maximum: _Number | None = None
+    minimum: Number | None = None
+    maximum: Number | None = None
 
     def faults(self) -> Iterator[Fault]:
         """Yield limits that are exchanged."""
@@ -121,7 +119,7 @@ class Input(Scalar):
 class Parameter(Input):
     """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another."""
 
-    value: _Number | None = None
+    value: Number | None = None
 
 
 class Vector(Section):
@@ -225,14 +223,14 @@ class Header(Section):
     """
 
     name: _Text
-    step_size: _Positive
+    step_size: Positive
     decimation: int = Field(default=1, ge=1, le=10_000_000)
-    start_time: _Number = 0.0
+    start_time: Number = 0.0
     fmi_version: Literal["1.0", "2.0", "3.0"] | None = None
     interface: Interface | None = None
-    tolerance: _Positive | None = None
+    tolerance: Positive | None = None
     interpolation: Interpolation = "zero-order"
-    structural_parameters: dict[str, _Number] = Field(default_factory=dict)
+    structural_parameters: dict[str, Number] = Field(default_factory=dict)
     state: Literal["auto", "serialised", "replay"] = "auto"
     description: str = ""
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.errors import BindingError, FmuInputError, said
+from fmu_asset.instances.plan import Floats
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 
@@ -25,7 +25,8 @@ from .draft import bindable, observable
 from .layout import ObservationHistory
 from .session import FmiAsset
 
-Roles = dict[str, dict[str, npt.NDArray[np.float64]]]
+Roles = dict[str, dict[str, Floats]]
+"""Inputs of N steps by role and name, (N,) or (N, n) for an array: what `FmiAsset.simulate` takes."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]", re.DOTALL)
 _TIME = "time"
@@ -33,23 +34,8 @@ _TIME = "time"
 _TIME_TOLERANCE = 1e-6
 
 
-class InputHistories(NamedTuple):
-    """The inputs of N steps.
-
-    Attributes
-    ----------
-    steps : int
-        N.
-    roles : dict of str to dict of str to ndarray
-        By role and name, (N,) or (N, n) for an array: what `FmiAsset.simulate` takes.
-    """
-
-    steps: int
-    roles: Roles
-
-
-def read_histories(path: Path, binding: Binding) -> InputHistories:
-    """Read the inputs of all steps from a CSV file.
+def read_histories(path: Path, binding: Binding) -> tuple[int, Roles]:
+    """Return how many steps a CSV file has, and their inputs.
 
     The first line names the columns: `time` [s], which begins at the binding's start time and goes on by its
     interval, and inputs as `control.load_factor`, or `load_factor` where no other role has that name; the
@@ -73,7 +59,7 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
     time = table.numbers(_TIME, "a simulation")
     _check_time(path, time, binding)
     names = _input_names(binding)
-    columns: dict[tuple[str, str], dict[int, npt.NDArray[np.float64]]] = {}
+    columns: dict[tuple[str, str], dict[int, Floats]] = {}
     for column in table.columns:
         if column == _TIME:
             continue
@@ -94,7 +80,7 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
             raise FmuInputError(f"{path} lacks the column {role}.{name}[{min(lost)}]; count from 1.")
         array = np.column_stack([elements[number] for number in sorted(elements)])
         roles.setdefault(role, {})[name] = elements.get(0, array)
-    return InputHistories(len(time), roles)
+    return len(time), roles
 
 
 def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> None:
@@ -127,7 +113,7 @@ def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history:
     atomic_write_text(path, text.getvalue())
 
 
-def _check_time(path: Path, time: npt.NDArray[np.float64], binding: Binding) -> None:
+def _check_time(path: Path, time: Floats, binding: Binding) -> None:
     wanted = binding.binding.start_time + binding.interval * np.arange(len(time))
     wrong = np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval)
     if wrong.size:
@@ -296,8 +282,8 @@ def _steps_to(start: float, end: float | None, size: float | None) -> tuple[int,
     return steps, size
 
 
-def fly_histories(asset: FmiAsset, given: InputHistories) -> ObservationHistory:
-    """Simulate an asset under the histories of a file.
+def fly_histories(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
+    """Simulate an asset under the histories of a file, as `read_histories` returns them.
 
     Each row holds over the step that begins at its time. Under linear interpolation lines lead from row to
     row: the first is where the asset starts, and there is a moment for each row.
@@ -310,16 +296,16 @@ def fly_histories(asset: FmiAsset, given: InputHistories) -> ObservationHistory:
         As `FmiAsset.simulate`.
     """
     if asset.binding.binding.interpolation == "zero-order":
-        return asset.simulate(**given.roles, steps=given.steps, progress=None)
-    if given.steps < 2:
+        return asset.simulate(**roles, steps=steps, progress=None)
+    if steps < 2:
         raise FmuInputError(said("inputs.one_row"))
-    first = {role: {name: v[0] for name, v in table.items()} for role, table in given.roles.items()}
-    rest = {role: {name: v[1:] for name, v in table.items()} for role, table in given.roles.items()}
+    first = {role: {name: v[0] for name, v in table.items()} for role, table in roles.items()}
+    rest = {role: {name: v[1:] for name, v in table.items()} for role, table in roles.items()}
     asset.reset(**first)
-    return _from_here(asset, given.steps - 1, rest)
+    return from_here(asset, steps - 1, rest)
 
 
-def _from_here(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
+def from_here(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
     """Return this moment and what comes out of the steps after it."""
     first, then = asset.observe(), asset.simulate(**roles, steps=steps, progress=None)
     return ObservationHistory(
@@ -351,4 +337,4 @@ def fly(asset: FmiAsset, experiment: Experiment) -> ObservationHistory:
         As `FmiAsset.simulate`.
     """
     asset.reset(experiment.parameters, **experiment.inputs)
-    return _from_here(asset, experiment.steps, {})
+    return from_here(asset, experiment.steps, {})

@@ -1,6 +1,5 @@
 """Names of a binding found in an FMU: where their values stand in a block, what is refused, what is read."""
 
-import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -58,9 +57,8 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     variable = description.variable(name)
     place = _element(description, name, label) if variable is None else Place(variable, range(variable.size))
     if place is None:
-        near = difflib.get_close_matches(name, [v.name for v in description.variables], 1, 0.6)
-        hint = f"; did you mean {near[0]!r}?" if near else "."
-        raise BindingError(f"{label} names {name!r}, which is not a variable of {description.path}{hint}")
+        unknown = f"{label} names {name!r}, which is not a variable of {description.path}"
+        raise BindingError(unknown + description.hint(name))
     variable = place.variable
     sent = (
         causality == "input"

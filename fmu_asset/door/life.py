@@ -199,7 +199,9 @@ class OpenedFmu:
     @property
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMU, oldest first: status and text."""
-        self._collect_log()
+        instance = self._housing.instance
+        if instance is not None and not instance.lost:
+            self._log.extend((status_name(status), text) for status, text in instance.take_log())
         return tuple(self._log)
 
     @property
@@ -389,12 +391,6 @@ class OpenedFmu:
             more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
             why = said("running.not_finite", self=self, names=bad[:5], more=more, which=which)
             raise FmuOutputError(why, [text for _, text in self.log[-5:]])
-
-    def _collect_log(self) -> None:
-        instance = self._housing.instance
-        if instance is not None and not instance.lost:
-            for status, text in instance.take_log():
-                self._log.append((status_name(status), text))
 
     def _fail(self, error: FmuError, what: str) -> NoReturn:
         """Raise the error with the FMU's file and the moment, and keep its messages."""

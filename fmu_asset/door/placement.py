@@ -7,7 +7,6 @@ of starting for good, a new instance in the same process and then a new process.
 """
 
 import logging
-import math
 import weakref
 from array import array
 from collections.abc import Callable
@@ -22,11 +21,12 @@ from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import extract_fmu
 from fmu_asset.errors import FmuCallError, FmuError, FmuInputError, said
 from fmu_asset.folders import plain_folder, remove_folder
-from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
+from fmu_asset.instances.co_simulation import open_instance
 from fmu_asset.instances.plan import Floats, Instance, Plan, Settings
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
+from reporting.toml_file import checked
 
 from .binding import Binding
 
@@ -390,12 +390,6 @@ def limits_of(
     FmuInputError
         If one is not positive.
     """
-    given = {"step_timeout": step_timeout, "load_timeout": load_timeout, "memory_limit": memory_limit}
-    changed = {}
-    for (name, value), key in zip(given.items(), ("step_time", "load_time", "memory"), strict=True):
-        if value is not None and not (math.isfinite(value) and value > 0.0):
-            unit = "MiB" if name == "memory_limit" else "seconds"
-            raise FmuInputError(f"{name} must be a positive number of {unit}, but is {value!r}.")
-        if value is not None:
-            changed[key] = value
-    return binding.limits.model_copy(update=changed)
+    given = {"step_time": step_timeout, "load_time": load_timeout, "memory": memory_limit}
+    limits = binding.limits.model_dump() | {key: value for key, value in given.items() if value is not None}
+    return checked(WorkerLimits, limits, "the limits of the worker", FmuInputError, what="the limits")

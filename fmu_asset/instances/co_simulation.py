@@ -386,3 +386,14 @@ class ModelExchange(FmuInstance):
     def _free(self) -> None:
         self._close_solver()
         super()._free()
+
+
+def open_instance(plan: Plan) -> FmuInstance:
+    """Return a new instance of the plan's FMI version and interface.
+
+    Raises
+    ------
+    FmuCallError
+        If the binary cannot be loaded or the instance cannot be made.
+    """
+    return (ModelExchange if plan.fmu.interface == "model-exchange" else CoSimulation)(plan)

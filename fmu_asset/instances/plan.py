@@ -120,11 +120,6 @@ class Plan:
         """Number of values behind time and step size in a request: all inputs, then where lines begin."""
         return sum(group.count for group in self.inputs) + self.linear_count
 
-    @property
-    def output_count(self) -> int:
-        """Number of output values."""
-        return sum(group.count for group in self.outputs)
-
 
 _C_TYPES: dict[str, Any] = {
     "Real": ctypes.c_double, "Float64": ctypes.c_double, "Float32": ctypes.c_float, "Integer": ctypes.c_int,
@@ -277,7 +272,7 @@ class Instance(Protocol):
 
     def __init__(self, plan: Plan) -> None:
         self.request = (ctypes.c_double * (2 + plan.input_count))()
-        self.reply = (ctypes.c_double * max(plan.output_count, 1))()
+        self.reply = (ctypes.c_double * max(sum(group.count for group in plan.outputs), 1))()
         self.lost = False
 
     def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:

@@ -32,7 +32,7 @@ from fmu_asset.description import PLACEHOLDER, Declaration, description_members,
 from fmu_asset.errors import FmuBuildError, FmuError, said
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
-from reporting.units import BASE_UNITS, meaning_of
+from reporting.units import BASE_UNITS
 
 PYTHONFMU_VERSION = "0.7.0"
 """The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
@@ -112,24 +112,6 @@ def check_start(table: Iterable[FmuVariable]) -> None:
             if row.variability == "tunable":
                 advice = "that number of an effect; correct the patch"
             raise FmuBuildError(said("packing.start", row=row, low=low, high=high, advice=advice))
-
-
-def units_of(table: Iterable[FmuVariable]) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
-    """Return the units of a table with their display units; see `Declaration`.
-
-    What a text does not say is left out: of a unit that is not understood no more than its name is told.
-    """
-    units: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
-    for row in table:
-        meaning, shown = meaning_of(row.unit or ""), meaning_of(row.display_unit or "")
-        base, displays = units.setdefault(row.unit, ({}, {})) if row.unit else ({}, {})
-        if meaning is not None:
-            base |= {symbol: n for symbol, n in zip(BASE_UNITS, meaning.exponents, strict=True) if n}
-            if meaning[1:] != (1.0, 0.0):
-                base |= {"factor": meaning.factor, "offset": meaning.offset}
-            if shown is not None and row.display_unit:
-                displays[row.display_unit] = meaning.factor / shown.factor
-    return units
 
 
 # ---------------------------------------------------------------- pythonfmu

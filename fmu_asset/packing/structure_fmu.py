@@ -24,8 +24,15 @@ from fe.runtime.transient import ModalIntegrator
 from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
-from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
+from fmu_asset.compiled.package import (
+    DATA_FILE,
+    PLATFORM,
+    FmiVersion,
+    Platform,
+    binaries_of,
+    compiled_members,
+    find_compiler,
+)
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError, said
 from fmu_asset.instances.plan import Interface
@@ -43,7 +50,6 @@ from .contents import (
     python_members,
     room_members,
     sealed,
-    units_of,
     write_fmu,
 )
 from .patch_file import PatchFile
@@ -144,7 +150,7 @@ def build_fmu(
         kept = _patched_members(model, effects, options.get("arrays"))
     check_start(table)
     description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
-    declared = Declaration(name, f"{description} {options.get('note', '')}".strip(), table, units_of(table))
+    declared = Declaration(name, f"{description} {options.get('note', '')}".strip(), table)
     if kind == "python":
         resources = {
             "reduced_model.npz": model.to_bytes(),

@@ -11,21 +11,12 @@ from __future__ import annotations
 import math
 import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import partial, partialmethod
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
-from .variables import (
-    STATUS_BAD_CALL,
-    STATUS_BAD_STATE,
-    STATUS_BAD_STEP,
-    STATUS_INTERNAL,
-    STATUS_NOT_FINITE,
-    STATUS_OK,
-    STATUS_OUTSIDE_RANGE,
-    FmuVariable,
-)
+from .variables import FmuVariable, Status
 
 INSTANTIATED, INITIALISING, READY, REFUSED, TERMINATED = range(5)
 """Phases of an instance; REFUSED is an initialisation that was not accepted."""
@@ -46,26 +37,6 @@ class UnacceptableValuesError(ValueError):
     """The values lie in their ranges, but the asset cannot have them; one sentence with its full stop."""
 
 
-class Behaviour(Protocol):
-    """What an FMU does; a call either completes or raises and leaves everything as it was.
-
-    Outputs are the first of the table, in order; Booleans are 0 or 1. `parameters` are those of the table by
-    name.
-    """
-
-    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Begin at a time [s] and return the outputs."""
-
-    def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Advance by one step with the inputs held and return the outputs at its end."""
-
-    def state(self) -> list[float]:
-        """Return all that is remembered, without the parameters."""
-
-    def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
-        """Take back what `state` returned."""
-
-
 class Contents(NamedTuple):
     """What the FMU's resources hold.
 
@@ -75,7 +46,10 @@ class Contents(NamedTuple):
         Inputs, parameters and outputs, in this order; one output is `status`. Tunable parameters and further
         inputs may follow at its end: the behaviour is told of them by `tune(values by name, start time)`.
     make_behaviour : callable
-        Makes a fresh `Behaviour`.
+        Makes afresh what the FMU does: `start(parameters by name, time [s], inputs)` and
+        `advance(time, duration, inputs)` return the outputs, the first of the table in order, Booleans 0 or
+        1; `state()` all that is remembered without the parameters, as floats; `restore(parameters, state)`
+        takes it back. A call either completes or raises and leaves everything as it was.
     later : tuple of slice
         Outputs that are computed when somebody reads them, since most masters do not: groups of rows that
         follow one another, of which the behaviour's `later(number)` returns the values.
@@ -140,19 +114,19 @@ class Slave:
         if math.isfinite(start_time):
             self._time = self._start_time = float(start_time)
         else:
-            self._refuse(STATUS_NOT_FINITE, f"the start time is {start_time!r}; it must be finite")
+            self._refuse(Status.NOT_FINITE, f"the start time is {start_time!r}; it must be finite")
 
     def enter_initialization_mode(self) -> None:
         """Begin initialisation."""
         if self._phase in (INSTANTIATED, REFUSED):
             self._phase = INITIALISING
         else:
-            self._refuse(STATUS_BAD_CALL, "initialisation was entered a second time; reset the FMU first")
+            self._refuse(Status.BAD_CALL, "initialisation was entered a second time; reset the FMU first")
 
     def exit_initialization_mode(self) -> None:
         """Check parameters and inputs, and find the initial state."""
         if self._phase != INITIALISING:
-            self._refuse(STATUS_BAD_CALL, "initialisation was left without having been entered")
+            self._refuse(Status.BAD_CALL, "initialisation was left without having been entered")
             return
         self._phase = READY if self._initialise() else REFUSED
 
@@ -182,11 +156,11 @@ class Slave:
                 return False
             outputs = act(self._values[: self._input_count])
         except UnacceptableValuesError as error:
-            return self._refuse(STATUS_OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
+            return self._refuse(Status.OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
-            return self._refuse(STATUS_INTERNAL, f"{what} failed: {error!r}")
+            return self._refuse(Status.INTERNAL, f"{what} failed: {error!r}")
         self._values[self._first_output : self._first_output + len(outputs)] = outputs
-        self._values[self._status] = STATUS_OK
+        self._values[self._status] = Status.OK
         self._stale = False
         self._pending = [True] * len(self._later)
         return True
@@ -204,16 +178,16 @@ class Slave:
 
     def _may_step(self, current_time: float, step_size: float) -> bool:
         if self._phase != READY:
-            return self._refuse(STATUS_BAD_CALL, f"a step was asked for {_WHY[self._phase]}")
+            return self._refuse(Status.BAD_CALL, f"a step was asked for {_WHY[self._phase]}")
         if not (step_size > 0.0 and math.isfinite(step_size) and math.isfinite(current_time)):
             return self._refuse(
-                STATUS_BAD_STEP,
+                Status.BAD_STEP,
                 f"the step from t = {current_time!r} s over {step_size!r} s was refused: the communication "
                 "point must be finite, the step size finite and positive",
             )
         if abs(current_time - self._time) > 1e-6 * step_size + 1e-9 * abs(self._time):
             return self._refuse(
-                STATUS_BAD_STEP,
+                Status.BAD_STEP,
                 f"the step from t = {current_time!r} s was refused: the FMU stands at t = {self._time!r} s",
             )
         return True
@@ -223,39 +197,32 @@ class Slave:
 
     # ------------------------------------------------------------------ values
 
-    def set_real(self, vrs: Sequence[int], values: Sequence[float]) -> None:
-        """Set inputs and tunable parameters at any time, others before the end of initialisation."""
-        self._set("Real", vrs, values)
-
-    def set_integer(self, vrs: Sequence[int], values: Sequence[int]) -> None:
-        """Set integers and enumerations, as `set_real`."""
-        self._set("Integer", vrs, values)
-
-    def set_boolean(self, vrs: Sequence[int], values: Sequence[bool]) -> None:
-        """Set Booleans, as `set_real`."""
-        self._set("Boolean", vrs, values)
-
     def _set(self, kind: str, vrs: Sequence[int], values: Sequence[float]) -> None:
+        """Set inputs and tunable parameters at any time, others before the end of initialisation."""
         for vr, value in zip(vrs, values, strict=True):
             row = self._table[vr] if 0 <= vr < len(self._table) else None
             if row is None or row.causality == "output" or row.kind not in _KINDS[kind]:
                 name = "an unknown variable" if row is None else row.name
-                self._refuse(STATUS_BAD_CALL, f"{name} (value reference {vr}) cannot be set as {kind}")
+                self._refuse(Status.BAD_CALL, f"{name} (value reference {vr}) cannot be set as {kind}")
             elif row.variability == "fixed" and self._phase in (READY, TERMINATED):
                 self._refuse(
-                    STATUS_BAD_CALL,
+                    Status.BAD_CALL,
                     f"{row.name} is a fixed parameter and can be set only before the first step",
                 )
             else:
                 self._values[vr] = float(value)
                 self._stale = True
 
+    set_real = partialmethod(_set, "Real")
+    set_integer = partialmethod(_set, "Integer")  # enumerations, too
+    set_boolean = partialmethod(_set, "Boolean")
+
     def get_real(self, vrs: Sequence[int]) -> list[float]:
         """Return values; some outputs are computed when they are asked for."""
         values = self._values
         if min(vrs, default=0) < 0 or max(vrs, default=0) >= len(values):
             unknown = next(vr for vr in vrs if not 0 <= vr < len(values))
-            self._refuse(STATUS_BAD_CALL, f"there is no value reference {unknown}")
+            self._refuse(Status.BAD_CALL, f"there is no value reference {unknown}")
             return [math.nan] * len(vrs)
         if self._stale and self._phase == INITIALISING:
             self._initialise()
@@ -271,7 +238,7 @@ class Slave:
             self._values[part] = self._behaviour.later(number)
             self._pending[number] = False
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
-            self._refuse(STATUS_INTERNAL, f"values could not be read: {error!r}")
+            self._refuse(Status.INTERNAL, f"values could not be read: {error!r}")
             self._values[part] = [math.nan] * (part.stop - part.start)
 
     def get_integer(self, vrs: Sequence[int]) -> list[int]:
@@ -285,7 +252,7 @@ class Slave:
     def set_string(self, vrs: Sequence[int], values: Sequence[str]) -> None:
         """Refuse: there are no String variables."""
         if vrs:
-            self._refuse(STATUS_BAD_CALL, "the FMU has no String variables")
+            self._refuse(Status.BAD_CALL, "the FMU has no String variables")
 
     def get_string(self, vrs: Sequence[int]) -> list[str]:
         """Refuse: there are no String variables."""
@@ -310,7 +277,7 @@ class Slave:
             values = body[flags : flags + count]
             self._behaviour.restore(self._parameters(values), body[flags + count :])
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
-            self._refuse(STATUS_BAD_STATE, f"the FMU state was not restored: {error}")
+            self._refuse(Status.BAD_STATE, f"the FMU state was not restored: {error}")
             return
         self._phase, self._time, self._start_time = int(body[0]), body[1], body[2]
         self._stale, *self._pending = (flag != 0.0 for flag in body[3:flags])
@@ -341,10 +308,10 @@ class Slave:
             row = self._table[index]
             if not math.isfinite(value):
                 return self._refuse(
-                    STATUS_NOT_FINITE, f"{row.name} is {value!r}, which is not finite; {consequence}"
+                    Status.NOT_FINITE, f"{row.name} is {value!r}, which is not finite; {consequence}"
                 )
             return self._refuse(
-                STATUS_OUTSIDE_RANGE,
+                Status.OUTSIDE_RANGE,
                 f"{row.name} = {value!r} lies outside its range {self._low[index]:g} to {self._high[index]:g}"
                 f"{'' if row.unit in (None, '1') else f' {row.unit}'}; {consequence}",
             )
@@ -352,7 +319,7 @@ class Slave:
 
     def _refuse(self, status: int, sentence: str) -> bool:
         self._values[self._status] = status
-        level = _DISCARD if self._phase == READY and status != STATUS_BAD_STATE else _ERROR
+        level = _DISCARD if self._phase == READY and status != Status.BAD_STATE else _ERROR
         category = "logStatusDiscard" if level == _DISCARD else "logStatusError"
         self.log_queue.append(LogMessage(level, category, sentence))
         return False

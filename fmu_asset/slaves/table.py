@@ -47,8 +47,6 @@ class Roles:
     ----------
     chosen : tuple of str
         Names of all that can be chosen, in the order of the model: parameters, losses, masses, controls.
-    outputs : int
-        Number of strains, displacements and accelerations.
     displacement_bound : str or None
         The bound of the displacements, where it is an output.
     point_load : int
@@ -58,7 +56,6 @@ class Roles:
     """
 
     chosen: tuple[str, ...]
-    outputs: int
     displacement_bound: str | None = None
     point_load: int = 0
     release: str | None = None
@@ -161,9 +158,8 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     for mode in modes:
         table.add(f"damping_ratio[{mode}]", "output", f"Damping ratio of mode {mode}", unit="1", display="%")
     chosen = tuple(variables[name] for name in model.chosen)
-    outputs = model.static_count + len(model.accelerations)
     if wing:
         names = ("initial_tip_displacement", "load_point_displacement")
-        return table.rows(), Roles(chosen, outputs, None, TIP_FORCE, *names)
+        return table.rows(), Roles(chosen, None, TIP_FORCE, *names)
     table.add_status()
-    return table.rows(), Roles(chosen, outputs, "displacement_error_bound")
+    return table.rows(), Roles(chosen, "displacement_error_bound")

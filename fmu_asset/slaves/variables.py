@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Literal
 
 Kind = Literal["Real", "Integer", "Boolean", "Enumeration"]
@@ -18,11 +19,11 @@ QUASI_STATIC = 1
 TRANSIENT = 2
 """Value of `response`: the modes are integrated in time."""
 
-(
-    STATUS_OK, STATUS_OUTSIDE_RANGE, STATUS_NOT_FINITE, STATUS_BAD_STEP, STATUS_BAD_CALL, STATUS_BAD_STATE,
-    STATUS_INTERNAL,
-) = range(7)  # fmt: skip
-"""Values of `status`."""
+
+class Status(IntEnum):
+    """Values of `status`."""
+
+    OK, OUTSIDE_RANGE, NOT_FINITE, BAD_STEP, BAD_CALL, BAD_STATE, INTERNAL = range(7)
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,13 @@ ENUMERATIONS = (
         "Status",
         "What became of the last call; other than ok, the call was refused and state and outputs stay",
         (
-            ("ok", STATUS_OK, "The outputs belong to the inputs of the last step"),
-            ("outside_range", STATUS_OUTSIDE_RANGE, "An input or parameter lies outside its min and max"),
-            ("not_finite", STATUS_NOT_FINITE, "An input or parameter is NaN or infinite"),
-            ("bad_step", STATUS_BAD_STEP, "Step size or communication point is not acceptable"),
-            ("bad_call", STATUS_BAD_CALL, "A call in the wrong phase, such as a step before initialisation"),
-            ("bad_state", STATUS_BAD_STATE, "A restored state does not belong to this FMU"),
-            ("internal", STATUS_INTERNAL, "The computation failed; the log says how"),
+            ("ok", Status.OK, "The outputs belong to the inputs of the last step"),
+            ("outside_range", Status.OUTSIDE_RANGE, "An input or parameter lies outside its min and max"),
+            ("not_finite", Status.NOT_FINITE, "An input or parameter is NaN or infinite"),
+            ("bad_step", Status.BAD_STEP, "Step size or communication point is not acceptable"),
+            ("bad_call", Status.BAD_CALL, "A call in the wrong phase, such as a step before initialisation"),
+            ("bad_state", Status.BAD_STATE, "A restored state does not belong to this FMU"),
+            ("internal", Status.INTERNAL, "The computation failed; the log says how"),
         ),
     ),
 )

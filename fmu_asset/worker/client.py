@@ -15,10 +15,10 @@ from fmu_asset import errors
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError, said
 from fmu_asset.folders import remove_folder
 from fmu_asset.instances.plan import REPORT_PERIOD, Floats, Instance, Plan, Settings
-from reporting.toml_file import Section
+from reporting.toml_file import Positive, Section
 
 from .process import CLOSE_LIMIT, WorkerProcess
-from .protocol import CALL, FAILURE, HEADER, LARGEST_MESSAGE, PART, RESULT, STEP, look, send, separated
+from .protocol import HEADER, LARGEST_MESSAGE, Answer, Question, look, send, separated
 from .sandbox import Grants
 
 _MEBIBYTE = 1024**2
@@ -38,7 +38,6 @@ _CALLS = {
 }
 """Which limit holds for a call, and what it is in a sentence."""
 
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Paths = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(strict=False)]
 
 
@@ -59,9 +58,9 @@ class WorkerLimits(Section):
         What it may touch all the same; see `Grants`.
     """
 
-    step_time: _Positive = 60.0
-    load_time: _Positive = 60.0
-    memory: _Positive = 4096.0
+    step_time: Positive = 60.0
+    load_time: Positive = 60.0
+    memory: Positive = 4096.0
     sandbox: bool = True
     read: _Paths = ()
     write: _Paths = ()
@@ -129,7 +128,7 @@ class WorkerInstance(Instance):
 
     def step(self) -> None:
         """Make the step that the request block describes."""
-        self._ask(STEP, "step", self._request)
+        self._ask(Question.STEP, "step", self._request)
         length = self._await(len(self._reply))[1]
         if length != len(self._reply):
             raise self._died()
@@ -138,15 +137,15 @@ class WorkerInstance(Instance):
 
     def run(self, requests: Floats, replies: Floats, report: Callable[[int], object]) -> None:
         """Make many steps; each may take the time of a step."""
-        self._ask(CALL, "run", self._pickled("run", requests))
-        target, size, filled, kind = replies.data.cast("B"), replies[0].nbytes, 0, PART
-        while kind == PART:
+        self._ask(Question.CALL, "run", self._pickled("run", requests))
+        target, size, filled, more = replies.data.cast("B"), replies[0].nbytes, 0, True
+        while more:
             kind, length = self._await(len(target) - filled, part=True)
             if length % size:
                 raise self._died()
             self._fill(target[filled : filled + length])
             filled += length
-            self.lost = kind == PART
+            self.lost = more = kind == Answer.PART
             report(filled // size)
 
     def read(self) -> None:
@@ -206,7 +205,7 @@ class WorkerInstance(Instance):
         kindly = not self.lost
         if kindly:
             with contextlib.suppress(FmuWorkerError):
-                self._ask(CALL, "close", self._pickled("close"))
+                self._ask(Question.CALL, "close", self._pickled("close"))
         self.lost = True
         self._process.end(CLOSE_LIMIT if kindly else 0.0)
         remove_folder(self._folder)
@@ -228,7 +227,7 @@ class WorkerInstance(Instance):
 
     def _call(self, name: str, *arguments: object) -> bytes:
         """Call a method of the instance; only what the twin says is pickled, and never what comes back."""
-        self._ask(CALL, name, self._pickled(name, *arguments))
+        self._ask(Question.CALL, name, self._pickled(name, *arguments))
         largest = int(self._limits.memory * _MEBIBYTE) if name == "save" else LARGEST_MESSAGE
         answer = bytearray(self._await(largest)[1])
         self._next_glance = 0.0
@@ -241,11 +240,12 @@ class WorkerInstance(Instance):
         look(self._poll)
         self._fill(self._header, REPORT_PERIOD * part)
         kind, logged, number, length = HEADER.unpack(self._header)
-        known = kind in (RESULT, FAILURE, PART if part else RESULT) and number == self._number
-        if not known or length > (LARGEST_MESSAGE if kind == FAILURE else largest):
+        last = Answer.PART if part else Answer.RESULT
+        known = kind in (Answer.RESULT, Answer.FAILURE, last) and number == self._number
+        if not known or length > (LARGEST_MESSAGE if kind == Answer.FAILURE else largest):
             raise self._died()
         self._logged = self._logged or logged != 0
-        if kind == FAILURE:
+        if kind == Answer.FAILURE:
             self._fail(length)
         return kind, length
 

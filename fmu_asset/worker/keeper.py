@@ -17,7 +17,7 @@ from typing import NoReturn
 
 from fmu_asset.folders import remove_folder
 
-from .protocol import OWN_FAILURE, WORKER_NUMBER
+from .protocol import WORKER_NUMBER, Exit
 from .protocol import ended as has_ended
 
 _GRACE = 2.0
@@ -113,7 +113,7 @@ def _work(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) 
         import traceback
 
         traceback.print_exc()
-    os._exit(OWN_FAILURE)
+    os._exit(Exit.OWN_FAILURE)
 
 
 def _kill(process: int) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from fmu_asset.errors import FmuWorkerError
 from fmu_asset.folders import end_processes
 
-from .protocol import OWN_FAILURE, PIPES_GONE, WORKER_NUMBER, ended, receive
+from .protocol import WORKER_NUMBER, Exit, ended, receive
 from .sandbox import Grants, landlock_version
 
 CLOSE_LIMIT = 2.0
@@ -129,9 +129,9 @@ class WorkerProcess:
             name = {item.value: item.name for item in signal.Signals}.get(-code, "a real-time signal")
             meaning = f": {_MEANINGS[name]}" if name in _MEANINGS else ""
             how = f"was ended by signal {-code} ({name}){meaning}"
-        elif code == PIPES_GONE:
+        elif code == Exit.PIPES_GONE:
             how = "could not answer: the FMU's code closed files that are not its own"
-        elif code == OWN_FAILURE:
+        elif code == Exit.OWN_FAILURE:
             how = "failed outside the FMU"
         else:
             how = f"ended with exit status {code}: the FMU's code ended its own process"

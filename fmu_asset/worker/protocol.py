@@ -13,16 +13,32 @@ import os
 import select
 import struct
 import time
+from enum import IntEnum
 
 HEADER = struct.Struct("<HHIQ")
 WORKER_NUMBER = struct.Struct("<q")
 """First of all, the process number of the worker."""
 LARGEST_MESSAGE = 2**23
 """Bytes of an answer in words; a header that announces more does not come from the other side's program."""
-STEP, CALL = 1, 2
-RESULT, FAILURE, PART = 1, 2, 3
-OWN_FAILURE, PIPES_GONE, DESERTED = 70, 71, 72
-"""Exit statuses of a worker: its own program failed, the FMU closed its pipes, the twin is gone."""
+
+
+class Question(IntEnum):
+    """Kinds of messages to a worker."""
+
+    STEP, CALL = 1, 2
+
+
+class Answer(IntEnum):
+    """Kinds of messages from a worker."""
+
+    RESULT, FAILURE, PART = 1, 2, 3
+
+
+class Exit(IntEnum):
+    """Exit statuses of a worker: its own program failed, the FMU closed its pipes, the twin is gone."""
+
+    OWN_FAILURE, PIPES_GONE, DESERTED = 70, 71, 72
+
 
 # Waking a process that sleeps on a pipe costs as much as a whole step. Whoever awaits the other side of a
 # step therefore looks again for a moment before it sleeps, if there is a processor for each of the two.

@@ -15,24 +15,11 @@ from typing import Any, NoReturn
 import numpy as np
 
 from fmu_asset.errors import FmuError, FmuWorkerError
-from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance
+from fmu_asset.instances.co_simulation import open_instance
 from fmu_asset.instances.plan import Floats
 
-from .protocol import (
-    DESERTED,
-    FAILURE,
-    HEADER,
-    OWN_FAILURE,
-    PART,
-    PIPES_GONE,
-    RESULT,
-    STEP,
-    joined,
-    look,
-    receive,
-    send,
-)
+from .protocol import HEADER, Answer, Exit, Question, joined, look, receive, send
 
 LARGEST_FILE = 2 * 1024**3
 """Bytes that an FMU may write to one file, such as an endless log."""
@@ -85,13 +72,13 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
     except BrokenPipeError:
         pass  # the twin is gone, or this is a copy of the worker without one
     except OSError as error:
-        os._exit(PIPES_GONE if error.errno == errno.EBADF else OWN_FAILURE)
+        os._exit(Exit.PIPES_GONE if error.errno == errno.EBADF else Exit.OWN_FAILURE)
     except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
         traceback.print_exc()
         sys.stderr.flush()
-        os._exit(OWN_FAILURE)
+        os._exit(Exit.OWN_FAILURE)
     # Without the interpreter's shutdown, which third-party libraries may not survive.
-    os._exit(0 if asked else DESERTED)
+    os._exit(0 if asked else Exit.DESERTED)
 
 
 def _restrict() -> None:
@@ -120,14 +107,14 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
     def answer(kind: int, payload: bytes | memoryview) -> None:
         if os.getpid() != own_number:
             os._exit(0)  # a copy that the FMU has made of this process
-        logged = kind != FAILURE and instance is not None and len(instance.messages) > 0
+        logged = kind != Answer.FAILURE and instance is not None and len(instance.messages) > 0
         HEADER.pack_into(reply_header, 0, kind, logged, number, len(payload))
         send(outgoing, reply_header, payload)
 
     while receive(incoming, header):
         kind, _, number, length = HEADER.unpack(header)
         try:
-            if kind == STEP:
+            if kind == Question.STEP:
                 if not receive(incoming, request) or instance is None:
                     break
                 instance.step()
@@ -151,13 +138,15 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
                     raise FmuWorkerError("The worker was asked before it had an FMU.")
                 request[:] = block
                 payload = _called(instance, name, arguments, answer) or (reply if name == "read" else b"")
-            answer(RESULT, payload)
+            answer(Answer.RESULT, payload)
         except FmuError as error:
             refused = system_error.value == errno.EACCES or "ermission denied" in str(error)
             sentence = error.sentence + (_refusal() if confined and refused else "")
             lost = instance is None or instance.lost
             time = "" if error.time is None else repr(error.time)
-            answer(FAILURE, joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages))
+            answer(
+                Answer.FAILURE, joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages)
+            )
         look(poll)
     return False, instance
 
@@ -183,7 +172,7 @@ def _run(instance: FmuInstance, requests: Floats, answer: Callable[[int, bytes],
 
     def report(done: int) -> None:
         nonlocal sent
-        answer(PART, replies[sent:done].tobytes())
+        answer(Answer.PART, replies[sent:done].tobytes())
         sent = done
 
     instance.run(requests, replies, report)

@@ -19,7 +19,7 @@ from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import companion_bytes
-from fmu_asset.compiled.compiler import find_compiler
+from fmu_asset.compiled.package import find_compiler
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.patch_file import load_patch

@@ -268,8 +268,6 @@ def test_from_an_example_to_a_verdict(campaign, tmp_path):
     assert str(tmp_path) not in page
     # a second time: only on demand (that it comes to the same conclusion is tested in test_workflow.py)
     assert "--replace" in refused("discrepancy", "run", str(campaign), *RIG, "--out", str(out))
-    said("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--replace")
-    assert not (out / "self_calibration.json").exists()
 
 
 def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path):

@@ -87,7 +87,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
 
     def binding(self) -> Binding:
         """Return the binding: one of its own, or that which follows from the structure."""
-        from fmu_asset.structures.binding import structure_binding
+        from fmu_asset.structures import structure_binding
 
         if self._folder is not None or self.section.binding:
             return super().binding()
@@ -114,7 +114,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
-        from fmu_asset.structures.binding import structure_binding_text
+        from fmu_asset.structures import structure_binding_text
 
         self.model = self.reduced(progress)
         if not self.path(BINDING_COPY).exists():

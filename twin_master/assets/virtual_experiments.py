@@ -4,8 +4,6 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from calibration.virtual_wing import (
     RECORDED_GAUGE,
     SENSITIVITY,
@@ -16,6 +14,7 @@ from calibration.virtual_wing import (
 from fe.runtime.state import DigitalState, losses_of
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.experiment import from_here
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.slaves.variables import QUASI_STATIC, TRANSIENT
 from scenarios import binding_files
@@ -72,13 +71,10 @@ class FmuTestBench(ExitStack):
         time = sampling_times(duration, sampling_rate)
         binding = self._binding.with_header(step_size=1.0 / sampling_rate)
         release = {"response": float(TRANSIENT), "initial_tip_displacement": initial_tip_displacement}
-        strain = np.empty_like(time)
         with self._session(binding, release) as session:
             session.reset(control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0})
-            strain[0] = session.observe().values[RECORDED_GAUGE - 1]
-            for sample in range(1, time.size):
-                strain[sample] = session.step().values[RECORDED_GAUGE - 1]
-        return time, SENSITIVITY * strain
+            recorded = from_here(session, time.size - 1, {})
+        return time, SENSITIVITY * recorded.values[:, RECORDED_GAUGE - 1]
 
     def _session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
         return FmiAsset(self._fmu, binding, parameters=self._parameters | parameters)

@@ -8,11 +8,11 @@ from math import prod
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuInputError, FmuOutputError
+from reporting.arrays import Float
 from reporting.progress import reporter
 from twin_master.assets.asset_source import BINDING_COPY, AssetBelief, PairedSource
 from twin_master.assets.coupled_source import SeveralSource
@@ -24,8 +24,6 @@ from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError, said
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.scenario.section import LARGEST_COUNT
-
-Float = NDArray[np.float64]
 
 STEP_TIMEOUT = 60.0
 """Wall-clock limit of a step where nothing else is said [s]."""

@@ -20,6 +20,7 @@ import xarray as xr
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
+from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.folders import lock_folder
 from reporting.json_file import parse_json
@@ -33,7 +34,7 @@ from twin_master.assets.library_source import (
     write_observation_library,
 )
 from twin_master.errors import MissionInputError, check_names, said
-from twin_master.library.grid import Float, GridSampler, SamplingGrid
+from twin_master.library.grid import GridSampler, SamplingGrid
 from twin_master.network.transition import NUMBER, check_fits
 
 PLAN_NAME, ROWS_NAME = "grid.json", "observations.npy"

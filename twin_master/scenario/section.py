@@ -15,10 +15,10 @@ from pkgutil import iter_modules
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 
 from reporting import toml_file
+from reporting.arrays import Float, Index
 from reporting.toml_file import Fault, NotNegative, Positive, shown
 from scenarios import asset_scripts, binding_files, recording_files, structure_files
 from twin_master.errors import said
@@ -139,9 +139,6 @@ def incomplete(table: Mapping[str, object], names: tuple[str, ...], where: str, 
     return {*table} != {*names}, told
 
 
-Float = NDArray[np.float64]
-
-
 ROLE = "modes"
 """The role of an observation whose values are features of modes."""
 Feature = Literal["frequency", "damping_ratio", "shape"]
@@ -179,7 +176,7 @@ class ModesSection(Section):
         yield not self.columns, said("scenario.mode_features")
 
     @property
-    def places(self) -> NDArray[np.int64]:
+    def places(self) -> Index:
         """Places of the modes in the model (M,), from 0."""
         return np.array(self.numbers or range(1, len(self.bands) + 1)) - 1
 

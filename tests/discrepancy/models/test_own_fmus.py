@@ -24,7 +24,7 @@ from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
-from fmu_asset.structures.rig import rig_text
+from fmu_asset.structures import rig_text
 from tests.discrepancy.asking import FloatArray, campaign, seen, trial
 from tests.discrepancy.rigs import INPUTS
 from tests.fmu_asset.ours import wing_arrays, wing_model

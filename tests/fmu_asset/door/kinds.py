@@ -17,7 +17,7 @@ from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import parse_structure
 from fmu_asset.companions.damage_growth import DamageGrowth
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
-from fmu_asset.structures.binding import structure_binding
+from fmu_asset.structures import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
 from tests.fmu_asset.coupling.reference import recursion

@@ -53,7 +53,7 @@ def test_limits_come_from_the_caller_then_from_the_binding(binding) -> None:
     assert limits_of(limited, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
     assert limits_of(limited, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(FmuInputError, match="memory_limit must be a positive number of MiB"):
+        with pytest.raises(FmuInputError, match=r"the limits of the worker: memory: .*, but .* came"):
             limits_of(limited, None, None, wrong)
 
 

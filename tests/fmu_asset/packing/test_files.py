@@ -21,7 +21,7 @@ from fmu_asset import errors
 from fmu_asset.archive.fmu_file import inspect_fmu, read_fmu
 from fmu_asset.check import check_file, check_fmu
 from fmu_asset.companions import COMPANION_NAMES
-from fmu_asset.compiled.compiler import compile_library, find_compiler
+from fmu_asset.compiled.package import compile_library, find_compiler
 from fmu_asset.door.binding import load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.contents import build_script_fmu

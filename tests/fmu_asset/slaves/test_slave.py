@@ -179,7 +179,7 @@ WRONG_TIMES += [(time, 0.01) for time in (0.0, 0.5, math.nan)]
 def both_step(pair: tuple[Slave, Slave], time: float) -> None:
     for one in pair:
         assert one.step(GOOD, time, 0.01) == OK
-        assert one.status == variables.STATUS_OK
+        assert one.status == variables.Status.OK
     assert pair[0].everything() == pair[1].everything()
 
 
@@ -191,13 +191,13 @@ def test_refused_steps_change_nothing(pair, wrong, response) -> None:
     for one in pair:
         one.start(response=response, initial_tip_displacement=0.01)
     both_step(pair, 0.0)
-    inputs, times, status, said = list(GOOD), (0.01, 0.01), variables.STATUS_BAD_STEP, ""
+    inputs, times, status, said = list(GOOD), (0.01, 0.01), variables.Status.BAD_STEP, ""
     if wrong in WRONG_TIMES:
         times = wrong
         said = "stands at t = 0.01" if times[0] in (0.0, 0.5) else ""
     else:
         index, inputs[wrong[0]] = wrong
-        status = variables.STATUS_OUTSIDE_RANGE if math.isfinite(wrong[1]) else variables.STATUS_NOT_FINITE
+        status = variables.Status.OUTSIDE_RANGE if math.isfinite(wrong[1]) else variables.Status.NOT_FINITE
         health = "health[{}]" if slave.three else "health.z{}"
         said = ("load_factor", health.format(1), health.format(2), "tip_force")[index]
     before = slave.everything()
@@ -218,7 +218,7 @@ def test_calls_in_the_wrong_phase(slave) -> None:
     assert "before initialisation" in slave.log[-1][1]
     assert slave.start() == OK
     slave.status_of(fmu.enterInitializationMode)
-    assert slave.status == variables.STATUS_BAD_CALL
+    assert slave.status == variables.Status.BAD_CALL
     for kind, name, value in (
         (slave.real, "mass.servo", 0.2),
         (slave.whole, "response", 2),
@@ -230,7 +230,7 @@ def test_calls_in_the_wrong_phase(slave) -> None:
     ):
         before, call = slave.everything(), getattr(fmu, f"set{kind}")
         assert (slave.status_of(call, [slave.reference.get(name, 999)], [value]) != OK) == compiled
-        assert slave.status == variables.STATUS_BAD_CALL
+        assert slave.status == variables.Status.BAD_CALL
         assert slave.everything() == before
     if not compiled:
         assert all(math.isnan(fmu.getReal(unknown)[-1]) for unknown in ([999], [49, 50, 51], [0, 999]))
@@ -290,7 +290,7 @@ def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours) -> None:
 def test_parameters_that_are_refused_stop_the_start(slave, name, value, right) -> None:
     key = name.replace(".", "__")
     slave.start(**{key: value})
-    assert slave.status in (variables.STATUS_OUTSIDE_RANGE, variables.STATUS_NOT_FINITE)
+    assert slave.status in (variables.Status.OUTSIDE_RANGE, variables.Status.NOT_FINITE)
     assert slave.log[-1][1].startswith(name)
     assert slave.step(STILL, 0.0, 1.0) != OK
     assert slave.start(anew=False, **{key: right}) == OK
@@ -315,7 +315,7 @@ def test_a_computation_that_fails_is_a_refusal(compiler, model, tmp_path, kind, 
             packed = sys.modules[f"{one.description.model_identifier}_runtime.fe.reduced"].ReducedModel
             patch.setattr(packed, "static_response", fail)
         assert one.step([1.0, 4.0, 0.0, 0.0], 1.0, 1.0) == DISCARD
-        assert one.status == variables.STATUS_INTERNAL
+        assert one.status == variables.Status.INTERNAL
         assert "not positive definite" in one.log[-1][1]
         assert one.everything()[RESULTS] == before[RESULTS]
         patch.undo()
@@ -344,7 +344,7 @@ def test_states_of_something_else_are_refused(slave, ours) -> None:
         wrong += [state + b"12345678", tagged, bad_count, not_finite, too_short]
     for content in wrong:
         assert slave.restore(content) == ERROR or not compiled
-        assert slave.status == variables.STATUS_BAD_STATE
+        assert slave.status == variables.Status.BAD_STATE
         assert "was not restored" in slave.log[-1][1]
     assert slave.everything()[:36] == before[:36]
     assert slave.step(STILL, 0.0, 1.0) == OK

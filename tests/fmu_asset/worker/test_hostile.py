@@ -21,7 +21,7 @@ from fmu_asset import errors
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.worker.client import WorkerInstance
-from fmu_asset.worker.protocol import CALL, HEADER
+from fmu_asset.worker.protocol import HEADER, Question
 from tests.fmu_asset.door.kinds import HOSTILE
 from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python, tables
 
@@ -183,7 +183,7 @@ def test_an_answer_to_another_request_is_not_taken(hostile) -> None:
         instance = asset._housing.instance
         assert isinstance(instance, WorkerInstance)
         question = instance._pickled("read")
-        os.write(instance._out, HEADER.pack(CALL, 0, 77, len(question)) + question)
+        os.write(instance._out, HEADER.pack(Question.CALL, 0, 77, len(question)) + question)
         with pytest.raises(errors.FmuWorkerError, match="wrote something else into it"):
             asset.step()
 

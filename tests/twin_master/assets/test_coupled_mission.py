@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmu_asset.door.binding import load_binding
 from fmu_asset.errors import FmuError, SspError
 from reporting.progress import SilentProgress
-from scenarios import binding_files
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import check_resumed, journal, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
@@ -217,9 +215,3 @@ def test_the_law_of_the_shipped_damage_is_what_the_twin_believes():
         believed = pytest.approx(scenario.transition.probability[control.name], rel=1e-12)
         assert [values[f"probability.{region}"] * severity for region in ("z1", "z2")] == [believed] * 2
     assert {factor.levels[1] - factor.levels[0] for factor in scenario.state} == {values["level"]}
-    assert load_binding(binding_files()["three_fmus"]).step_size == 1.0
-    drawn = [
-        one.asset.source(one).parameters()
-        for one in (resolve_scenario(load_scenario("three_fmus"), Overrides(seed=seed)) for seed in (7, 8))
-    ]
-    assert all(drawn[0][name] != drawn[1][name] for name in ("damage_seed", "gauge_seed"))
