@@ -18,7 +18,7 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 from scipy import sparse
 
-from benchmarks.study_regions import bracket, plate, tube
+from benchmarks.study_regions import plate
 from fe.reduction.model_cache import reduced_structure, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import Reduction, measured_errors, reduce_structure
 from fe.reduction.terms import ReductionTerms
@@ -369,14 +369,6 @@ def test_same_system_gives_the_same_bytes():
 
 
 # ---------------------------------------------------------------- of a structure file
-
-
-@pytest.mark.long  # what the documentation says of six regions, in minutes
-@pytest.mark.parametrize("make", [plate, bracket, tube])
-def test_six_regions_by_default(tmp_path, make):
-    structure = load_and_assemble(make(tmp_path, 6))
-    errors = measured_errors(structure, reduce_structure(structure).model, 60)
-    assert max(errors.strain, errors.displacement) <= errors.bound < 1e-3
 
 
 @pytest.mark.parametrize(("changes", "cells", "sentence"), Inputs(__file__).refused("beam"))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fe.elements import cells as assembly
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime import errors
-from fe.structure.affine import natural_frequencies, static_responses
+from fe.structure.affine import static_responses
 from fe.structure.design import Gauge, Material
 from fe.structure.location import attach, gauge_rows, on_surface
 from fe.structure.mesh import StructureMesh
@@ -218,14 +218,6 @@ def test_a_cantilever_has_the_figures_of_a_beam(made):
     mass, centre = weighed(structure)
     assert mass == pytest.approx(area_mass + 0.4)
     np.testing.assert_allclose(centre, [0.5, 0.03, 0.005], atol=1e-12)
-    frequency, _ = natural_frequencies(made("cantilever", ("mass = 0.4", "mass = 0.0")), 3)
-    roots = np.array([1.8751040687, 4.6940911330])
-    first, second = roots**2 / (2.0 * np.pi) * np.sqrt(stiffness / area_mass)
-    np.testing.assert_allclose(frequency, [first, 6.0 * first, second], rtol=3e-3)  # the second one sideways
-    assert (structure.design.damping.alpha, structure.design.damping.beta) == (0.1, 0.0)
-    names = structure.gauges, structure.displacements, structure.accelerations
-    assert names == (("top", "bottom"), ("w",), ("a",))
-    assert abs(structure.acceleration_output - structure.displacement_output).max() == 0.0
 
 
 def test_terms_make_what_a_changed_file_makes(made):

@@ -61,7 +61,7 @@ def on(*names: str) -> dict[str, float]:
 
 
 @pytest.fixture(scope="module")
-def warm(patched: Path) -> Iterator[FmiAsset]:
+def flying(patched: Path) -> Iterator[FmiAsset]:
     """The wing with effects, started anew by each test."""
     with FmiAsset(patched, WARM, isolated=False) as asset:
         yield asset
@@ -208,7 +208,7 @@ def expected(model: WingModel, given: Trial, patch: ModelPatch, health: np.ndarr
 
 
 @pytest.mark.parametrize(("kind", "name"), NAMED)
-def test_records_are_those_of_the_naming_side(kind, name, warm, naming_side) -> None:
+def test_records_are_those_of_the_naming_side(kind, name, flying, naming_side) -> None:
     """Within 1e-6 of the largest strain and the largest displacement."""
     patch, chosen, damage, columns = patch_of(name), OFF.get(name, on(name)), np.zeros((1, 2)), 26
     time = np.arange({TrialKind.RINGDOWN: 61, TrialKind.STATIC: len(FORCES), TrialKind.FLIGHT: 5}[kind])
@@ -231,9 +231,9 @@ def test_records_are_those_of_the_naming_side(kind, name, warm, naming_side) -> 
         health = dict(zip(("z1", "z2"), damage.T, strict=True))
         acting, course = {"load_factor": FACTORS}, {"control": {"load_factor": FACTORS}, "health": health}
     trial = Trial.plain("trial", kind, (), (1.0 if kind == TrialKind.FLIGHT else 0.01) * time, **acting)
-    warm.reset(chosen, control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]})
-    begin = [warm.observe().values] * (kind == TrialKind.RINGDOWN)
-    shown = np.array([*begin, *warm.simulate(**course).values])[:, :columns]
+    flying.reset(chosen, control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]})
+    begin = [flying.observe().values] * (kind == TrialKind.RINGDOWN)
+    shown = np.array([*begin, *flying.simulate(**course).values])[:, :columns]
     wanted, plain = (
         expected(naming_side, trial, each, damage)[:, :columns] for each in (patch, ModelPatch())
     )
