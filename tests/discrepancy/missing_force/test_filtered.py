@@ -63,8 +63,10 @@ def trial_of(time, residual, *, used=None, deviation=None, local=None, coloured=
     )  # fmt: skip
 
 
-def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
-    """Return the covariance (N C, N C) of the readings by the force, and of force and readings (N, N C).
+def dense(trial, process, per_second=2000, window=(-np.inf, np.inf)):
+    """Return the covariance (N C, N C) of the readings by the force, and of force and readings (M, N C).
+
+    The force is that at the fine stamps (M,), of which every PARTS-th is a sample.
 
     By quadrature of what a kernel over all pairs of moments, those of a window, does to an impulse response;
     nothing is stepped.
@@ -81,7 +83,13 @@ def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
     inside = (moments > window[0]) & (moments < window[1])
     kernel *= np.outer(inside, inside)
     answers = np.zeros((len(trial.time), 2, len(moments)))
-    nearest = np.zeros((len(trial.time), len(moments)))
+    nearest = np.zeros((len(trial.fine_time), len(moments)))
+    for k, now in enumerate(trial.fine_time):
+        place = np.clip(now / step - 0.5, 0.0, len(moments) - 1.001)
+        nearest[k, int(place)], nearest[k, int(place) + 1] = 1.0 - place % 1.0, place % 1.0
+        if now in window:  # what begins or ends at a sample does so before it
+            nearest[k] = 0.0
+            nearest[k, round(now / step)] = 1.0
     generator = trial.system.generator
     turn = np.sqrt(1.0 - RATIO**2) * FREQUENCY
     for k, now in enumerate(trial.time):
@@ -89,15 +97,11 @@ def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
         decay = np.where(since > 0.0, np.exp(-RATIO * FREQUENCY * np.maximum(since, 0.0)), 0.0)
         x = -decay * np.sin(turn * since) / turn * step
         v = -decay * (np.cos(turn * since) - RATIO * FREQUENCY / turn * np.sin(turn * since)) * step
-        place = np.clip(now / step - 0.5, 0.0, len(moments) - 1.001)
-        nearest[k, int(place)], nearest[k, int(place) + 1] = 1.0 - place % 1.0, place % 1.0
-        if now in window:  # what begins or ends at a sample does so before it
-            nearest[k] = 0.0
-            nearest[k, round(now / step)] = 1.0
         answers[k, 0] = x
-        answers[k, 1] = generator[1, 0] * x + generator[1, 1] * v - nearest[k]
+        answers[k, 1] = generator[1, 0] * x + generator[1, 1] * v - nearest[PARTS * k]
     rows = (answers / trial.deviation[:, None]).reshape(-1, len(moments))
-    return rows @ kernel @ rows.T, nearest @ kernel @ rows.T
+    by_force = kernel @ rows.T
+    return rows @ by_force, nearest @ by_force
 
 
 @pytest.mark.parametrize(
@@ -134,10 +138,9 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
         return
     _, (force,), (deviation, _) = filtered.smoothed(trial.residual)
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
-    np.testing.assert_allclose(force[::PARTS], mean, atol=0.02 * process.size)
-    variance = process.size**2 - np.einsum(
-        "nk,kn->n", cross[:, at], np.linalg.solve(covariance, cross[:, at].T)
-    )
+    np.testing.assert_allclose(force, mean, atol=0.02 * process.size)
+    own = cross[::PARTS, at]
+    variance = process.size**2 - np.einsum("nk,kn->n", own, np.linalg.solve(covariance, own.T))
     np.testing.assert_allclose(deviation, np.sqrt(variance), atol=0.02 * process.size)
 
 
@@ -160,21 +163,6 @@ def states(filtered):
     """Return the states of a trial after each of its samples."""
     steps, which = filtered.steps(filtered.trial.residual[None]), filtered.trial.steps[1]
     return steps.before(which, 0, steps.begin(filtered.system[3]), np.arange(1, len(which) + 1))
-
-
-def test_the_state_between_samples_is_that_of_samples_in_between():
-    random = np.random.default_rng(5)
-    count = 30
-    residual = random.standard_normal((count, 2))
-    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), [(0, PROCESS)])
-    dense_count = (count - 1) * PARTS + 1
-    filled, used = np.zeros((dense_count, 2)), np.zeros((dense_count, 2), dtype=bool)
-    filled[::PARTS], used[::PARTS] = residual, True
-    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), [(0, PROCESS)])
-    added, (force,), _ = coarse.smoothed(residual)
-    other, (again,), _ = fine.smoothed(filled)
-    np.testing.assert_allclose(force, again[::PARTS], atol=1e-9)
-    np.testing.assert_allclose(added, other[::PARTS], atol=1e-9)
 
 
 def test_states_and_noise_by_closed_forms():
@@ -308,8 +296,12 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed"), [("offset", 23), ("random motion", 23), ("line", 49), ("scatter", 57), ("quiet", 7)]
-)
+    ("kind", "seed"),
+    [
+        ("offset", 23), pytest.param("random motion", 23, marks=pytest.mark.long),
+        pytest.param("line", 49, marks=pytest.mark.long), ("scatter", 57), ("quiet", 7),
+    ],
+)  # fmt: skip
 def test_moments_of_residuals_are_where_they_were_made(kind, seed):
     """In an even and an uneven record, of events that last and that end; quiet coloured noise has none."""
     generator = np.random.default_rng(seed)

@@ -14,6 +14,7 @@ LIBRARY = Path("library") / "UAVconfig.json"
 
 
 def test_a_folder_with_both_repositories_is_read(published_folder):
+    """Slopes come from the fitted rows alone."""
     found = read_targets(published_folder)
     assert found.strain.shape == (5, 5, 24)
     fitted = {(LEVELS[i], LEVELS[j]) for i, j in np.argwhere(fitted_states())}
@@ -24,22 +25,15 @@ def test_a_folder_with_both_repositories_is_read(published_folder):
     assert found.frequency_at_one == pytest.approx([5.632, 28.5], rel=1e-6)
     assert found.strain_slope == pytest.approx(np.full(24, -0.85), abs=1e-9)
     assert set(found.sources) == {"UAVconfig.json", "massoptimizationresults.csv"}
-
-
-def test_slopes_come_from_the_fitted_rows_alone(published_folder):
     results = published_folder / RESULTS
-    before = read_targets(published_folder)
     lines = results.read_text().splitlines()
     for number in range(2, len(lines), 2):  # the held-out rows
         cells = lines[number].split(",")
         lines[number] = ",".join([*cells[:-2], str(1.05 * float(cells[-2])), cells[-1]])
     results.write_text("\n".join(lines) + "\n")
     after = read_targets(published_folder)
-    assert np.all(
-        after.frequency[~after.fitted_row, 0] == pytest.approx(1.05 * before.frequency[~before.fitted_row, 0])
-    )
-    assert after.frequency_slope.tolist() == before.frequency_slope.tolist()
-    assert after.all_frequency_slope.tolist() != before.all_frequency_slope.tolist()
+    assert after.frequency_slope.tolist() == found.frequency_slope.tolist()
+    assert after.all_frequency_slope.tolist() != found.all_frequency_slope.tolist()
 
 
 def test_the_published_folders(published_library):

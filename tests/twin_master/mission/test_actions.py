@@ -79,20 +79,15 @@ def asset_of(known: Knowledge) -> Any:
     return ReducedModelSource(known.scenario, reduced_model()).open()
 
 
-def test_an_action_is_a_control_with_a_price_that_reads_back():
+def test_an_action_is_a_control_with_a_price_and_a_repair_follows_the_growth_of_its_turn():
     written = scenario()
     assert written.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
     assert written.control[INSPECT].values == {"load_factor": 2.0}
     assert written.rewards.control["inspect"] == pytest.approx(-0.1 - 0.2 / 16.0)
     assert [reading[2:] for reading in written.readings] == [("inspect_z1", 0.1), ("inspect_z2", 0.1)]
-    assert parse_scenario(written.to_dict(), "config.json") == written
     own = scenario(('"3g" = 0.15 }', '"3g" = 0.15, inspect = 0.0 }'))
     assert own.transition.probability["inspect"] == 0.0
-
-
-def test_a_repair_follows_the_growth_of_its_turn():
-    moved = knowledge().model.transition
-    row = moved.row(REPAIR_1, 4 * 5 + 1).reshape(5, 5)
+    row = knowledge().model.transition.row(REPAIR_1, 4 * 5 + 1).reshape(5, 5)
     assert row[0] == pytest.approx([0.0, 0.95, 0.05, 0.0, 0.0])
     assert not row[1:].any()
 

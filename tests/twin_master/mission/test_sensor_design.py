@@ -58,6 +58,7 @@ def test_readings_are_drawn_in_states_that_are_all_alike_probable(samples, monke
 
 
 def test_three_of_twelve_are_those_of_an_exhaustive_search():
+    """One beside a region separates its levels, and those of the other region are hardly told."""
     readings, able = drawn_readings(knowledge()), range(0, 24, 2)
     found = chosen_sensors(readings, able, 3)
     told = {
@@ -70,15 +71,9 @@ def test_three_of_twelve_are_those_of_an_exhaustive_search():
     assert found.of_all > found.information[-1] > found.information[0] > 0.0
     with pytest.raises(MissionInputError, match="from 1 to 2"):
         chosen_sensors(readings, [0, 1], 3)
-
-
-def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_told():
-    known = knowledge()
-    readings = drawn_readings(known)
-    apart = separations(known, readings, range(24))
+    apart, fewer = (separations(knowledge(), readings, gauges) for gauges in (range(24), [16, 23]))
     assert min(far for (name, _), far in apart.items() if name == "z1") > 2.0
     assert max(far for (name, _), far in apart.items() if name == "z2") < 1.0
-    fewer = separations(known, readings, [16, 23])
     assert all(fewer[place] <= far + 1e-9 for place, far in apart.items())
 
 

@@ -17,7 +17,7 @@ from calibration.result.file import run_record
 from reporting.page import ReportFigure
 from reporting.words import number
 from tests.refusals import Inputs, refused
-from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
+from tests.twin_master.report.conftest import altered, flown, line, panel, rescripted, stored
 from twin_master.errors import RunFolderError
 from twin_master.network.planner import BeliefPolicy
 from twin_master.report import page as report
