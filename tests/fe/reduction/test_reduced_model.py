@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import meshio
@@ -18,7 +17,6 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 from scipy import sparse
 
-from benchmarks.study_regions import plate
 from fe.reduction.model_cache import reduced_structure, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import Reduction, measured_errors, reduce_structure
 from fe.reduction.terms import ReductionTerms
@@ -39,7 +37,6 @@ from fe.structure.tables import StructureSettings
 from fe.wing.design import wing_structure
 from fe.wing.operators import AffineWing, eigenmodes, outputs, solve_static, stiffness_parts
 from reporting.errors import FileNotWrittenError
-from tests.kept import FE, kept
 from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
 
@@ -263,19 +260,9 @@ def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model, st
         np.testing.assert_allclose(output[:-1], strain, rtol=0, atol=1e-2 * np.abs(strain).max())
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def beam_pair(beam: AffineStructure, beam_reduction: Reduction) -> tuple[AffineStructure, ReducedModel]:
     return beam, beam_reduction.model
-
-
-@pytest.fixture
-def plate_pair(tmp_path: Path) -> tuple[AffineStructure, ReducedModel]:
-    """A coarse plate with a hole, four regions around it, its reduced model good to half a per cent."""
-    file = plate(tmp_path, 4, around=8, across=3)
-    with file.open("a", encoding="utf-8") as text:
-        text.write("\n[reduction]\ntolerance = 5e-3\n")
-    full = load_and_assemble(file)
-    return full, kept("coarse-plate", lambda: reduce_structure(full).model, FE, full.design_hash)
 
 
 @pytest.mark.parametrize(("kind", "count", "largest"), [("beam", 4, 1e-3), ("plate", 5, 8e-3)])

@@ -332,7 +332,7 @@ def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(ra
 def test_less_and_less_flexibility_tends_to_none(exponent: float) -> None:
     """With large steps a port with little is one without (`port_flexibility`).
 
-    What it does is compared with an integrator in `tests/discrepancy/models/test_flexible_ports.py`.
+    What it does is compared with an integrator in `tests/discrepancy/models/test_lumped.py`.
     """
     acts = laws_of(ModelPatch((PowerDamping("mass", 1.5, exponent, 0.0, 6.0, 1.0),)), ["mass"])
     start = {"q": np.ones(1), "v": np.zeros(1), "force": np.zeros(801), "interval": 0.005, "substeps": 40}
