@@ -17,8 +17,6 @@ from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import attempt, fit, upper_factor
 from discrepancy.fits.predictive import residual_set
-from discrepancy.fits.screening import Screen
-from discrepancy.judgement.separability import _distance
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness
@@ -221,17 +219,6 @@ def test_evidence_with_unknown_variance_against_quadrature(freedom):
 # ---------------------------------------------------------------- far from the truth
 
 
-def test_differences_reach_as_far_as_a_parameter_may_lie():
-    """An effect that is known to a thousandth of its prior keeps that deviation whatever the first step."""
-    problem = kit.BENCH.problem(4, kit.BENCH.patch("root_compliance", {"compliance_share": 0.3}))
-    found = kit.fitted(problem, Term(kit.chosen("root_compliance")[0]))
-    deviation = float(np.sqrt(found.effect_covariance[0, 0]))
-    step = replace(found.point, effect=found.point.effect + deviation)
-    moved = fit(problem, found.candidate, step)
-    assert moved.objective == pytest.approx(found.objective, abs=0.05)
-    assert float(np.sqrt(moved.effect_covariance[0, 0])) == pytest.approx(deviation, rel=0.05)
-
-
 def test_a_curvature_that_is_none_is_refused():
     for wrong in (np.nan, np.inf, -1.0):
         with pytest.raises(FitError, match=r"not finite|singular"):
@@ -276,26 +263,6 @@ def test_a_fit_ends_with_finite_numbers_or_a_sentence(problem, u, coefficient, r
         return
     assert np.isfinite(found.log_evidence)
     assert np.all(np.isfinite(found.covariance))
-
-
-def test_what_a_model_can_follow_only_while_it_is_small(problem):
-    """It has been outdone by others and is no refusal; the last point that can be followed is compared."""
-    none = kit.fitted(problem)
-    screen = Screen(problem, none)
-    for coefficient, kept in ((-1e-7, 1), (-1e-5, 0)):
-        term = softening(coefficient, 0.3)
-        problem.refusals.clear()
-        assert len(list(Screen(problem, none).changes(term))) == kept
-        assert len(problem.refusals) == 1 - kept
-    problem.refusals.clear()
-    problem.refused(Candidate((term, term)), FitError("Of two, either may be to blame."))
-    assert not problem.refusals
-    term = softening(-4.5e-8, 0.3)
-    last = screen.change(term, np.array([1.0]))
-    with pytest.raises(DiscrepancyError):
-        screen.change(term, np.array([1.1]))
-    assert last.size > 0.0
-    assert _distance(screen, last, [last]) == pytest.approx(0.0, abs=1e-5 * last.size)
 
 
 def test_a_search_tells_what_could_not_be_fitted_and_goes_on():

@@ -1,6 +1,6 @@
 """What is read from noise records, against processes with known parameters."""
 
-from math import comb, inf
+from math import inf
 
 import numpy as np
 import pytest
@@ -20,22 +20,10 @@ from discrepancy.campaign.noise_tests import (
     fisher_g,
     holm,
     ljung_box,
-    periodogram,
     pooled_variance_p_value,
     variance_p_value,
 )
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
-
-
-def test_records_that_say_little():
-    """No record, a stated deviation, and a record too short for a spectrum."""
-    for record, freedom, deviation in ((None, 0.0, 0.7), (NoiseRecord(2.0, inf), inf, 2.0)):
-        found = noise_model(Channel("g", Quantity.STRAIN, "g", record), 0.7)
-        assert found.degrees_of_freedom == freedom
-        assert found.standard_deviation == found.static_deviation == deviation
-    short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
-    assert not short.autoregression.size
-
 
 INTERVAL = 0.002
 
@@ -117,22 +105,12 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients):
 
 @pytest.mark.parametrize("count", [64, 301])
 def test_p_values_of_serial_tests_are_uniform_under_white_noise(count):
-    noise = np.random.default_rng(count).standard_normal((1500, count))
+    noise = np.random.default_rng(count).standard_normal((800, count))
     for test in (ljung_box, cumulative_periodogram, fisher_g):
         p = np.array([test(row)[1] for row in noise])
         for level in (0.2, 0.05, 0.01, 0.0025):
             error = np.sqrt(level / len(noise))
             assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * error), (test.__name__, level)
-
-
-def test_fisher_g_against_his_exact_sum():
-    series = np.random.default_rng(2).standard_normal(41) + 1.1 * np.cos(0.9 * np.arange(41))
-    g, p, _ = fisher_g(series)
-    count = periodogram(series).size
-    exact = sum(
-        (-1) ** (j - 1) * comb(count, j) * (1.0 - j * g) ** (count - 1) for j in range(1, int(1.0 / g) + 1)
-    )
-    assert p == pytest.approx(exact, rel=0.02)
 
 
 def test_serial_tests_see_what_they_are_for():

@@ -334,31 +334,13 @@ def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():
     assert found.chi_square > 3.0 * said.chi_square  # told against the recorded noise
 
 
-def record_of(generator, count, size=1.5):
-    """Return a noise record with the same process as the trials, or with none of a size."""
-    root = np.linalg.cholesky(covariance(0.01 * np.arange(count), size, 0.03, 0.0) + np.eye(count))
-    samples = 0.02 * root @ generator.standard_normal(count)
-    return NoiseRecord(float(samples.std()), count - 1.0, samples - samples.mean(), 0.01, "pre-trigger")
-
-
-def test_colour_of_the_noise_is_told_from_a_remainder():
-    """The same process in the trials, in the noise record or not."""
-    generator = np.random.default_rng(5)
-    for of_noise in (True, False):
-        record = record_of(generator, 200, 1.5 * of_noise)
-        problem, _, _ = ringing(6, 400, coloured(1.5, 0.03, 0.0))
-        problem = kit.with_noise(problem, y1=record)
-        left = left_by(problem, kit.fitted(problem))
-        size = left.size[problem.channel_names.index("y1")]
-        # what the record's own autoregression took out is no remainder, nor is what it left
-        assert size == (0.0 if of_noise else pytest.approx(1.5, rel=0.5))
-        assert left.is_noise is of_noise
-
-
 def test_colour_of_the_noise_is_no_gap_where_stamps_are_uneven_and_it_stays():
+    """The same process in the trials and in the noise record."""
     generator, wrong = np.random.default_rng(5), [0, 0]
+    root = np.linalg.cholesky(covariance(0.01 * np.arange(500), 1.5, 0.03, 0.0) + np.eye(500))
     for seed in range(12):
-        record = record_of(generator, 500)
+        samples = 0.02 * root @ generator.standard_normal(500)
+        record = NoiseRecord(float(samples.std()), 499.0, samples - samples.mean(), 0.01, "pre-trigger")
         problem, _, _ = ringing(seed, 400, coloured(1.5, 0.03, 0.0, seed))
         trials = (item.rows(np.sort(generator.permutation(400)[:320])) for item in problem.campaign.trials)
         problem = kit.problem_of(replace(problem.campaign, trials=tuple(trials)), problem.model)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from discrepancy.campaign.held_out import choose_held_out
@@ -97,21 +96,6 @@ def test_load_levels_of_a_single_trial(kind):
 
 
 TRIALS = st.tuples(st.sampled_from(TrialKind), st.sampled_from([0.1, 0.2, 0.5, 1.0]), st.sampled_from("AB"))
-
-
-@given(st.lists(TRIALS, min_size=1, max_size=9))
-@settings(max_examples=100, deadline=None)
-def test_what_is_left_covers_what_is_held_out(rows):
-    trials = [trial(str(n), kind, top, 8, run) for n, (kind, top, run) in enumerate(rows)]
-    chosen = chosen_of(*trials)
-    assert held(*trials) == [item.name for item in chosen.held_out]
-    assert sum(len(item.time) for item in chosen.trials) == sum(len(item.time) for item in trials)
-    for item in chosen.held_out:
-        left = [other for other in chosen.fitted if other.kind is item.kind]
-        assert left
-        lowest = 0.0 if "levels held out" in item.name else min(item.level for item in left)
-        assert lowest <= item.level <= max(item.level for item in left)
-        assert any(other.run == item.run for other in chosen.fitted)
 
 
 MODEL = Inputs(__file__).text("cart.toml")

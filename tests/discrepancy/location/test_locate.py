@@ -15,7 +15,6 @@ from discrepancy.location.backbone import backbones
 from discrepancy.location.dependence import modal_motion
 from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
 from discrepancy.location.map import features, residual_map
-from discrepancy.location.omnibus_tests import variance_test
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
@@ -30,7 +29,7 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
     bench = Bench(count=120)
     generator = np.random.default_rng(23)
     silent, proportion = [], []
-    for _ in range(30):
+    for _ in range(20):
         fitted = bench.fit(generator)
         silent.append(not any(cell.significant for cell in residual_map(fitted, fitted.white(generator))))
         fitted = bench.fit(generator, extra={0: np.array([0.0, 0.0, 4.0, 0.0])})
@@ -38,7 +37,7 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
         found = [(cell.channel, cell.trial) for cell in cells if cell.significant]
         assert ("g3", "release 1") in found
         proportion.append(np.mean([place != ("g3", "release 1") for place in found]))
-    assert np.mean(silent) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 30)
+    assert np.mean(silent) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 20)
     assert np.mean(proportion) <= 0.05
 
 
@@ -52,23 +51,6 @@ def test_a_short_noise_record_makes_no_pattern_over_the_channels():
             bool(singular_patterns(fitted, kind)) for kind in kinds_of(fitted, fitted.white(generator))
         )
     assert told <= binom.isf(1e-3, 80, 0.01)
-
-
-def test_a_fit_far_from_the_truth_that_leaves_no_degree_of_freedom_is_no_crash():
-    # One reading in each of two kinds of trial, and a posterior that is much too wide: 0.02 degrees of
-    # freedom are left to both together, one to each.
-    fitted = Bench(count=40).fit(np.random.default_rng(1))
-    trials = []
-    for item in (fitted.trials[0], fitted.trials[-1]):
-        used = np.zeros_like(item.used)
-        used[0, 0] = True
-        wide = np.full((*item.residual.shape, 1), np.sqrt(0.9))
-        leverage = np.full(item.residual.shape, 0.9)
-        trial = replace(item.trial, used=used)
-        trials.append(replace(item, trial=trial, leverage=leverage, sensitivity=wide))
-    found = variance_test(replace(fitted, trials=tuple(trials)))
-    assert np.isnan(found.statistic)
-    assert 0.0 <= found.p_value <= 1.0
 
 
 def located(seed, extra, **given):
@@ -299,22 +281,6 @@ def test_what_no_fit_leaves_is_refused():
     for channels, trials in ((good.channels, ()), ({}, good.trials)):
         with pytest.raises(FitError, match="at least one trial, and the channels"):
             ResidualSet(channels, trials)
-
-
-def test_values_that_are_not_used_may_be_anything():
-    good = Bench(count=40).fit(np.random.default_rng(1))
-    item = good.trials[0]
-    used = item.used.copy()
-    used[7, 2] = False
-    residual = item.residual.copy()
-    residual[7, 2] = np.nan
-    changed = replace(item, trial=replace(item.trial, used=used), residual=residual)
-    assert np.isnan(changed.standardised[7, 2])
-    (white,) = ResidualSet(good.channels, (changed,)).white(np.random.default_rng(0))
-    assert np.all(np.isfinite(white))
-    used[:, 2] = False  # of a channel of which nothing counts no test in time is made
-    told = [name for _, name, _ in ResidualSet(good.channels, (changed,)).series((white,))]
-    assert told == [name for name in item.trial.channels if name != item.trial.channels[2]]
 
 
 # ---------------------------------------------------------------- splitting a motion into its modes

@@ -12,7 +12,7 @@ from benchmarks.force_events import counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.when import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
-from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
+from discrepancy.missing_force.filtered import Filtered, Process, regression
 from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
@@ -22,6 +22,7 @@ from discrepancy.report.residual_figures import time_line_figure
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate
 from tests.discrepancy.bench import Bench
+from tests.discrepancy.rigs import FEW
 
 
 def gaussian(covariance, readings):
@@ -192,15 +193,6 @@ def test_states_and_noise_by_closed_forms():
     assert decaying_part(noise, 0.02) is None
 
 
-def test_evidence_beside_unknowns_is_that_of_their_prior():
-    random, precision = np.random.default_rng(2), np.array([4.0, 0.01])
-    readings, columns = random.standard_normal(9), random.standard_normal((2, 9))
-    rows = np.vstack((readings, columns))
-    found = Regression(rows @ rows.T, 0.0).solve([0, 1], precision)
-    covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
-    assert found.evidence == pytest.approx(gaussian(covariance, readings))
-
-
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
 def test_the_most_probable_process_is_the_top_of_a_grid(end):
     """Also at the bounds of its time: what jumps from sample to sample, what stays as it is."""
@@ -286,7 +278,7 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
     if (kind, seed) != ("leak", 5):
         return
     problem = problem_of(case)
-    verdict = investigate(problem.campaign, problem.model).verdict
+    verdict = investigate(problem.campaign, problem.model, FEW).verdict
     told = [window for window in verdict.windows if not window.with_effect]
     for window, moments in zip(told, case.windows, strict=True):
         assert (window.begin.value, window.end.value) == pytest.approx(moments, abs=0.01 * case.length)
@@ -295,13 +287,10 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
     assert when_sentence(told) in verdict.sentence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("kind", "seed"),
-    [
-        ("offset", 23), pytest.param("random motion", 23, marks=pytest.mark.long),
-        pytest.param("line", 49, marks=pytest.mark.long), ("scatter", 57), ("quiet", 7),
-    ],
-)  # fmt: skip
+    ("kind", "seed"), [("offset", 23), ("random motion", 23), ("line", 49), ("scatter", 57), ("quiet", 7)]
+)
 def test_moments_of_residuals_are_where_they_were_made(kind, seed):
     """In an even and an uneven record, of events that last and that end; quiet coloured noise has none."""
     generator = np.random.default_rng(seed)
