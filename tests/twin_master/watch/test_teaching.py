@@ -149,7 +149,7 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
-        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, turns=44)
+        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, turns=40)
         records = journal(watch.folder)
         assert not any("model" in record for record in records)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
