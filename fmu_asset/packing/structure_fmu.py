@@ -202,10 +202,8 @@ def _patched_members(
         raise PatchFileError(said("packing.no_arrays"))
     if arrays.design_hash != model.design_hash:
         raise PatchFileError(said("packing.other_design", arrays=arrays, model=model))
-    try:
+    with PatchFileError.instead_of(FiniteElementError, before="The wing cannot carry the patch: "):
         ModalIntegrator(PatchedWing(arrays), model.nominal, *model.damping.tolist(), patch).modes  # noqa: B018
-    except FiniteElementError as cause:
-        raise PatchFileError(f"The wing cannot carry the patch: {cause}") from cause
     if not len(patch.of(LocalStiffnessLoss)):  # strips, which only that needs, are most of the bytes
         strips = ("strip_stiffness", "strip_of", "term_of")
         arrays = changed(arrays, **{name: getattr(arrays, name)[:0] for name in strips})

@@ -75,10 +75,8 @@ class SspPackage:
         self.path = Path(path)
         if not self.path.is_file():
             raise SspError(said("ssp.absent", self=self))
-        try:
+        with SspError.instead_of(FmuFileError):
             self.names = check_archive(self.path, self.path.stat().st_size, "SSP", "export")
-        except FmuFileError as error:
-            raise SspError(error.sentence) from error
         if SSD_NAME not in self.names:
             raise SspError(f"{self.path} is an archive without {SSD_NAME}, so it is no SSP file.")
 
