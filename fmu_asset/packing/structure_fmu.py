@@ -39,12 +39,12 @@ from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.progress import Progress
+from reporting.provenance import hash_members
 
 from .contents import (
     FmuInfo,
     check_start,
     checked_target,
-    content_hash_of,
     exchanged,
     guid_of,
     python_members,
@@ -283,7 +283,7 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
     found = re.search(r'(?:guid|instantiationToken)="([^"]*)"', root)
     declared = "" if found is None else found[1]
-    return declared, guid_of(content_hash_of(exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER))))
+    return declared, guid_of(hash_members(exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER))))
 
 
 def pack_wing(

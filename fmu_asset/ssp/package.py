@@ -15,13 +15,14 @@ from urllib.parse import unquote, urlsplit
 
 from lxml import etree
 
+from fe.runtime.arrays import archive_bytes
 from fmu_asset.archive.fmu_file import check_archive
 from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import rendered
 from fmu_asset.errors import FmuFileError, SspError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.packing.contents import archive_bytes, checked_target
+from fmu_asset.packing.contents import checked_target
 from reporting.files import atomic_write_bytes
 from reporting.units import BASE_UNITS
 
