@@ -31,6 +31,7 @@ from fmu_asset.errors import FmuBuildError, FmuError, said
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
 from reporting.provenance import hash_members
+from reporting.text_file import read_bytes
 from reporting.units import BASE_UNITS
 
 PYTHONFMU_VERSION = "0.7.0"
@@ -297,10 +298,7 @@ def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
     file = Path(script)
     if not file.stem.isidentifier() or file.suffix != ".py":
         raise FmuBuildError(said("script.name", file=file))
-    try:
-        source = file.read_bytes()
-    except OSError as error:
-        raise FmuBuildError(f"The model script {file} cannot be read ({error.strerror or error}).") from error
+    source = read_bytes(file, FmuBuildError, what="model script")
     pythonfmu_version()
     model = _model_class(file)
     module, name = f"{file.stem}_{PLACEHOLDER}", model.__name__
