@@ -54,12 +54,6 @@ def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory, no_repor
     return fly(tmp_path_factory.mktemp("flown") / "run", library_file)
 
 
-@pytest.fixture
-def whole(flown: RunOutcome, tmp_path: Path) -> Path:
-    """A copy of its folder."""
-    return Path(shutil.copytree(flown.folder, tmp_path / "whole"))
-
-
 def make(folder: Path, name: str, *, replace: bool = False) -> None:
     with create_run_folder(folder, {"kind": KIND, "name": name}, replace=replace):
         pass
@@ -196,7 +190,9 @@ def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, turns):
     assert not (tmp_path / "never").exists()
 
 
-def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, whole, monkeypatch):
+def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, tmp_path, monkeypatch):
+    whole = Path(shutil.copytree(flown.folder, tmp_path / "whole"))
+
     def report(folder: Path) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")
         return folder / "report.html"

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
-from tests.twin_master.report.drawn import altered, line, panel, rescripted, stored
+from tests.twin_master.report.conftest import altered, line, panel, rescripted, stored
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
 from twin_master.report.mission import (
