@@ -1,19 +1,27 @@
-"""The generator of the blind test on open rigs: its equations beside the model files, and what it writes."""
+"""Open rigs: equations beside the model files, and what is written; the bracket; every module is imported."""
 
 import tomllib
 from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from pkgutil import walk_packages
 
 import numpy as np
 import pytest
 
+import benchmarks
+import evidence
 from benchmarks.open_rigs.__main__ import judge, outcome_of
 from benchmarks.open_rigs.campaigns import ALONE, GAPS, SHARES, Bench, drawn, simulate, write
 from benchmarks.open_rigs.rigs import RIGS, Truth
+from benchmarks.study_structure_effects import IN_MOTION, campaign, outcome, rig
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
+from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
+from discrepancy.workflow import investigate
 from fe.runtime.patch import BoucWen, FreePlay, ModelPatch, Overflow, PowerDamping, PowerStiffness, Primitive
 from tests.refusals import Inputs
 
@@ -120,3 +128,33 @@ def test_the_family_of_a_law_that_is_left_alone_is_right(left, outcome):
     assert outcome_of(row, {"rig": "damper", "identifiers": [], "left": left}) == outcome
     assert outcome_of(row, {"rig": "stores", "identifiers": [], "left": left}) == "wrong"
     assert outcome_of(row, {"rig": "damper", "identifiers": ["outflow"], "left": left}) == "wrong"
+
+
+# ---------------------------------------------------------------- structures
+
+
+CHOSEN = ("", "gauge_gain", "breathing_crack", "coulomb_friction")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("bracket")
+    rig(made)
+    return made
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("hidden", [item for item in IN_MOTION if item.identifier in CHOSEN])
+def test_ring_downs_of_the_bracket_have_their_effect_named(folder, hidden):
+    made = campaign(folder / "bracket.toml", hidden, 2021, ringdown=True)
+    verdict = investigate(made, load_model(folder / "rig.toml"), seed=2021, thorough=False).verdict
+    assert outcome(hidden, verdict) == ("named" if hidden.identifier else "none"), verdict.sentence
+
+
+@pytest.mark.parametrize("package", [benchmarks, evidence], ids=["benchmarks", "evidence"])
+def test_every_module_can_be_imported(package):
+    """Few of them run in tests; a name that went elsewhere must not wait for whoever needs the others."""
+    found = [module.name for module in walk_packages(package.__path__, f"{package.__name__}.")]
+    assert found
+    for name in found:
+        import_module(name)

@@ -1,6 +1,7 @@
-"""What is read of a laboratory, what is published instead, and what is wrong told in one sentence."""
+"""What is read of a laboratory, what is published instead; the planform; what is wrong in one sentence."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from calibration.dynamics.records import read_records
 from calibration.dynamics.trials import average
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.geometry import read_lengths
+from calibration.geometry import published_lengths, read_lengths, tailored_design, tailored_geometry
 from calibration.paper.procedure import read_published_results
 from calibration.static.experiments import (
     LOAD_STANDARD_DEVIATION,
@@ -22,6 +23,9 @@ from calibration.wing.lab_data import (
     read_lab_folder,
     read_weighed_mass,
 )
+from fe.runtime.errors import InvalidDesignError
+from fe.wing.design import load_design
+from fe.wing.mesh import build_mesh
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
@@ -61,8 +65,13 @@ def test_the_published_figures_are_those_of_the_authors_folder(reference):
     assert read.input_hashes == published.input_hashes
     assert [origin.read for origin in read.origins] == [True, True, False]
     assert "left aside" in read.origins[2].text
-    assert read.authors.samples.shape == (100, 5)
     assert read.trials is None
+    authors = read.authors.samples
+    assert authors.shape == (100, 5)
+    mean, deviation = authors.mean(axis=0), authors.std(axis=0, ddof=1)
+    assert mean[1:3] == pytest.approx([0.1691, 0.1337], abs=5e-5)
+    assert deviation[1:3] == pytest.approx([0.0039, 0.0077], abs=5e-5)
+    assert mean[3:] == pytest.approx([1.030, 7.66e-4], rel=7e-4)
 
 
 def test_digitised_records_are_fitted_by_their_extremes(reference):
@@ -120,3 +129,55 @@ def test_wrong_units_are_recognised(tmp_path, load, displacement, sentence):
     (tmp_path / "pairs.csv").write_text(f"load,displacement\n{rows}\n", encoding="utf-8")
     with refused(ExperimentDataError, f"{sentence}.*expected before calibration|expected.*{sentence}"):
         read_measurements(tmp_path / "pairs.csv")
+
+
+# -------------------------------- the measured planform in the design, and what a wing cannot be
+
+
+def lengths(**measured):
+    """The published lengths, some measured otherwise [m]."""
+    published = published_lengths()
+    changes = {name: replace(getattr(published, name), measured=value) for name, value in measured.items()}
+    return published._replace(**changes)
+
+
+def test_the_published_lengths_are_the_shipped_design():
+    """So nothing is built anew for the wing of the paper."""
+    assert tailored_design(load_design(), published_lengths()).hash == load_design().hash
+
+
+def test_the_planform_is_the_posterior_mean_to_a_tenth_of_a_millimetre():
+    measured = lengths(semi_span=1.83517, root_chord=0.4401, tip_chord=0.25541)
+    found = tailored_geometry(measured)
+    # precision-weighted means by hand: tolerances of 2.54 and 0.2 mm, half-widths of 95 % intervals
+    precision = 0.2**-2 + 2.54**-2
+    for name, designed in (("semi_span", 1.8288), ("root_chord", 0.43561), ("tip_chord", 0.261112)):
+        length = getattr(measured, name)
+        mean = designed + 0.2**-2 / precision * (length.measured - designed)
+        assert length.posterior.mean == pytest.approx(mean, rel=1e-12)
+        assert length.posterior.standard_deviation == pytest.approx(1e-3 * precision**-0.5 / 1.96)
+        assert getattr(found, name) == round(mean, 4)
+
+
+def test_what_moves_with_the_planform_and_what_stays():
+    drawn = load_design()
+    tailored = tailored_design(drawn, lengths(semi_span=1.9, root_chord=0.44, tip_chord=0.255))
+    before, after = drawn.model_dump(), tailored.model_dump()
+    assert {key for key in before if before[key] != after[key]} == {"planform"}
+    planform = tailored.planform
+    assert (planform.semi_span, planform.root_chord, planform.tip_chord) != (1.828, 0.433, 0.26)
+    assert planform.straight_chord_line == drawn.planform.straight_chord_line
+    mesh = build_mesh(tailored)
+    corner = mesh.corners.reshape(-1, 3)
+    assert corner[:, 1].max() == pytest.approx(planform.semi_span)
+    # the test load stays 5 cm from the tip, a gauge where it was glued
+    assert tailored.tip_load.distance_from_tip == 0.05
+    assert tailored.gauges.positions == drawn.gauges.positions
+
+
+@pytest.mark.parametrize(("changes", "measured", "kind", "words"), INPUTS.refused("planform"))
+def test_what_no_longer_fits_is_refused_with_its_place(changes, measured, kind, words):
+    error = {"Data": ExperimentDataError, "Design": InvalidDesignError}[kind]
+    with pytest.raises(error, match=words) as caught:
+        tailored_design(load_design().changed(**changes), lengths(**measured))
+    assert "the changed design" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The way back: a campaign, its verdict, the model patched by it, and the campaign once more."""
+"""The way back: a campaign, its verdict, the model patched by it, the campaign once more; models by name."""
 
 import json
 import shlex
@@ -20,8 +20,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.model_choice import choose_model
 from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
+from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.sensing import observe
 from discrepancy.report.figures import ReportInput
 from discrepancy.search.strategy import search
@@ -29,7 +28,7 @@ from discrepancy.sources.examples import example_campaign, plan_of, write_exampl
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
-from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, SensorGain
+from fe.runtime.patch import ModelPatch, PowerDamping, SensorGain
 from fmu_asset.archive.fmu_file import read_fmu
 from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
@@ -306,22 +305,6 @@ def rig_conditions(model, *values):
     return Conditions(np.array(values or np.ones(len(model.parameters))), np.zeros((1, 2)))
 
 
-def test_a_law_in_the_file_is_the_law_of_a_patch():
-    """To the last bit, in motion and at rest, with the law times the factor of a parameter."""
-    content = tomllib.loads((SHIPPED_MODELS / "single_mass_rig.toml").read_text(encoding="utf-8"))
-    law = PowerStiffness("slide", 3.0, 3.0, 0, 0.008)
-    factor = {"name": "law", "terms": "spring", "deviation": 0.1, "low": 0.5, "high": 4.0}
-    more = {"law": [{"name": "spring", **law.to_mapping()}], "parameter": [*content["parameter"], factor]}
-    own, plain = (LumpedModel(LumpedDescription.parse(item)) for item in (content | more, content))
-    campaign = example_campaign(plain, "laboratory", 3, plan_of(plain))
-    for trial in campaign.trials:
-        for size in (1.0, 2.0):
-            patch = ModelPatch((replace(law, coefficient=3.0 * size),))
-            one = observe(own, campaign, trial, ModelPatch(), rig_conditions(own, 1.02, 0.9, size))
-            other = observe(plain, campaign, trial, patch, rig_conditions(plain, 1.02, 0.9))
-            np.testing.assert_array_equal(one.values, other.values)
-
-
 def test_a_built_in_sensor_is_that_of_its_channel():
     """Of two channels that measure one output, the one that the effect was found on."""
     model = uav_twin.load_model("single_mass_rig")
@@ -349,17 +332,11 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings():
     assert search(problem, chosen("load_cell")).none.chi_square < 1.2 * count
 
 
-@pytest.mark.parametrize("kind", ["lumped", "FMU"])
-def test_gains_of_a_load_act_one_upon_the_other(kind, foreign_fmu, tmp_path):
-    """A tare of 0.5 N that a second gain of 10 % doubles up on is 0.55 N."""
-    shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
-    fmu_rig(tmp_path, "rig.fmu")
-    model = uav_twin.load_model("single_mass_rig" if kind == "lumped" else tmp_path / "rig.toml")
-    trial = example_campaign(model, "static", 0, plan_of(model)).trials[0]
-    seen, wanted = (
-        model.respond(
-            trial, (("displacement", Quantity.DISPLACEMENT),), ModelPatch(gains), rig_conditions(model)
-        ).values
-        for gains in ((LoadGain(0.2, 0.5), LoadGain(0.1, 0.0)), (LoadGain(0.32, 0.55),))
-    )
-    np.testing.assert_allclose(seen, wanted, rtol=1e-9, atol=1e-15)
+# ---------------------------------------------------------------- models by name or file
+
+
+def test_a_structure_needs_no_cache(write_beam, tmp_path, monkeypatch):
+    (tmp_path / "no_folder").write_text("", encoding="utf-8")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "no_folder"))
+    file = write_beam(tmp_path, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
+    assert choose_model(file).model.ports == ("tip",)

@@ -4,8 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.stats import norm
 
 from discrepancy.self_calibration import NOTHING, outcome_of, self_calibrate, wilson, write_self_calibration
@@ -36,18 +34,6 @@ def test_how_verdicts_count(hidden, kind, named, group, outcome):
     assert outcome_of(hidden, kind, named, group) == outcome
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.integers(0, 60), st.integers(1, 60))
-def test_wilson_intervals_solve_their_equation(count, total):
-    count = min(count, total)
-    found = wilson(count, total)
-    z = norm.ppf(0.95)
-    for end in (found.low, found.high):
-        if 0.0 < end < 1.0:  # Wilson 1927: |p - end| = z sqrt(end (1 - end) / n)
-            assert abs(found.value - end) == pytest.approx(z * np.sqrt(end * (1.0 - end) / total), rel=1e-6)
-    assert wilson(0, 0).total == 0
-
-
 def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one():
     campaign, model = measured()
     simulator = Simulator(campaign, model)
@@ -75,6 +61,9 @@ def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     assert all(case.distance >= 25.0 for case in found.cases if case.hidden != NOTHING)
     assert sum(found.confusion()[2].ravel()) == 9
     assert found.share("right", null=True).total == 3
+    none, square = wilson(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)
+    assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, square / (9.0 + square)))
+    assert wilson(0, 0).total == 0
     again = self_calibrate(campaign, model, FEW, 9, seed=2, workers=2)
     assert again == found
     path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)

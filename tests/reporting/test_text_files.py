@@ -25,19 +25,16 @@ class ValueRefusedError(Exception):
 ERRORS = TableErrors(layout=WrongFileError, value=ValueRefusedError)
 
 
-@pytest.mark.parametrize(
-    ("kind", "text", "content"),
-    [
-        ("json", '{"a": [1, -9223372036854775808, 2.5, null]}', {"a": [1, -(2**63), 2.5, None]}),
-        (
-            "toml",
-            "name = 'Flügel'\nspan = 1.50\n[mesh]\ncells = [1, 2]\n",
-            {"name": "Flügel", "span": 1.5, "mesh": {"cells": [1, 2]}},
-        ),
-    ],
-)
-def test_a_file_is_read_with_and_without_a_byte_order_mark(tmp_path, kind, text, content):
-    (read, parse), file = READERS[kind], tmp_path / "file"
+TOML = "name = 'Flügel'\nspan = 1.50\n[mesh]\ncells = [1, 2]\n"
+CONTENTS = {
+    "json": ('{"a": [1, -9223372036854775808, 2.5, null]}', {"a": [1, -(2**63), 2.5, None]}),
+    "toml": (TOML, {"name": "Flügel", "span": 1.5, "mesh": {"cells": [1, 2]}}),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_file_is_read_with_and_without_a_byte_order_mark(tmp_path, kind):
+    (read, parse), file, (text, content) = READERS[kind], tmp_path / "file", CONTENTS[kind]
     for encoding in ("utf-8", "utf-8-sig"):
         file.write_text(text, encoding=encoding)
         assert read(file, WrongFileError) == parse(file.read_bytes(), "It", WrongFileError) == content

@@ -74,27 +74,20 @@ def test_a_campaign_gives_a_file_a_report_and_a_table(lab):
 
 
 def test_a_calibration_of_the_other_kind_is_not_overwritten(lab, make_calibration):
-    """A wing's by a campaign's and a campaign's by a wing's, of the same and of another asset."""
+    """A wing's by a campaign's and a campaign's by a wing's, of the same asset."""
     out, wing = lab.parent / "out", make_calibration().asset
     kept = save_calibration(make_calibration(), out / "calibration.nc")
     before = kept.read_bytes()
-    for asset, sentence in (
-        (wing, f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and one "
-               "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out"),
-        ("spring 7", f"is the calibration of {wing}, not of spring 7: choose another --out"),
-    ):  # fmt: skip
-        assert sentence in refused(*to(lab, asset))
-        assert kept.read_bytes() == before
+    told = refused(*to(lab, wing))
+    assert f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and" in told
+    assert "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out" in told
+    assert kept.read_bytes() == before
     kept.write_bytes(before[:200])  # what nobody can read is replaced
     said(*to(lab, "spring 7"), "--no-report")
     before = kept.read_bytes()
-    assert load_calibration(kept).design is None
-    for asset, sentence in (
-        ("spring 7", "of spring 7 from a campaign (`uav-twin calibrate campaign`), and one"),
-        ("UAV 1", "is the calibration of spring 7, not of UAV 1: choose another --out"),
-    ):
-        assert sentence in refused("calibrate", "--out", out, "--asset", asset, "--no-report")
-        assert kept.read_bytes() == before
+    told = refused("calibrate", "--out", out, "--asset", "spring 7", "--no-report")
+    assert "of spring 7 from a campaign (`uav-twin calibrate campaign`), and one" in told
+    assert kept.read_bytes() == before
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.table("changed.toml")["spring"])

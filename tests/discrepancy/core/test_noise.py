@@ -1,11 +1,9 @@
 """What is read from noise records, against processes with known parameters."""
 
-from math import comb, inf
+from math import inf
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
@@ -13,33 +11,19 @@ from scipy.signal import lfilter
 from discrepancy.campaign.noise import (
     MAINS_DEVIATION,
     NoiseModel,
-    aliased,
     autoregression,
     noise_model,
     without_lines,
 )
 from discrepancy.campaign.noise_tests import (
-    combine,
     cumulative_periodogram,
     fisher_g,
     holm,
     ljung_box,
-    periodogram,
     pooled_variance_p_value,
     variance_p_value,
 )
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
-
-
-def test_records_that_say_little():
-    """No record, a stated deviation, and a record too short for a spectrum."""
-    for record, freedom, deviation in ((None, 0.0, 0.7), (NoiseRecord(2.0, inf), inf, 2.0)):
-        found = noise_model(Channel("g", Quantity.STRAIN, "g", record), 0.7)
-        assert found.degrees_of_freedom == freedom
-        assert found.standard_deviation == found.static_deviation == deviation
-    short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
-    assert not short.autoregression.size
-
 
 INTERVAL = 0.002
 
@@ -64,28 +48,13 @@ def test_autoregression_is_recovered(coefficients):
     padded[: len(coefficients)] -= coefficients
     assert np.abs(padded).max() < 5.0 / np.sqrt(8000)
     assert innovation == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 8000))
+    noise = noise_model(channel(series[:3000]), 1.0)
+    assert noise.standard_deviation == pytest.approx(1.0, rel=0.05)  # of the innovation
+    assert noise.static_deviation == pytest.approx(series.std(), rel=0.1)
+    assert (noise.applies(INTERVAL), noise.applies(2.0 * INTERVAL)) == (True, False)
+    np.testing.assert_array_equal(noise.whiten(series, 2.0 * INTERVAL), series)
     left = np.convolve(series, np.r_[1.0, -found])  # of the record in silence
     assert innovation == pytest.approx(left @ left / (8000 - len(found) - 1.0), rel=1e-9)
-
-
-def test_model_of_a_coloured_record():
-    samples = 3.0 * coloured(np.random.default_rng(2), (0.8,), 4000)
-    noise = noise_model(channel(samples), 1.0)
-    assert noise.standard_deviation == pytest.approx(3.0, rel=0.05)  # of the innovation
-    assert noise.static_deviation == pytest.approx(3.0 / 0.6, rel=0.1)  # sigma / sqrt(1 - a^2)
-    assert noise.degrees_of_freedom > 0.0
-    assert noise.applies(INTERVAL)
-    assert not noise.applies(2.0 * INTERVAL)
-    np.testing.assert_array_equal(noise.whiten(samples, 2.0 * INTERVAL), samples)
-
-
-def test_white_records_stay_white():
-    generator = np.random.default_rng(3)
-    orders = [
-        len(noise_model(channel(generator.standard_normal(400)), 1.0).autoregression) for _ in range(300)
-    ]
-    # the Ljung-Box test of the record has level 1e-3
-    assert np.count_nonzero(orders) <= stats.binom.isf(1e-4, 300, 1e-3)
 
 
 @pytest.mark.parametrize(("coefficients", "count", "records"), [((), 64, 4000), ((0.9,), 500, 700)])
@@ -118,16 +87,6 @@ def test_lines_are_found_where_they_are_and_taken_out(interval, count, shown, si
     assert ljung_box(rest)[1] > 1e-3
 
 
-@given(st.floats(0.0, 1e3), st.floats(1e-4, 1e-1))
-def test_aliases_agree_at_the_samples(frequency, interval):
-    shown = aliased(frequency, interval)
-    assert 0.0 <= shown <= 0.5 / interval * (1.0 + 1e-9)
-    time = interval * np.arange(6)
-    np.testing.assert_allclose(
-        np.cos(2.0 * np.pi * frequency * time), np.cos(2.0 * np.pi * shown * time), atol=1e-5
-    )
-
-
 @pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])
 def test_whitening_is_that_of_the_whole_covariance(coefficients):
     """Sum of squares of whitened samples = x' C^-1 x with the Toeplitz covariance of the process."""
@@ -144,32 +103,14 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients):
 # ---------------------------------------------------------------- statistics of residuals
 
 
-def test_periodogram_of_a_cosine_and_of_white_noise():
-    count = 101
-    series = np.cos(2.0 * np.pi * 7 * np.arange(count) / count)
-    np.testing.assert_allclose(periodogram(series), count / 4 * (np.arange(1, 51) == 7), atol=1e-10)
-    noise = np.random.default_rng(0).standard_normal((4000, 64))
-    assert np.mean([periodogram(row) for row in noise]) == pytest.approx(1.0, abs=0.01)
-
-
 @pytest.mark.parametrize("count", [64, 301])
 def test_p_values_of_serial_tests_are_uniform_under_white_noise(count):
-    noise = np.random.default_rng(count).standard_normal((1500, count))
+    noise = np.random.default_rng(count).standard_normal((800, count))
     for test in (ljung_box, cumulative_periodogram, fisher_g):
         p = np.array([test(row)[1] for row in noise])
         for level in (0.2, 0.05, 0.01, 0.0025):
             error = np.sqrt(level / len(noise))
             assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * error), (test.__name__, level)
-
-
-def test_fisher_g_against_his_exact_sum():
-    series = np.random.default_rng(2).standard_normal(41) + 1.1 * np.cos(0.9 * np.arange(41))
-    g, p, _ = fisher_g(series)
-    count = periodogram(series).size
-    exact = sum(
-        (-1) ** (j - 1) * comb(count, j) * (1.0 - j * g) ** (count - 1) for j in range(1, int(1.0 / g) + 1)
-    )
-    assert p == pytest.approx(exact, rel=0.02)
 
 
 def test_serial_tests_see_what_they_are_for():
@@ -188,14 +129,6 @@ def test_holm_by_hand():
     assert holm([0.004, 0.011, 0.03, np.nan], 0.03) == (True, True, True, False)
     assert holm([0.011, 0.02, 0.03], 0.03) == (False, False, False)
     assert holm([], 0.01) == ()
-
-
-def test_combined_p_values_are_valid():
-    p = np.random.default_rng(8).uniform(size=(4000, 7))
-    combined = np.array([combine(row) for row in p])
-    for level in (0.1, 0.01):
-        assert np.mean(combined <= level) <= level + 3.0 * np.sqrt(level / 4000)
-    assert combine([0.3]) == 0.3
 
 
 def test_ljung_box_allows_for_samples_that_do_not_count():

@@ -1,4 +1,4 @@
-"""Screening and gates: dense projections, fits, level and power."""
+"""Screening and gates: dense projections, fits, level and power; what is left beside the noise."""
 
 from dataclasses import replace
 from math import inf, sin
@@ -12,11 +12,11 @@ from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
 from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
-from discrepancy.fits.screening import Screen, grid
+from discrepancy.fits.screening import Screen
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.location.locate import locate
+from discrepancy.search.honest_evidence import left_by, refitted, widened
 from discrepancy.search.starts import pairs
-from discrepancy.search_settings import SEARCH
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import ModelPatch, RunOffset
 
@@ -59,7 +59,8 @@ def test_change_is_the_projected_one(screened):
         assert float(vector[one] * screen.sign @ vector[other]) == pytest.approx(product, rel=1e-6)
 
 
-def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
+def test_pairs_and_gains_are_those_of_fits(screened):
+    """For linear effects with wide priors the screen is the fit; one change alone is no pair."""
     problem, none, screen, terms, changes = screened
     ((misfit, first, second),) = pairs(changes, screen.sign)
     found = kit.fitted(problem, *terms)
@@ -68,11 +69,6 @@ def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
     np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
     same = replace(changes[0], term=terms[1])
     assert pairs([changes[0], changes[0]], screen.sign) == pairs([changes[0], same], screen.sign) == []
-
-
-def test_gain_is_what_a_fit_achieves(screened):
-    """For a linear effect with a wide prior the screen is the fit."""
-    problem, none, _, terms, changes = screened
     for term, change in zip(terms, changes, strict=True):
         found = kit.fitted(problem, term)
         prior = 0.5 * float(found.point.effect @ found.point.effect)
@@ -89,23 +85,10 @@ def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
     assert mode.parameters[0].prior.value(change.start[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
 
 
-def test_noise_unknown_to_the_record_counts_by_what_is_left():
-    """With n0 = 0 the residual's own size stands for the noise: gains do not depend on the stand-in scale."""
-    sizes = []
-    for noise in (kit.NOISE, None):
-        problem = kit.closed_problem(seed=13, effect=0.12, noise=noise)
-        none = kit.fitted(problem)
-        sizes.append(next(iter(Screen(problem, none).changes(kit.OFFSET))).size)
-        if noise:  # sizes agree in units of what is left
-            left = none.sums[0] / (problem.counts[0] - none.spent[0])
-    assert sizes[1] == pytest.approx(sizes[0] / left, rel=0.25)
-
-
 @pytest.mark.parametrize(
     ("freedom", "kinds", "samples", "gap"),
     [
         (inf, ("static",), 0, 0.0),
-        (30.0, ("static",), 0, 0.0),
         (20.0, ("static", "ringdown"), 60, 0.0),
         (200.0, ("ringdown",), 120, 0.0),  # long enough for whiteness
         (inf, ("ringdown",), 80, 0.5),  # a third more variance, spread evenly
@@ -116,7 +99,7 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
     problem = kit.closed_problem(seed=1, noise=NoiseRecord(0.02, freedom), kinds=kinds, samples=samples)
     found = kit.fitted(problem)
     generator = np.random.default_rng(17)
-    draws, rejected, of_one = 300 if gap else 1500, 0, []
+    draws, rejected, of_one = 300 if gap else 600, 0, []
     for _ in range(draws):
         scale = 1.0 if freedom == inf else generator.chisquare(freedom, 3) / freedom
         sums = (1.0 + gap) * generator.chisquare(problem.counts - found.spent) / scale
@@ -128,23 +111,6 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
     whiteness = any(name.startswith("whiteness") for name, _ in absolute_tests(problem, found))
     assert whiteness or samples < 120
     assert rejected > 280 if gap else rejected <= binom.isf(1e-3, draws, ABSOLUTE_LEVEL)
-
-
-@pytest.mark.parametrize("effect", kit.CATALOGUE, ids=lambda effect: effect.identifier)
-def test_grids_hold_one_scale_and_every_level(effect):
-    term, points = Term(effect), list(grid(Term(effect)))
-    assert {point.shape for point in points} == {(len(term.parameters),)}
-    magnitudes = [n for n, item in enumerate(effect.parameters) if item.magnitude]
-    for at in magnitudes[:1]:
-        first, found = effect.parameters[at], {float(point[at]) for point in points}
-        if first.levels:
-            assert len(found) == first.levels
-            assert min(found) == pytest.approx(-max(found))
-        else:
-            assert found == ({1.0, SEARCH.linear} if first.prior.value(0.0) == 0.0 else {0.0})
-    # none of them is the model as it was
-    values = [term.values(point) for point in points]
-    assert not magnitudes or all(any(row[effect.parameters[n].name] for n in magnitudes) for row in values)
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0])
@@ -196,19 +162,6 @@ def test_shape_gate_compares_evidence():
 
 RIPPLES = 200.0
 """Waves of the ripple in a metre, over 2 pi."""
-
-
-def test_the_misfit_rises_by_the_covariance_where_all_is_linear():
-    problem = kit.closed_problem(seed=3, effect=0.2)
-    found = kit.fitted(problem, kit.OFFSET)
-    screen = Screen(problem, found, record_noise=False)
-    (centre,), deviation = found.point.effect, float(np.sqrt(found.effect_covariance[0, 0]))
-    for steps in (-2.0, 0.5, 1.0):
-        moved = centre + steps * deviation
-        rise = screen.rise(np.array([moved])) + 0.5 * (moved**2 - centre**2)
-        # a fit ends a little beside its optimum
-        assert rise == pytest.approx(0.5 * steps**2, rel=0.01)
-    assert with_draws(problem, found) is found
 
 
 def rippled(steepest):
@@ -311,3 +264,90 @@ def test_held_out_trials_move_nothing_that_is_shared():
         more = np.sum(along * (found.covariance[np.ix_(index, index)] @ along), axis=0)
         wanted = 1.0 + more - np.sum(local * taken, axis=0)
         np.testing.assert_allclose(shown[data.trial.name].expected_variance.ravel(), wanted, atol=1e-9)
+
+
+# ---------------------------------------------------------------- what is left beside the noise
+
+
+def ringing(seed, samples, extra=None, **given):
+    """Return ring-downs with something added to the first channel, and what their fit leaves."""
+    problem = kit.closed_problem(seed=seed, kinds=("ringdown",), samples=samples, extra=extra, **given)
+    none = kit.fitted(problem)
+    return problem, none, left_by(problem, none)
+
+
+def covariance(time, size, tau, frequency):
+    lag = np.abs(time[:, np.newaxis] - time)
+    return np.asarray(size**2 * np.exp(-lag / tau) * np.cos(frequency * lag) + 1e-9 * np.eye(len(time)))
+
+
+def coloured(size, tau, frequency, seed=8):
+    """Return what adds an exact draw of a remainder to the first channel of every trial, noise 0.02."""
+    generator = np.random.default_rng(seed)
+
+    def extra(rows):
+        root = np.linalg.cholesky(covariance(0.01 * rows, size, tau, frequency))
+        return np.asarray(0.02 * root @ generator.standard_normal(len(rows)))
+
+    return extra
+
+
+@pytest.mark.parametrize("freedom", [inf, 400.0])
+def test_white_noise_has_no_remainder(freedom):
+    """Forty campaigns of three channels: none has one, and fits stay as they were."""
+    wrong = 0
+    for seed in range(40):
+        problem, found, left = ringing(seed, 150, noise=NoiseRecord(0.02, freedom))
+        wrong += left.acts
+        assert np.all(left.factor >= 1.0)
+        if seed == 0:
+            assert refitted(problem, widened(problem, left), found) is found
+    assert wrong <= 1
+
+
+@pytest.mark.parametrize(
+    ("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0), (np.sqrt(0.2), 1e-6, 0.0)]
+)
+def test_size_time_and_frequency_are_found(size, tau, frequency):
+    """And of white noise a fifth above its record a size, and no time over which it forgets."""
+    problem, _, left = ringing(4, 900, coloured(size, tau, frequency))
+    first = problem.channel_names.index("y1")
+    over_noise = np.sqrt(np.mean([data.trial.noise_factor**-2 for data in problem.trials]))
+    assert left.size[first] == pytest.approx(size * over_noise, rel=0.2)
+    assert left.time[first] == pytest.approx(tau, rel=0.6, abs=0.04)
+    assert 2.0 * np.pi * left.frequency[first] == pytest.approx(frequency, abs=1.0)
+    assert np.all(np.delete(left.size, first) == 0.0)
+    assert not left.is_noise
+
+
+def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():
+    """Optimum, covariance and evidence are those of the same campaign whose records say so."""
+    problem, none, left = ringing(4, 300, coloured(3.0, 0.15, 0.0))
+    found = refitted(problem, widened(problem, left), none)
+    names = problem.campaign.channels
+    said = kit.fitted(kit.with_noise(
+        problem, **{key: NoiseRecord(0.02 * float(f), inf) for key, f in zip(names, left.factor, strict=True)}
+    ))  # fmt: skip
+    np.testing.assert_allclose(found.point.shared, said.point.shared, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, said.covariance, rtol=1e-3, atol=1e-9)
+    assert found.log_evidence == pytest.approx(said.log_evidence, abs=0.05)
+    assert found.chi_square > 3.0 * said.chi_square  # told against the recorded noise
+
+
+def test_colour_of_the_noise_is_no_gap_where_stamps_are_uneven_and_it_stays():
+    """The same process in the trials and in the noise record."""
+    generator, wrong = np.random.default_rng(5), [0, 0]
+    root = np.linalg.cholesky(covariance(0.01 * np.arange(500), 1.5, 0.03, 0.0) + np.eye(500))
+    for seed in range(12):
+        samples = 0.02 * root @ generator.standard_normal(500)
+        record = NoiseRecord(float(samples.std()), 499.0, samples - samples.mean(), 0.01, "pre-trigger")
+        problem, _, _ = ringing(seed, 400, coloured(1.5, 0.03, 0.0, seed))
+        trials = (item.rows(np.sort(generator.permutation(400)[:320])) for item in problem.campaign.trials)
+        problem = kit.problem_of(replace(problem.campaign, trials=tuple(trials)), problem.model)
+        problem = kit.with_noise(problem, y1=record)
+        found = kit.fitted(problem)
+        wrong[0] += absolute_gate(problem, replace(found, remainder=left_by(problem, found))).passed is False
+        located = locate(residual_set(problem, found))
+        assert all(cell.channel != "y1" for cell in located.cells)
+        wrong[1] += located.disagrees
+    assert max(wrong) <= 1

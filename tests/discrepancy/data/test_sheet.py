@@ -125,7 +125,8 @@ def refusal(path):
     return ""
 
 
-def test_300_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
+def test_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
+    """Three hundred, and lines that are long or ambiguous, which take no long time."""
     rng = random.Random(7)
     pieces = [
         b"", b";", b",", b"\t", b'"', b"\n", b"\r", b"nan", b"1e999", b"\xff", b"[", b"(" * 50, b"9" * 400,
@@ -143,21 +144,13 @@ def test_300_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
         assert "\n" not in said
         assert said.endswith(".") or not said
     assert outcomes == {"read", "refused"}
-    assert time.monotonic() - started < 30.0
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
+    for content in (
         b"(" * 200_000, b"a" * 200_000, b"1" * 200_000, b"a [" + b"m " * 90_000 + b"];b\n1;2\n",
         b"1," * 100_000, b'"' * 99_999,
-    ],
-)  # fmt: skip
-def test_long_lines_take_no_long_time(tmp_path, content):
-    started = time.monotonic()
-    with pytest.raises(CampaignFileError):
-        sheet_of(tmp_path, content + b"\n" + content)
-    assert time.monotonic() - started < 10.0
+    ):  # fmt: skip
+        with pytest.raises(CampaignFileError):
+            sheet_of(tmp_path, content + b"\n" + content)
+    assert time.monotonic() - started < 30.0
 
 
 # ---------------------------------------------------------------- Excel
@@ -235,42 +228,31 @@ def test_damaged_workbooks_are_refused_in_one_sentence(tmp_path):
 # ---------------------------------------------------------------- units
 
 
-def rows(table):
-    """Return quantity, unit and its power or factor, of a part of `units.toml`."""
-    known = Inputs(__file__).table("units.toml")[table]
-    return [(Quantity(name), unit, size) for name, row in known.items() for unit, size in row.items()]
+def rows(*tables):
+    """Return quantity, unit and its power or factor, of parts of `units.toml`."""
+    known = [Inputs(__file__).table("units.toml")[table] for table in tables]
+    return [(Quantity(name), *one) for part in known for name, row in part.items() for one in row.items()]
 
 
-def test_the_units_of_old_mean_the_same():
+def test_units_mean_what_they_always_did_and_what_laboratories_write():
     """What they were before pint is written down, for their meaning must not change."""
-    for quantity, unit, power in rows("powers"):
-        assert conversion_of(quantity, unit) == pytest.approx(float(f"1e{power}"), rel=1e-15), unit
+    powers = [(quantity, unit, float(f"1e{power}")) for quantity, unit, power in rows("powers")]
+    for quantity, unit, factor in powers + rows("factors", "others"):
+        assert quantity in quantities_of(unit), unit
+        assert conversion_of(quantity, unit) == pytest.approx(factor, rel=1e-15), unit
     usual = {(quantity, unit) for quantity, row in UNITS.items() for unit in row.usual}
-    assert usual == {row[:2] for table in ("powers", "factors") for row in rows(table)}
-
-
-@pytest.mark.parametrize(("quantity", "unit", "factor"), rows("factors") + rows("others"))
-def test_units_as_laboratories_write_them(quantity, unit, factor):
-    assert quantity in quantities_of(unit)
-    assert conversion_of(quantity, unit) == pytest.approx(factor, rel=1e-15)
+    assert usual == {row[:2] for row in rows("powers", "factors")}
+    assert conversion("ms", "s") == pytest.approx(1e-3, rel=1e-15)
+    with pytest.raises(ValueError, match="cannot become s"):
+        conversion("mm", "s")
 
 
 @pytest.mark.parametrize(
     "unit",
-    ["", "kg", "t", "1/min", "Hz", "links", "dB", "2 mm", "9**9**9", "kN/m", "i.O.", "degF", "x", "m" * 9999],
-)
-def test_what_is_no_unit_of_ours_is_of_no_quantity(unit):
-    assert quantities_of(unit) == ()
-
-
-@pytest.mark.parametrize("unit", ["mV/V", "V/V", "µV/V", "mV/volt"])
-def test_a_ratio_of_volts_is_a_signal_and_no_strain(unit):
-    assert quantities_of(unit) == (Quantity.SIGNAL,)
-    with pytest.raises(ValueError, match=f"strain must have a unit such as .*, and '{unit}' came"):
+    ["", "kg", "t", "1/min", "Hz", "links", "dB", "2 mm", "9**9**9", "kN/m", "i.O.", "degF", "x", "m" * 9999,
+     "mV/V", "V/V", "µV/V", "mV/volt"],
+)  # fmt: skip
+def test_what_is_no_unit_of_ours_is_of_no_quantity_and_a_ratio_of_volts_a_signal(unit):
+    assert quantities_of(unit) == (Quantity.SIGNAL,) * ("V/" in unit or "V/v" in unit)
+    with pytest.raises(ValueError, match=r"strain must have a unit such as .*, and '.*' came"):
         conversion_of(Quantity.STRAIN, unit)
-
-
-def test_a_time_is_converted_and_a_length_is_no_time():
-    assert conversion("ms", "s") == pytest.approx(1e-3, rel=1e-15)
-    with pytest.raises(ValueError, match="cannot become s"):
-        conversion("mm", "s")

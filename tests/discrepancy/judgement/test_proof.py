@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.signal import lfilter
-from scipy.stats import binom, kstest
 
 from discrepancy.campaign.records import NoiseRecord, TrialKind
 from discrepancy.errors import FitError
@@ -230,7 +229,8 @@ def test_p_value_beside_a_short_noise_record_is_that_of_the_f_test():
     assert test.p_value == pytest.approx(stats.f.sf(0.5 * fall / ((square - fall) / freedom), 2, freedom))
 
 
-@pytest.mark.parametrize("freedom", [pytest.param(inf, marks=pytest.mark.long), 30.0])
+@pytest.mark.long
+@pytest.mark.parametrize("freedom", [inf, 30.0])
 def test_p_values_are_uniform_where_the_name_is_right(freedom):
     """100 campaigns with the effect that is named: Kolmogorov-Smirnov, and the rejections at 5 %."""
     generator = np.random.default_rng(11)
@@ -243,8 +243,8 @@ def test_p_values_are_uniform_where_the_name_is_right(freedom):
             found[test.name].append(test.p_value)
     for values in found.values():
         assert len(values) == 100
-        assert kstest(values, "uniform").pvalue > 1e-3
-        assert sum(p < 0.05 for p in values) <= binom.isf(1e-3, 100, 0.05)
+        assert stats.kstest(values, "uniform").pvalue > 1e-3
+        assert sum(p < 0.05 for p in values) <= stats.binom.isf(1e-3, 100, 0.05)
 
 
 MIDDLE = np.mean(list(STATIONS.values()))
@@ -304,13 +304,6 @@ def test_directions_of_zeros():
     whole = kit.problem_of(replace(problem.campaign, trials=trials), problem.model)
     (zeros,) = (test for test in asked(whole)[2] if test.name == "zeros of the static runs")
     assert zeros.strongest.startswith("the zero of displacement in the runs without a label (")
-    # the second ring-down has 1.5 times the noise
-    assert {data.trial.noise_factor for data in problem.trials} == {1.0, 1.5}
-    starts = {n: data.trial.start for n, data in enumerate(problem.trials)}
-    assert len(set(starts.values())) == 4
-    moves = asked(problem)[1]["channel y1"]["the zero over time"]
-    drift = {n: column.max() for n, column in moves.items()}
-    assert drift == pytest.approx({n: drift[3] * start / starts[3] for n, start in starts.items()})
     # two static trials of one run have other channels
     first, second, *others = (replace(trial, run="A") for trial in problem.campaign.trials)
     assert second.channels[0] == "y3"

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
-from calibration.dynamics.records import read_records
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import NoiseRecord, Quantity
 from discrepancy.errors import FitError
@@ -17,10 +15,10 @@ from discrepancy.location.backbone import backbones
 from discrepancy.location.dependence import modal_motion
 from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
 from discrepancy.location.map import features, residual_map
-from discrepancy.location.omnibus_tests import variance_test
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
+from tests.discrepancy.asking import integrated
 from tests.discrepancy.bench import SHAPES, Bench, with_noise
 from tests.discrepancy.core.kit import fitted, problem_of
 
@@ -31,7 +29,7 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
     bench = Bench(count=120)
     generator = np.random.default_rng(23)
     silent, proportion = [], []
-    for _ in range(30):
+    for _ in range(20):
         fitted = bench.fit(generator)
         silent.append(not any(cell.significant for cell in residual_map(fitted, fitted.white(generator))))
         fitted = bench.fit(generator, extra={0: np.array([0.0, 0.0, 4.0, 0.0])})
@@ -39,7 +37,7 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
         found = [(cell.channel, cell.trial) for cell in cells if cell.significant]
         assert ("g3", "release 1") in found
         proportion.append(np.mean([place != ("g3", "release 1") for place in found]))
-    assert np.mean(silent) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 30)
+    assert np.mean(silent) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 20)
     assert np.mean(proportion) <= 0.05
 
 
@@ -53,30 +51,6 @@ def test_a_short_noise_record_makes_no_pattern_over_the_channels():
             bool(singular_patterns(fitted, kind)) for kind in kinds_of(fitted, fitted.white(generator))
         )
     assert told <= binom.isf(1e-3, 80, 0.01)
-
-
-def test_variance_test_counts_only_what_the_fit_leaves():
-    bench = Bench(count=32, noise_freedom=np.inf)
-    generator = np.random.default_rng(31)
-    squares = [variance_test(bench.fit(generator)).statistic for _ in range(400)]
-    assert np.mean(squares) == pytest.approx(1.0, abs=0.02)
-
-
-def test_a_fit_far_from_the_truth_that_leaves_no_degree_of_freedom_is_no_crash():
-    # One reading in each of two kinds of trial, and a posterior that is much too wide: 0.02 degrees of
-    # freedom are left to both together, one to each.
-    fitted = Bench(count=40).fit(np.random.default_rng(1))
-    trials = []
-    for item in (fitted.trials[0], fitted.trials[-1]):
-        used = np.zeros_like(item.used)
-        used[0, 0] = True
-        wide = np.full((*item.residual.shape, 1), np.sqrt(0.9))
-        leverage = np.full(item.residual.shape, 0.9)
-        trial = replace(item.trial, used=used)
-        trials.append(replace(item, trial=trial, leverage=leverage, sensitivity=wide))
-    found = variance_test(replace(fitted, trials=tuple(trials)))
-    assert np.isnan(found.statistic)
-    assert 0.0 <= found.p_value <= 1.0
 
 
 def located(seed, extra, **given):
@@ -282,13 +256,13 @@ def test_restored_residuals_are_white_with_unit_variance(held_out):
     bench = Bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
-        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(1200)
+        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(500)
     ])  # fmt: skip
     covariance = draws.T @ draws / len(draws)
     plain = np.abs(covariance - np.eye(len(covariance)))
-    # Standard deviations of the entries are sqrt(2 / 1200) on and sqrt(1 / 1200) off the diagonal.
-    assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 1200)
-    assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 1200)
+    # Standard deviations of the entries are sqrt(2 / 500) on and sqrt(1 / 500) off the diagonal.
+    assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 500)
+    assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 500)
 
 
 def test_what_no_fit_leaves_is_refused():
@@ -307,22 +281,6 @@ def test_what_no_fit_leaves_is_refused():
     for channels, trials in ((good.channels, ()), ({}, good.trials)):
         with pytest.raises(FitError, match="at least one trial, and the channels"):
             ResidualSet(channels, trials)
-
-
-def test_values_that_are_not_used_may_be_anything():
-    good = Bench(count=40).fit(np.random.default_rng(1))
-    item = good.trials[0]
-    used = item.used.copy()
-    used[7, 2] = False
-    residual = item.residual.copy()
-    residual[7, 2] = np.nan
-    changed = replace(item, trial=replace(item.trial, used=used), residual=residual)
-    assert np.isnan(changed.standardised[7, 2])
-    (white,) = ResidualSet(good.channels, (changed,)).white(np.random.default_rng(0))
-    assert np.all(np.isfinite(white))
-    used[:, 2] = False  # of a channel of which nothing counts no test in time is made
-    told = [name for _, name, _ in ResidualSet(good.channels, (changed,)).series((white,))]
-    assert told == [name for name in item.trial.channels if name != item.trial.channels[2]]
 
 
 # ---------------------------------------------------------------- splitting a motion into its modes
@@ -346,19 +304,7 @@ def test_two_damped_modes_are_split_up_to_the_ends():
 # ---------------------------------------------------------------- backbones of known laws
 
 
-def _moved(force):
-    """Return x of x'' + w^2 x + force(x, x') = 0 from one, integrated numerically."""
-    found = solve_ivp(
-        lambda t, y: [y[1], -(OMEGA**2) * y[0] - force(*y)], (0.0, TIME[-1]), [1.0, 0.0], t_eval=TIME,
-        rtol=1e-9, atol=1e-11,
-    )  # fmt: skip
-    return found.y[0]
-
-
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
-ON_PAPER = pytest.mark.skipif(
-    not REFERENCE.is_dir(), reason=f"the published ring-downs are not at {REFERENCE}"
-)
 TIME = 0.005 * np.arange(2000)
 OMEGA = 2.0 * np.pi * 5.0
 
@@ -372,19 +318,13 @@ def _viscous(zeta=0.01, f=5.0, size=1.0):
     return size * np.exp(-zeta * w * TIME) * np.cos(w * np.sqrt(1.0 - zeta**2) * TIME + 0.4)
 
 
-def test_viscous_damping_is_flat_and_exact():
-    curve = _curve(_viscous() + 0.2 - 0.01 * TIME)
-    np.testing.assert_allclose(curve.frequency, 5.0, rtol=1e-7)
-    np.testing.assert_allclose(curve.damping_ratio, 0.01, rtol=1e-5)
-    np.testing.assert_allclose(curve.amplitude, np.exp(-0.01 * OMEGA * curve.time), rtol=1e-5)
-    assert curve.time[0] < 0.5
-    assert curve.time[-1] > 9.0
-
-
 def test_two_modes_are_separated():
     """A mode that dies away is dropped, the other goes on; pure noise gives no points."""
-    first, second = backbones(TIME, _viscous() + _viscous(0.006, 7.3, 0.5), (4.9, 7.5))
+    drift = 0.2 - 0.01 * TIME
+    first, second = backbones(TIME, _viscous() + _viscous(0.006, 7.3, 0.5) + drift, (4.9, 7.5))
     np.testing.assert_allclose(first.frequency, 5.0, rtol=1e-5)
+    np.testing.assert_allclose(first.damping_ratio, 0.01, rtol=1e-3)
+    np.testing.assert_allclose(first.amplitude, np.exp(-0.01 * OMEGA * first.time), rtol=1e-3)
     np.testing.assert_allclose(second.frequency, 7.3, rtol=1e-5)
     np.testing.assert_allclose(second.damping_ratio, 0.006, rtol=1e-3)
     noise = np.random.default_rng(3).standard_normal(TIME.size)
@@ -421,45 +361,21 @@ def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude():
     np.testing.assert_allclose(curve.frequency[:-2], 5.0, rtol=1e-3)
 
 
-def test_quadratic_damping_has_a_ratio_proportional_to_amplitude():
-    c = 0.1
-    curve = _curve(_moved(lambda x, v: c * abs(v) * v), periods=3.0)
-    exact = 4.0 * c * curve.amplitude / (3.0 * np.pi)
-    assert curve.amplitude[0] > 3.0 * curve.amplitude[-1]
-    np.testing.assert_allclose(curve.damping_ratio, exact, rtol=0.03)
-    slope = np.polyfit(np.log(curve.amplitude), np.log(curve.damping_ratio), 1)[0]
-    assert slope == pytest.approx(1.0, abs=0.02)
-
-
 def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude():
     # f = f0 (1 + 3 kappa A^2 / 8) to first order
     kappa, zeta = 0.04, 0.008
-    curve = _curve(_moved(lambda x, v: 2.0 * zeta * OMEGA * v + OMEGA**2 * kappa * x**3))
+
+    def rate(_, x):
+        return [x[1], -(OMEGA**2) * x[0] * (1.0 + kappa * x[0] ** 2) - 2.0 * zeta * OMEGA * x[1]]
+
+    curve = _curve(integrated(rate, TIME, [1.0, 0.0])[:, 0])
     shift = curve.frequency / 5.0 - 1.0
     np.testing.assert_allclose(shift, 0.375 * kappa * curve.amplitude**2, atol=2e-4, rtol=0.04)
     slope = np.polyfit(np.log(curve.amplitude[:6]), np.log(shift[:6]), 1)[0]
     assert slope == pytest.approx(2.0, abs=0.1)
 
 
-@ON_PAPER
-def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest():
-    curves = []
-    for record in read_records(REFERENCE):
-        found = backbones(record.time, record.signal, (5.65, 29.97), averaging_width=record.averaging_width)
-        curves.append(found[0])
-    assert len(curves) == 5
-    of_all = np.array([
-        [np.interp(np.log((0.6e-3, 6e-3)), np.log(curve.amplitude[::-1]), values[::-1])
-         for values in (curve.frequency, curve.damping_ratio)]
-        for curve in curves
-    ])  # fmt: skip
-    small, large = of_all[..., 0], of_all[..., 1]
-    assert np.all((small - large) * (1.0, -1.0) > 0.0)
-    for rise in ((small - large) * (1.0, -1.0)).T:
-        assert rise.mean() > 5.0 * rise.std(ddof=1) / np.sqrt(len(rise))
-
-
-@ON_PAPER
+@pytest.mark.skipif(not REFERENCE.is_dir(), reason=f"the published ring-downs are not at {REFERENCE}")
 def test_one_linear_mode_does_not_explain_the_real_ring_downs(tmp_path):
     """From 0.3 s on, when the second bending mode has died away; all five releases have one amplitude."""
     wing = read_campaign(write_rig_campaign("real_wing", REFERENCE, tmp_path / "campaign", begin=0.3))

@@ -12,7 +12,7 @@ from benchmarks.force_events import counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.when import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
-from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
+from discrepancy.missing_force.filtered import Filtered, Process, regression
 from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
@@ -22,6 +22,7 @@ from discrepancy.report.residual_figures import time_line_figure
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate
 from tests.discrepancy.bench import Bench
+from tests.discrepancy.rigs import FEW
 
 
 def gaussian(covariance, readings):
@@ -63,8 +64,10 @@ def trial_of(time, residual, *, used=None, deviation=None, local=None, coloured=
     )  # fmt: skip
 
 
-def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
-    """Return the covariance (N C, N C) of the readings by the force, and of force and readings (N, N C).
+def dense(trial, process, per_second=2000, window=(-np.inf, np.inf)):
+    """Return the covariance (N C, N C) of the readings by the force, and of force and readings (M, N C).
+
+    The force is that at the fine stamps (M,), of which every PARTS-th is a sample.
 
     By quadrature of what a kernel over all pairs of moments, those of a window, does to an impulse response;
     nothing is stepped.
@@ -81,7 +84,13 @@ def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
     inside = (moments > window[0]) & (moments < window[1])
     kernel *= np.outer(inside, inside)
     answers = np.zeros((len(trial.time), 2, len(moments)))
-    nearest = np.zeros((len(trial.time), len(moments)))
+    nearest = np.zeros((len(trial.fine_time), len(moments)))
+    for k, now in enumerate(trial.fine_time):
+        place = np.clip(now / step - 0.5, 0.0, len(moments) - 1.001)
+        nearest[k, int(place)], nearest[k, int(place) + 1] = 1.0 - place % 1.0, place % 1.0
+        if now in window:  # what begins or ends at a sample does so before it
+            nearest[k] = 0.0
+            nearest[k, round(now / step)] = 1.0
     generator = trial.system.generator
     turn = np.sqrt(1.0 - RATIO**2) * FREQUENCY
     for k, now in enumerate(trial.time):
@@ -89,15 +98,11 @@ def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
         decay = np.where(since > 0.0, np.exp(-RATIO * FREQUENCY * np.maximum(since, 0.0)), 0.0)
         x = -decay * np.sin(turn * since) / turn * step
         v = -decay * (np.cos(turn * since) - RATIO * FREQUENCY / turn * np.sin(turn * since)) * step
-        place = np.clip(now / step - 0.5, 0.0, len(moments) - 1.001)
-        nearest[k, int(place)], nearest[k, int(place) + 1] = 1.0 - place % 1.0, place % 1.0
-        if now in window:  # what begins or ends at a sample does so before it
-            nearest[k] = 0.0
-            nearest[k, round(now / step)] = 1.0
         answers[k, 0] = x
-        answers[k, 1] = generator[1, 0] * x + generator[1, 1] * v - nearest[k]
+        answers[k, 1] = generator[1, 0] * x + generator[1, 1] * v - nearest[PARTS * k]
     rows = (answers / trial.deviation[:, None]).reshape(-1, len(moments))
-    return rows @ kernel @ rows.T, nearest @ kernel @ rows.T
+    by_force = kernel @ rows.T
+    return rows @ by_force, nearest @ by_force
 
 
 @pytest.mark.parametrize(
@@ -134,10 +139,9 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
         return
     _, (force,), (deviation, _) = filtered.smoothed(trial.residual)
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
-    np.testing.assert_allclose(force[::PARTS], mean, atol=0.02 * process.size)
-    variance = process.size**2 - np.einsum(
-        "nk,kn->n", cross[:, at], np.linalg.solve(covariance, cross[:, at].T)
-    )
+    np.testing.assert_allclose(force, mean, atol=0.02 * process.size)
+    own = cross[::PARTS, at]
+    variance = process.size**2 - np.einsum("nk,kn->n", own, np.linalg.solve(covariance, own.T))
     np.testing.assert_allclose(deviation, np.sqrt(variance), atol=0.02 * process.size)
 
 
@@ -160,21 +164,6 @@ def states(filtered):
     """Return the states of a trial after each of its samples."""
     steps, which = filtered.steps(filtered.trial.residual[None]), filtered.trial.steps[1]
     return steps.before(which, 0, steps.begin(filtered.system[3]), np.arange(1, len(which) + 1))
-
-
-def test_the_state_between_samples_is_that_of_samples_in_between():
-    random = np.random.default_rng(5)
-    count = 30
-    residual = random.standard_normal((count, 2))
-    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), [(0, PROCESS)])
-    dense_count = (count - 1) * PARTS + 1
-    filled, used = np.zeros((dense_count, 2)), np.zeros((dense_count, 2), dtype=bool)
-    filled[::PARTS], used[::PARTS] = residual, True
-    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), [(0, PROCESS)])
-    added, (force,), _ = coarse.smoothed(residual)
-    other, (again,), _ = fine.smoothed(filled)
-    np.testing.assert_allclose(force, again[::PARTS], atol=1e-9)
-    np.testing.assert_allclose(added, other[::PARTS], atol=1e-9)
 
 
 def test_states_and_noise_by_closed_forms():
@@ -202,15 +191,6 @@ def test_states_and_noise_by_closed_forms():
         pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
     )  # fmt: skip
     assert decaying_part(noise, 0.02) is None
-
-
-def test_evidence_beside_unknowns_is_that_of_their_prior():
-    random, precision = np.random.default_rng(2), np.array([4.0, 0.01])
-    readings, columns = random.standard_normal(9), random.standard_normal((2, 9))
-    rows = np.vstack((readings, columns))
-    found = Regression(rows @ rows.T, 0.0).solve([0, 1], precision)
-    covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
-    assert found.evidence == pytest.approx(gaussian(covariance, readings))
 
 
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
@@ -298,7 +278,7 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
     if (kind, seed) != ("leak", 5):
         return
     problem = problem_of(case)
-    verdict = investigate(problem.campaign, problem.model).verdict
+    verdict = investigate(problem.campaign, problem.model, FEW).verdict
     told = [window for window in verdict.windows if not window.with_effect]
     for window, moments in zip(told, case.windows, strict=True):
         assert (window.begin.value, window.end.value) == pytest.approx(moments, abs=0.01 * case.length)
@@ -307,6 +287,7 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
     assert when_sentence(told) in verdict.sentence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "seed"), [("offset", 23), ("random motion", 23), ("line", 49), ("scatter", 57), ("quiet", 7)]
 )

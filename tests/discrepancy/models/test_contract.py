@@ -2,7 +2,7 @@
 
 import pickle
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -182,31 +182,21 @@ def test_rates_are_derivatives(kind: Kind, change: str) -> None:
     np.testing.assert_allclose(found.rates[seen_later] / scale, slope[seen_later] / scale, atol=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("how", "said", "sentence"),
-    [
-        (TrialKind.STATIC, {"outputs": {"x9": Quantity.DISPLACEMENT}}, "no output 'x9'"),
-        (TrialKind.STATIC, {"quantity": Quantity.FORCE}, "is a displacement"),
-        (TrialKind.STATIC, {"quantity": Quantity.VELOCITY}, "is at rest"),
-        (TrialKind.STATIC, {"load_place": "nose"}, r"place (is )?'nose'"),
-        (TrialKind.STATIC, {"items": (PowerStiffness("nose", 1.0, 3.0, 0, 1.0),)}, "port 'nose', which"),
-        (TrialKind.RINGDOWN, {"release": None}, "does not say how it was released"),
-        (TrialKind.STATIC, {"parameters": np.ones(9)}, "parameters, but 9 came"),
-    ],
-)
-def test_what_cannot_be_answered_is_refused_in_a_sentence(kind: Kind, how, said, sentence: str) -> None:
-    what, given = kind.trial(how, force=np.ones(3)), dict(said)
-    what = replace(what, **{name: given.pop(name) for name in ("load_place", "release") if name in given})
-    items = given.pop("items", ())
-    if "quantity" in given:
-        given = {"outputs": {kind.output: given["quantity"]}}
-    with pytest.raises(ModelError, match=sentence):
-        kind.seen(what, *items, **given)
+OF_ALL = [
+    (TrialKind.STATIC, {"outputs": {"x9": Quantity.DISPLACEMENT}}, (), "no output 'x9'"),
+    (TrialKind.STATIC, {"quantity": Quantity.FORCE}, (), "is a displacement"),
+    (TrialKind.STATIC, {"quantity": Quantity.VELOCITY}, (), "is at rest"),
+    (TrialKind.STATIC, {"load_place": "nose"}, (), r"place (is )?'nose'"),
+    (TrialKind.STATIC, {}, (PowerStiffness("nose", 1.0, 3.0, 0, 1.0),), "port 'nose', which"),
+    (TrialKind.RINGDOWN, {"release": None}, (), "does not say how it was released"),
+    (TrialKind.STATIC, {"parameters": np.ones(9)}, (), "parameters, but 9 came"),
+]
 
 
 @pytest.mark.parametrize(
     ("kind", "how", "said", "items", "sentence"),
     [
+        *((name, *row) for name in TABLE["kind"] for row in OF_ALL),
         ("lumped", TrialKind.FLIGHT, {}, (), "is a flight, but the model .* no input load_factor"),
         ("lumped", TrialKind.STATIC, {"load_place": (0.1, 0.2)}, (), "takes forces at"),
         ("lumped", TrialKind.STATIC, {}, (patch.Washout(0.1, 1.0),), "cannot carry the primitive 'washout'"),
@@ -222,9 +212,14 @@ def test_what_cannot_be_answered_is_refused_in_a_sentence(kind: Kind, how, said,
     ],
     indirect=["kind"],
 )  # fmt: skip
-def test_what_a_kind_cannot_do_is_refused(kind: Kind, how: TrialKind, said, items, sentence: str) -> None:
+def test_what_cannot_be_answered_is_refused_in_a_sentence(kind: Kind, how, said, items, sentence) -> None:
+    given = dict(said)
+    of_trial = {name: given.pop(name) for name in said if name in {item.name for item in fields(Trial)}}
+    what = replace(kind.trial(how, force=np.ones(3)), **of_trial)
+    if "quantity" in given:
+        given = {"outputs": {kind.output: given["quantity"]}}
     with pytest.raises(ModelError, match=sentence):
-        kind.seen(replace(kind.trial(how, force=np.ones(3)), **said), *items)
+        kind.seen(what, *items, **given)
 
 
 ROWS = [

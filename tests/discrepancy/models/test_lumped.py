@@ -7,19 +7,25 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.linalg import eigh, expm
+from scipy.optimize import brentq
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
+from discrepancy.models.acting import Acting, Shown
+from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
+from discrepancy.models.motion import Motion, motion_of
 from discrepancy.models.system_model import State
 from fe.runtime import patch as patches
-from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
-from tests.discrepancy.asking import FloatArray, integrated, seen
+from fe.runtime.motion import laws_of
+from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
+from tests.discrepancy.asking import FloatArray, seen
 from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import model_of
-from tests.fe.runtime.stepping import exact, force_of, second_order, states_of
+from tests.discrepancy.rigs import laws, model_of
+from tests.fe.runtime.stepping import force_of, second_order, states_of
 from tests.refusals import Inputs
 
 pytestmark = pytest.mark.xdist_group("compiling")
@@ -61,6 +67,7 @@ def shown(model: LumpedModel, what: Trial, *items: Any, outputs: Any = DISPLACEM
 
 SCALED = 1.1 * (STIFFNESS - 0.2 * 2200.0 * np.outer(JOINT, JOINT))
 ROOT = np.linalg.inv(STIFFNESS) + 3e-4 * np.outer([0.2, 0.4, 0.6], [0.2, 0.4, 0.6])
+TWO_GAINS = patches.LoadGain(0.2, 0.5), patches.LoadGain(0.1, 0.0)  # one upon the other
 WARM, SOFTER = np.array([0.0, 10.0, 0.0, -20.0]), patches.ModulusTemperature(2e-3)
 
 
@@ -71,6 +78,7 @@ WARM, SOFTER = np.array([0.0, 10.0, 0.0, -20.0]), patches.ModulusTemperature(2e-
         ((), [1.0], [np.linalg.solve(SCALED, [0, 0, 1])], {"parameters": np.array([1.1, 0.8, 2.0])}),
         ((patches.RootCompliance(3e-4),), [2.0], [2.0 * ROOT[:, 2]], {}),  # in series
         ((patches.LoadGain(0.05, 0.5),), [0.0, 4.0], np.outer([0.0, 4.7], END), {}),
+        (TWO_GAINS, [0.0, 4.0], np.outer([0.0, 5.83], END), {}),
         ((patches.LoadPlace(-0.05, 0.0),), [3.0], [np.linalg.solve(STIFFNESS, [0, 0.75, 2.25])], {}),
         ((patches.PointMass(0.3, 0.55),), [1.0], [END], {}),
         ((SOFTER,), [1.0] * 4, np.outer(1.0 / (1 - 2e-3 * WARM), END), {"temperature": WARM}),
@@ -83,71 +91,14 @@ def test_static_rows_are_those_of_the_matrices(chain, items, force, wanted, said
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
-@pytest.mark.parametrize(
-    "law",
-    [
-        PowerStiffness("joint", 3.0, 3.0, 0, 2e-3),
-        FreePlay("joint", 1000.0, 5e-4),
-        MicroSlip("joint", 0.8, 1500.0, -0.4),
-        BoucWen("joint", 1000.0, 8e-4, 2.0),
-    ],
-)
-def test_static_rows_with_a_joint_are_in_equilibrium(chain, law: Primitive) -> None:
-    force = np.array([0.0, 2.0, 5.0, 2.0, -4.0])
-    u = shown(chain, static(list(force)), law)
-    pull = u @ STIFFNESS - np.outer(force, [0, 0, 1])  # what the joint must give: -row F
-    np.testing.assert_allclose(pull[:, 0], 0.0, atol=1e-9)
-    np.testing.assert_allclose(pull[:, 1], -pull[:, 2], atol=1e-9)
-    internal = -pull[:, 2]
-    if not states_of(law):
-        wanted = [force_of(law, x, 0.0, np.zeros(0)) for x in u @ JOINT]
-        np.testing.assert_allclose(internal, wanted, atol=1e-8)
-    else:  # softer on first loading, and not the same on the way back
-        assert internal[2] < internal[1] < 0.0
-        assert abs(u[3, 2]) > abs(u[1, 2])
-
-
 # ---------------------------------------------------------------- motion
-
-
-@pytest.mark.parametrize(
-    ("law", "tolerance"),
-    [
-        (PowerStiffness("joint", 0.0, 3.0, 0, 2e-3), 1e-7),
-        (PowerStiffness("joint", 0.3, 3.0, 0, 2e-3), 5e-4),
-        (PowerDamping("joint", 0.5, 2.0, 0.0, 0.1, 1.0), 5e-4),
-        (PowerStiffness("joint", -0.4, 1.0, -1, 2e-3), 5e-4),
-    ],
-)
-def test_a_ringdown_is_its_equation(chain: LumpedModel, law: Primitive, tolerance: float) -> None:
-    """The full equations, by a general integrator."""
-    what = ringdown()
-    values = shown(chain, what, law, outputs=(*DISPLACEMENTS.items(), VELOCITY, ACCELERATION))
-    start = values[0, :3]
-
-    def acceleration(u: FloatArray, v: FloatArray) -> FloatArray:
-        internal = JOINT * force_of(law, float(JOINT @ u), float(JOINT @ v), np.zeros(0))
-        return (-STIFFNESS @ u - VISCOUS @ v - internal) / np.diag(MASS)
-
-    # released from equilibrium under a force at the end only
-    np.testing.assert_allclose(acceleration(start, np.zeros(3))[:2], 0.0, atol=1e-8)
-    assert start[2] == pytest.approx(0.02)
-    wanted = integrated(
-        lambda t, y: np.concatenate((y[3:], acceleration(y[:3], y[3:]))), what.time,
-        np.concatenate((start, np.zeros(3))), atol=1e-13, max_step=2e-3,
-    )  # fmt: skip
-    u, v = wanted[:, :3], wanted[:, 3:]
-    np.testing.assert_allclose(values[:, :3], u, atol=0.02 * tolerance)
-    np.testing.assert_allclose(values[:, 3], v[:, 2], atol=0.5 * 2.0 * tolerance)
-    of_end = np.array([acceleration(*pair)[2] for pair in zip(u, v, strict=True)])
-    np.testing.assert_allclose(values[:, 4], of_end, atol=4.0 * tolerance * np.max(np.abs(of_end)))
 
 
 def test_a_record_that_begins_under_load_begins_at_rest(chain: LumpedModel) -> None:
     what = trial(TrialKind.FORCED, 100, force=np.full(100, 3.0))
-    for laws in ((), (MicroSlip("joint", 0.5, 800.0, -0.3),)):
-        still = shown(chain, static([3.0] * 100), *laws)
-        np.testing.assert_allclose(shown(chain, what, *laws), still, rtol=1e-3 if laws else 1e-11)
+    for items in ((), (MicroSlip("joint", 0.5, 800.0, -0.3),)):
+        still = shown(chain, static([3.0] * 100), *items)
+        np.testing.assert_allclose(shown(chain, what, *items), still, rtol=1e-3 if items else 1e-11)
 
 
 def test_initial_states_are_shares_of_the_release(chain: LumpedModel) -> None:
@@ -161,12 +112,12 @@ def test_initial_states_are_shares_of_the_release(chain: LumpedModel) -> None:
     np.testing.assert_allclose(values, wanted, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("laws", [(), (PowerDamping("joint", 0.2, 2.0, 0.0, 0.1, 1.0),)])
-def test_a_clock_shows_the_motion_at_other_times(chain: LumpedModel, laws: tuple[Primitive, ...]) -> None:
+@pytest.mark.parametrize("items", [(), (PowerDamping("joint", 0.2, 2.0, 0.0, 0.1, 1.0),)])
+def test_a_clock_shows_the_motion_at_other_times(chain: LumpedModel, items: tuple[Primitive, ...]) -> None:
     stamps, time = np.arange(40001) * 1e-4, ringdown(200).time
-    fine = shown(chain, ringdown(stamps), *laws)
+    fine = shown(chain, ringdown(stamps), *items)
     for clock in ((0.02, 0.013), (-0.01, -0.0333), (0.0, -0.02)):
-        values, times = shown(chain, ringdown(200), *laws, clock=clock), (1 + clock[0]) * time + clock[1]
+        values, times = shown(chain, ringdown(200), *items, clock=clock), (1 + clock[0]) * time + clock[1]
         expected = np.stack([np.interp(times, stamps, column) for column in fine.T], axis=1)
         np.testing.assert_allclose(values, expected, atol=0.02 * 2e-4)
         assert np.all(values[times < 0.0] == values[0])  # held until the release
@@ -192,27 +143,8 @@ def test_closed_form_and_stepped_ringdown_agree_for_any_damping(ratios: Any, clo
 
 # ---------------------------------------------------------------- at uneven stamps
 
-SEEN = (("x1", Quantity.DISPLACEMENT), VELOCITY, ACCELERATION)
-
-
-def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
-    time = 0.02 * (np.arange(200) + 0.9 * np.random.default_rng(1).uniform(-0.5, 0.5, 200))
-    time = np.delete(time - time[0], slice(66, 73))  # and a gap
-    force = np.append(0.0, np.random.default_rng(2).normal(size=len(time) - 1))
-    into = np.append(np.zeros(5), 1.0 / MASS[2, 2])[:, None]
-    found = exact(MOTION, into, time, force[:, None])
-    acceleration = found @ MOTION[5] + force * into[5]
-    expected = np.stack([found[:, 0], found[:, 5], acceleration], axis=1)
-    measured = shown(chain, trial(TrialKind.FORCED, time, force=force), outputs=SEEN)
-    np.testing.assert_allclose(measured, expected, atol=1e-9 * np.abs(expected).max())
-
 
 # ---------------------------------------------------------------- what it says of itself
-
-
-def test_the_default_place_of_a_load_is_the_one_input() -> None:
-    model, what = LumpedModel.load("single_mass_rig"), static([1974.0], load_place="tip_load")
-    assert shown(model, what, outputs={"displacement": Quantity.DISPLACEMENT}) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("name", "whole", "parts"), INPUTS.table("parts.toml")["row"])
@@ -223,3 +155,118 @@ def test_a_matrix_may_be_given_by_parts_alone(name: str, whole: str, parts: str)
     )
     for kind in ("mass", "stiffness", "capacity", "conductance"):
         np.testing.assert_array_equal(one[kind], other[kind])
+
+
+# ---------------------------------------------------------------- a joint that the modes leave out
+
+
+LIGHT = 1e-5
+"""Mass of the joint's own node [kg], as good as none: the mode that it makes is left out."""
+BETA = 1e-3
+HOLD = 6000.0
+"""Spring of the joint [N/m]: a seventh of the compliance of the tip."""
+TIP = np.array([0.0, 0.0, 0.0, 1.0])
+ROWS = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
+"""Of the tip and of the joint."""
+RELEASE = Release(displacement=0.02, deviation=0.01, at_rest=True, mode_count=1, time_zero_deviation=0.0)
+TIME, EARLY = np.linspace(0.0, 2.796, 700), np.linspace(0.0, 0.01, 101)
+A = 0.02 * 0.135
+"""About the motion of the joint [m]."""
+
+
+def on_joint(modes: int, beta: float) -> LinearSystem:
+    """Three masses of 1 kg in a row on a joint whose node weighs next to nothing."""
+    springs = np.array([HOLD, 2000.0, 4000.0, 5000.0])
+    stretch = np.eye(4) - np.eye(4, k=-1)
+    stiffness = stretch.T @ np.diag(springs) @ stretch
+    mass = np.diag([LIGHT, 1.0, 1.0, 1.0])
+    ports = {"joint": np.array([1.0, 0.0, 0.0, 0.0]), "tip": TIP}
+    return LinearSystem(mass, 0.3 * mass + beta * stiffness, stiffness, ports, modes, beta)
+
+
+def let_go(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **how: int) -> Motion:
+    system = on_joint(how.pop("modes", 3), beta)
+    acts = laws_of(ModelPatch(items), list(system.ports))
+    acting = Acting(time, time, initial=np.zeros((0, 2)), release=(row, RELEASE))
+    return motion_of(system, acting, acts, **how)
+
+
+def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
+    return motion.seen([Shown.of(row) for row in rows]).values
+
+
+LAWS = laws("joint", HOLD, A, 15.0 * A)
+
+
+def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ...]) -> float:
+    """Speed v of a joint without mass: damper v + sum F(x, v) = push."""
+    drags = [
+        (d.coefficient * abs(x / d.reference_displacement) ** d.displacement_exponent, d)
+        for d in items
+        if isinstance(d, PowerDamping)
+    ]
+    rest = max(abs(push) - sum(size for size, d in drags if d.velocity_exponent == 0.0), 0.0)
+    moving = [(size, d) for size, d in drags if d.velocity_exponent > 0.0]
+
+    def left(v: float) -> float:
+        drag = sum(size * (v / d.reference_velocity) ** d.velocity_exponent for size, d in moving)
+        return float(damper * v - rest + drag)
+
+    size = brentq(left, 0.0, rest / damper, xtol=1e-15) if moving and rest > 0.0 else rest / damper
+    return float(np.sign(push) * size)
+
+
+def integrated(items: tuple[Primitive, ...], time: FloatArray, at: int) -> FloatArray:
+    """Displacements (N, 2) of tip and joint, that has no mass, released `at` a node, by an integrator."""
+    system = on_joint(3, BETA)
+    stiffness, damping = system.stiffness, BETA * system.stiffness + 0.3 * system.mass
+    inverse = np.linalg.inv(stiffness)
+    inside, at_tip = ([item for item in items if item.port == port] for port in ("joint", "tip"))
+
+    def force(x: float) -> float:
+        return sum(force_of(item, x, 0.0, np.zeros(0)) for item in inside)  # damping is in its speed
+
+    def held(x: float) -> FloatArray:
+        pull = (0.02 + inverse[at, 0] * force(x)) / inverse[at, at]
+        return inverse[:, at] * pull - inverse[:, 0] * force(x)
+
+    def derivative(t: float, y: FloatArray) -> FloatArray:
+        u, v, x = y[:3], y[3:6], y[6]
+        place = np.concatenate(([x], u))
+        push = -stiffness[0] @ place - damping[0, 1:] @ v - force(x)
+        speed = joint_speed(push, damping[0, 0] - 0.3 * LIGHT, x, items)
+        a = -(stiffness @ place)[1:] - damping[1:] @ np.concatenate(([speed], v))
+        a[2] -= sum(force_of(item, u[2], v[2], np.zeros(0)) for item in at_tip)
+        return np.concatenate((v, a, [speed]))
+
+    x = brentq(lambda x: held(x)[0] - x, 0.0, 3.0 * A if at else 0.03, xtol=1e-14)
+    begin = np.concatenate((held(x)[1:], np.zeros(3), [x]))
+    found = solve_ivp(derivative, (0.0, time[-1]), begin, t_eval=time, rtol=1e-6, atol=1e-9, max_step=2e-3)
+    return np.asarray(found.y[[2, 6]].T)
+
+
+@pytest.mark.parametrize(
+    ("name", "time", "at"),
+    [
+        *((n, TIME[:250], 3) for n in LAWS),
+        ("cubic", EARLY, 3),
+        ("play", EARLY, 3),
+        ("crack", EARLY, 0),
+        ("viscous", EARLY, 0),
+    ],
+)
+def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray, at: int) -> None:
+    """Released at the tip, or at the joint itself; what remembers is beside four modes, which are all."""
+    if any(states_of(item) for item in LAWS[name]):
+        true = values(let_go(BETA, *LAWS[name], time=time, row=np.eye(4)[at], modes=4, refinement=16), ROWS)
+    else:
+        true = integrated(LAWS[name], time, at)
+    effect, usual, fine = (
+        np.abs(values(let_go(BETA, *items, time=time, row=np.eye(4)[at], refinement=n), ROWS) - true).max(
+            axis=0
+        )
+        for items, n in (((), 1), (LAWS[name], 1), (LAWS[name], 8))
+    )
+    assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
+    assert fine[0] < 1e-3 * 0.02
+    assert np.all(usual < np.array([0.03, 0.08]) * effect + 1e-3 * np.array([0.02, A]))

@@ -12,15 +12,11 @@ from scipy.signal import lfilter
 
 from calibration.result.file import load_calibration, result_bytes, save_calibration
 from calibration.result.record import ParameterPrior
-from calibration.static.errors_in_variables import exact_posterior
-from calibration.static.experiments import published_measurements
-from calibration.static.posterior import stiffness_curve_of
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, ModelError
-from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
+from discrepancy.model_choice import ModelChoice, ModelKind
 from discrepancy.models.interface import Model, Response, Scales
 from discrepancy.parameters.calibration import calibrate_parameters
-from fe.reduction.model_cache import reduced_model
 from tests.discrepancy.core import kit
 
 FORCE = np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
@@ -311,26 +307,3 @@ def test_held_out_trials_take_no_part():
     assert found.mean("p1") == pytest.approx(1.1, abs=0.005)
     told = [(item.trials, item.after > 10.0) for item in found.channels]
     assert told == [("fitted", False), ("held out", True)]
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("wing")
-def test_the_published_load_test_gives_the_posterior_of_the_wings_own_calibration():
-    """Errors of load and displacement as one: with f = k(e) x, their variances add as S(e) / k^2.
-
-    That S grows with e is left out, which is worth 0.03 deviations.
-    """
-    pairs, model = published_measurements(), reduced_model()
-    curve = stiffness_curve_of(model.tip_stiffness, model.validity["young_modulus_factor"])
-    exact = exact_posterior(pairs, curve=curve)
-    stiffness = float(model.tip_stiffness(exact.mean))
-    noise = float(np.hypot(pairs.displacement_standard_deviation, pairs.load_standard_deviation / stiffness))
-    campaign = campaign_of(
-        pairs.displacement, force=pairs.load, noise=noise, output="load_point_displacement",
-        young_modulus_factor=(1.0, 0.05 / 1.96),
-    )  # fmt: skip
-    found = calibrate_parameters(campaign, choose_model(None), samples=20_000)
-    assert found.mean("young_modulus_factor") == pytest.approx(exact.mean, abs=6e-4)
-    deviation = found.standard_deviation("young_modulus_factor")
-    assert deviation == pytest.approx(exact.standard_deviation, rel=0.03)
-    assert found.kept_share("servo_mass") > 0.95

@@ -1,10 +1,8 @@
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from evidence.identification import least_squares
 from evidence.identification.errors import IdentificationError
 from evidence.identification.identifiability import analyse, profile
 from evidence.identification.least_squares import DesignFit, identify, minimise_local
@@ -45,15 +43,13 @@ def recovered(
     return identify(start, free, virtual_targets, tolerance=2e-4)
 
 
-def test_known_numbers_are_recovered(recovered, virtual_design, free):
+def test_known_numbers_are_recovered(recovered, virtual_design, free, virtual_targets):
+    """And a fit that begins with them stays there."""
     assert recovered.converged
     assert recovered.iterations[0].objective > 100.0 * recovered.iterations[-1].objective
     error = scaled(free, recovered.values) - scaled(free, values_of(virtual_design, free))
     assert np.abs(error).max() < 2e-3
     assert np.abs(scaled(free, recovered.start) - scaled(free, recovered.values)).max() > 0.04
-
-
-def test_the_solution_is_a_fixed_point(recovered, free, virtual_targets):
     again = identify(recovered.design, free, virtual_targets, tolerance=2e-4)
     assert again.converged
     assert len(again.iterations) == 1
@@ -61,13 +57,11 @@ def test_the_solution_is_a_fixed_point(recovered, free, virtual_targets):
     assert again.iterations[-1].objective == pytest.approx(recovered.iterations[-1].objective, abs=1e-6)
 
 
-def test_without_weight_the_prior_decides(virtual_model, some_parameters, virtual_targets):
+def test_bounds_and_the_radius_are_kept(virtual_model, some_parameters, virtual_targets):
+    """Of a fit whose data weigh nothing, which ends at the prior means, and of one that wants to go far."""
     loose = Weights(**dict.fromkeys(Weights.__dataclass_fields__, 1000000.0))
     found = minimise_local(virtual_model, some_parameters, virtual_targets, loose, 100.0)
     assert np.abs(scaled(some_parameters, found)).max() < 1e-6
-
-
-def test_bounds_and_the_radius_are_kept(virtual_model, some_parameters, virtual_targets):
     softer = replace(virtual_targets, strain=2.0 * virtual_targets.strain)
     found = minimise_local(virtual_model, some_parameters, softer, Weights(), 0.3)
     step = scaled(some_parameters, found) - scaled(some_parameters, virtual_model.values)
@@ -88,6 +82,7 @@ def test_a_start_outside_the_bounds_is_refused(virtual_design, some_parameters, 
 
 
 def test_the_analysis_tells_known_from_unknown(recovered, virtual_targets):
+    """The profile of a nearly linear number is a parabola."""
     analysis = analyse(recovered, virtual_targets, Weights())
     jacobian = analysis.singular_values[:, None] * analysis.directions
     covariance = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(FREE)))
@@ -98,38 +93,8 @@ def test_the_analysis_tells_known_from_unknown(recovered, virtual_targets):
     nothing = analyse(recovered, virtual_targets, blind)
     assert nothing.effective_count < 1e-6
     assert nothing.width == pytest.approx(np.ones(len(FREE)))
-
-
-def test_a_profile_of_a_nearly_linear_number_is_a_parabola(recovered, virtual_targets):
-    analysis = analyse(recovered, virtual_targets, Weights())
     found = profile(recovered, virtual_targets, Weights(), analysis, "net lift at 3g")
     assert found.rise.min() == pytest.approx(0.0, abs=1e-3)
     assert found.rise == pytest.approx(found.linear, rel=0.1, abs=0.05)
     with pytest.raises(IdentificationError, match="no free number 'lift'"):
         profile(recovered, virtual_targets, Weights(), analysis, "lift")
-
-
-def test_steps_that_are_refused_again_and_again_are_no_convergence(
-    monkeypatch, virtual_design, free, virtual_targets
-):
-    """The local model promises that farther is better, and the full model never keeps it."""
-    costs = iter([1.0] + [2.0] * 50)
-
-    def build(design: WingDesign, *_: object) -> SimpleNamespace:
-        return SimpleNamespace(design=design, cost=next(costs), values=values_of(design, free))
-
-    def residuals(model: SimpleNamespace, *_: object) -> tuple[np.ndarray, np.ndarray]:
-        return np.array([model.cost]), np.zeros((1, len(free)))
-
-    def push(model: SimpleNamespace, parameters: object, *rest: object) -> np.ndarray:
-        width = np.array([p.standard_deviation * p.stride for p in free])
-        return np.asarray(model.values + rest[-1] * width)
-
-    monkeypatch.setattr(least_squares, "build_local_model", build)
-    monkeypatch.setattr(least_squares, "objective", residuals)
-    monkeypatch.setattr(least_squares, "minimise_local", push)
-    fit = identify(virtual_design, free, virtual_targets)
-    assert not fit.converged
-    assert all(iteration.limited for iteration in fit.iterations)
-    assert len(fit.iterations) < 15  # it gives up
-    np.testing.assert_array_equal(fit.values, values_of(virtual_design, free))

@@ -11,10 +11,7 @@ from evidence.identification.comparison import _row
 from evidence.identification.design_file import HEADER, design_toml, rounded
 from evidence.identification.errors import IdentificationError
 from evidence.identification.parameters import (
-    CLUSTERS,
     fixed_parameters,
-    layout_of,
-    set_layout,
     values_of,
     wing_parameters,
     with_values,
@@ -45,25 +42,6 @@ def test_what_is_written_is_read_back(steps):
     wanted = np.clip(values + width * np.array(steps), lower, upper)
     found = values_of(with_values(DESIGN, PARAMETERS, wanted), PARAMETERS)
     assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
-
-
-def test_the_layout_is_two_rows_and_two_staggered_clusters():
-    content = {"planform": {"semi_span": 2.0}, "gauges": {"positions": [(0.0, 0.0)] * 24}}
-    layout = {
-        "row A first": 0.1, "row A pitch": 0.06, "row A gap": 0.2, "row A chord": 0.5,
-        "row A chord slope": -0.2,
-        "cluster 1 stagger": -0.04, "cluster 1 chord": 0.36, "cluster 1 chord slope": 0.7,
-        "cluster 2 stagger": 0.02, "cluster 2 chord": 0.15, "cluster 2 chord slope": -1.0,
-    }  # fmt: skip
-    set_layout(content, layout)
-    positions = np.array(content["gauges"]["positions"])
-    assert positions[7, 0] == pytest.approx(0.1 + 7 * 0.06)
-    assert positions[8, 0] == pytest.approx(0.1 + 8 * 0.06 + 0.2)
-    assert positions[:16, 1] == pytest.approx(0.5 - 0.2 * (positions[:16, 0] / 2.0 - 0.5))
-    for (start, beside), stagger in zip(CLUSTERS, (-0.04, 0.02), strict=True):
-        assert positions[start : start + 4, 0] == pytest.approx(positions[beside : beside + 4, 0] + stagger)
-    assert positions[20:, 1].mean() == pytest.approx(0.15)
-    assert layout_of(content) == pytest.approx(layout)
 
 
 def test_a_start_laid_out_otherwise_is_refused():

@@ -14,6 +14,7 @@ LIBRARY = Path("library") / "UAVconfig.json"
 
 
 def test_a_folder_with_both_repositories_is_read(published_folder):
+    """Slopes come from the fitted rows alone."""
     found = read_targets(published_folder)
     assert found.strain.shape == (5, 5, 24)
     fitted = {(LEVELS[i], LEVELS[j]) for i, j in np.argwhere(fitted_states())}
@@ -24,22 +25,15 @@ def test_a_folder_with_both_repositories_is_read(published_folder):
     assert found.frequency_at_one == pytest.approx([5.632, 28.5], rel=1e-6)
     assert found.strain_slope == pytest.approx(np.full(24, -0.85), abs=1e-9)
     assert set(found.sources) == {"UAVconfig.json", "massoptimizationresults.csv"}
-
-
-def test_slopes_come_from_the_fitted_rows_alone(published_folder):
     results = published_folder / RESULTS
-    before = read_targets(published_folder)
     lines = results.read_text().splitlines()
     for number in range(2, len(lines), 2):  # the held-out rows
         cells = lines[number].split(",")
         lines[number] = ",".join([*cells[:-2], str(1.05 * float(cells[-2])), cells[-1]])
     results.write_text("\n".join(lines) + "\n")
     after = read_targets(published_folder)
-    assert np.all(
-        after.frequency[~after.fitted_row, 0] == pytest.approx(1.05 * before.frequency[~before.fitted_row, 0])
-    )
-    assert after.frequency_slope.tolist() == before.frequency_slope.tolist()
-    assert after.all_frequency_slope.tolist() != before.all_frequency_slope.tolist()
+    assert after.frequency_slope.tolist() == found.frequency_slope.tolist()
+    assert after.all_frequency_slope.tolist() != found.all_frequency_slope.tolist()
 
 
 def test_the_published_folders(published_library):
@@ -72,14 +66,7 @@ def strains(content: dict[str, Any]) -> list[float]:
 @pytest.mark.parametrize(
     ("file", "change", "error", "sentence"),
     [
-        (RESULTS, lambda lines: lines.insert(0, lines.pop(0).replace("freq_2", "second")), FILE,
-         "no column 'freq_2'"),
-        (RESULTS, lambda lines: lines.insert(3, f"nan,{lines.pop(3).partition(',')[2]}"), DATA,
-         "line 4: column 'e_sample' holds nan"),
         (RESULTS, lambda lines: lines.__delitem__(slice(6, None)), DATA, "holds 5 rows; at least 10"),
-        (LIBRARY, lambda content: strains(content).append(np.nan), INPUT, "NaN is no number in JSON"),
-        (LIBRARY, lambda content: strains(content).pop(), INPUT,
-         r"\[20\]\[0\]\[3g\]\[mean\] must hold 24 finite"),
         (LIBRARY, lambda content: strains(content).insert(4, -strains(content).pop(4)), DATA,
          "must be positive"),
         (LIBRARY, lambda content: content["states"][0].pop(), DATA, "the levels of z1"),

@@ -56,7 +56,6 @@ def tiny(
     [
         (EACH, "growing_damage", 1.0),
         ({"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}}, "growing_damage", 1.0),
-        (EACH, "inspected_wing", 1.0),
         (EACH, "inspected_wing", 0.7),
     ],
 )

@@ -22,7 +22,7 @@ from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving
 from twin_master.fleet.report import WORST, fleet_page, serve_fleet, write_fleet_report
 from twin_master.fleet.shard import Engine
-from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
+from twin_master.fleet.watching import FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.folder import Watch
 from uav_twin import fly_fleet, learn_from_fleet, open_fleet
@@ -223,30 +223,6 @@ def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
     assert sorted(notes[-2:]) == ["north/wing-0 is watched again.", "north/wing-2 is watched again."]
 
 
-def test_a_topic_that_jumps_ahead_and_is_left_alone(broker, tmp_path):
-    publisher, notes, told = broker.client("publisher"), list[str](), list[tuple[str, int, int]]()
-    last = 2 * TURNS_AT_ONCE  # a single message that brings more turns than a file is read at once
-
-    def send() -> None:
-        if notes:
-            for turn in (0, *range(last, last + 20)):
-                publish(publisher, "wing-0", turn)
-            publisher.publish("wings/last", json.dumps({"turn": 0, "control": "2g"}), qos=1)
-            notes.clear()
-
-    def tell(asset: WatchedAsset, decision: Decision) -> None:
-        told.append((asset.name, decision["turn"], decision["lost_sensors"]))
-        fleet.asked = asset.name == "north/last"
-
-    planned = load_fleet(tmp_path / "fleet.toml")
-    fleet = FleetWatch(planned, tmp_path / "out", tell, notes.append, turns=last + 1)
-    fleet.run(send)
-    lost = [0, *[24] * (last - 1), 0]
-    assert told == [*(("north/wing-0", turn, lost[turn]) for turn in range(last + 1)), ("north/last", 0, 24)]
-    topics = fleet._sources[0]._topics  # type: ignore[union-attr]
-    assert [len(topic.came) for topic in topics.values()] == [0, 0]  # nineteen came too late
-
-
 def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):
     """Also one that was watched before; and what was decided of it and never published is."""
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
@@ -281,8 +257,11 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
     assert fleet.failures == {}
     (tmp_path / "out" / "north" / "two" / "published").write_text("?")
     client.publish("wings/one", "no observation", qos=1).wait_for_publish(20)
-    again = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", lambda *_: None, notes.append)
+    planned = load_fleet(tmp_path / "fleet.toml")
+    again = FleetWatch(planned, tmp_path / "out", lambda *_: None, notes.append, turns=1)
     again.run(end)
+    topics = again._sources[0]._topics  # type: ignore[union-attr]
+    assert [len(topic.came) for topic in topics.values()] == [0, 0]  # who has all turns is left alone
     wait_until(lambda: states()[-1] == "ended")
     client.disconnect()
     silent = [said for said in told if said[0] == "north/two"]

@@ -41,15 +41,14 @@ GAINS = SETTINGS.gauge_gain * np.array([-2.5, -1.0, 1.0, 2.5])
 DRAWS = np.array([1.0, 2.0])
 
 
-def small(gauges: int = 3, width: float = 0.0) -> tuple[GraphicalModel, GaussianSensorModel]:
+def small(gauges: int = 3) -> tuple[GraphicalModel, GaussianSensorModel]:
     model = GraphicalModel.from_tables({"z": [0, 1, 2]}, {"u": {"z": worsening_table(3, 0.2)}})
     value = np.random.default_rng(1).normal(10.0, 3.0, size=(2, 3, 1, gauges))
-    interval = width * np.random.default_rng(2).normal(size=(3, 1, gauges, 1)) if width else None
-    return model, GaussianSensorModel(value, 1.0, interval=interval)
+    return model, GaussianSensorModel(value, 1.0)
 
 
-def watchful(gauges: int = 3, given: Noticing = SETTINGS, width: float = 0.0) -> WatchfulEstimator:
-    model, sensors = small(gauges, width)
+def watchful(gauges: int = 3, given: Noticing = SETTINGS) -> WatchfulEstimator:
+    model, sensors = small(gauges)
     return WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, given)
 
 
@@ -62,16 +61,14 @@ def run(estimator: WatchfulEstimator, seen: Float) -> list[Estimate]:
     return estimates
 
 
-def drawn(random: np.random.Generator, turns: int, gauges: int = 3, width: float = 0.0) -> Float:
+def drawn(random: np.random.Generator, turns: int, gauges: int = 3) -> Float:
     """Return observations of the model itself, with noise scales drawn from their prior."""
-    model, sensors = small(gauges, width)
+    model, sensors = small(gauges)
     half = 0.5 * SETTINGS.noise_degrees
     scale = np.sqrt(half / random.gamma(half, size=gauges))
     draw, state, rows = random.integers(2), 0, []
     for _ in range(turns):
         rows.append(sensors.value_per_draw[draw, state, 0] + scale * random.normal(size=gauges))
-        if width:
-            rows[-1] += sensors.interval[state, 0] @ random.normal(size=1)
         state = random.choice(3, p=model.transition.matrix[0, state])
     return np.array(rows)
 
@@ -81,7 +78,8 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     inner = ExactFilter(model, sensors)
     seen = drawn(np.random.default_rng(3), 12)
     seen[6:, 1] *= 1.4
-    watched = run(WatchfulEstimator(inner, sensors, DRAWS), seen)
+    words = Words(names=("root", "spar", "tip"), command="")  # of an asset where none looks for causes
+    watched = run(WatchfulEstimator(inner, sensors, DRAWS, words=words), seen)
     before: Carried | None = None
     for turn, row in enumerate(seen):
         plain, found = inner.turn(before, row, 0, turn), watched[turn]
@@ -99,7 +97,12 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
         np.testing.assert_allclose(mixed / mixed.sum(), found.filtered, atol=2.0 * told + 1e-6)
         if turn < 6:
             np.testing.assert_allclose(found.filtered, plain.filtered, atol=0.03)
-    assert probability["gauge 2 off"] > 0.9
+    assert probability["gauge 2 (spar) off"] > 0.9
+    assert found.suspicion.gauge_off > 0.9
+    (alarm,) = (notice for one in watched for notice in one.notices if notice.kind == "alarm")
+    assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
+    assert f": gauge 2 (spar) shows too much, since about turn {alarm.since}" in alarm.sentence
+    assert alarm.sentence.endswith("alarm from 100)")
     assert np.abs(found.filtered - plain.filtered).max() > 0.1
     carried = [estimate.carried for estimate in watched]
     smoothed = watchful().smoothed(carried)
@@ -108,6 +111,12 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     right = carried[-1].arrays["notice/right"]
     assert np.all(smoothed >= right * inner.smoothed(carried) - 1e-12)
     assert watchful().smoothed([]).shape == (0, 3)
+    # A model that takes the place of another begins without suspicion.
+    taught = GaussianSensorModel(sensors.value_per_draw * [[[[1.0, 1.4, 1.0]]]], 1.0)
+    other = WatchfulEstimator(ExactFilter(model, taught), taught, DRAWS)
+    after = other.turn(carried[-1], seen[-1], 0, 12)
+    assert max(after.suspicion.none_of_these, after.suspicion.gauge_off) < 0.05
+    assert not after.notices
 
 
 def test_shares_of_hypotheses_switch_as_their_chain_says():
@@ -207,19 +216,6 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
         assert mean == pytest.approx(np.exp(getattr(today.suspicion, name)), rel=1e-4)
 
 
-@pytest.mark.parametrize("width", [0.0, 10.0])
-def test_false_alarms_are_rarer_than_the_threshold_says(width):
-    """The noise is what the model says, and its sums of squares are expected ones: what that costs."""
-    estimator, random = watchful(width=width), np.random.default_rng(5)
-    largest = []
-    for _ in range(120):
-        turns = [estimate.suspicion for estimate in run(estimator, drawn(random, 15, width=width))]
-        largest.append([(s.log_evidence_any_gauge, s.log_evidence_none) for s in turns if s is not None])
-    values = np.exp(np.array(largest))  # (missions, turns, 2)
-    assert np.all(values.mean(axis=0) < 1.5)
-    assert np.mean(values.max(axis=1) >= 20.0) <= 0.05  # Ville: in the mean
-
-
 def twins() -> dict[str, Twin]:
     """Return twins of two gauges that do not learn, learn, and give notice beside either."""
     model, sensors = small(2)
@@ -235,7 +231,7 @@ def twins() -> dict[str, Twin]:
 EXTREME = st.floats(allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308, np.nan])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(rows=st.lists(st.tuples(EXTREME, EXTREME), min_size=1, max_size=6), late=st.integers(0, 6))
 def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, late):
     ordinary = drawn(np.random.default_rng(2), 4, 2)
@@ -276,19 +272,6 @@ def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():
     assert "Turn 5: gauge 2 shows 1e+09" in revised.notices[0].sentence
 
 
-def test_a_model_that_takes_the_place_of_another_begins_without_suspicion():
-    model, sensors = small()
-    taught = GaussianSensorModel(1.2 * sensors.value_per_draw, 1.0)
-    other = WatchfulEstimator(ExactFilter(model, taught), taught, DRAWS)
-    seen = 1.2 * drawn(np.random.default_rng(7), 12)
-    before = run(watchful(), seen)
-    assert before[-1].suspicion is not None
-    assert before[-1].suspicion.log_evidence_none > np.log(SETTINGS.threshold)
-    after = other.turn(before[-1].carried, seen[-1], 0, 12)
-    assert max(after.suspicion.none_of_these, after.suspicion.gauge_off) < 0.05
-    assert not after.notices
-
-
 def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
     monkeypatch.setattr("twin_master.learning.monitor._LARGEST", 71)
     with pytest.raises(InvalidModelError, match=r"3 states and 2 draws for each of 12 faults .* leave out"):
@@ -302,36 +285,6 @@ def at_levels(name: str, between: bool) -> Knowledge:
 @pytest.fixture(scope="module")
 def wing() -> Knowledge:
     return prepare_twin("paper_level_turns")
-
-
-PLACES = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
-SEARCH = "; to find the cause: uav-twin discrepancy run --from-run DIR"
-
-
-@pytest.mark.parametrize(
-    ("gauge", "gain", "begin", "words", "shows", "search"),
-    [
-        (5, 0.2, 0, None, "gauge 5 shows too much", SEARCH),
-        (17, -0.2, 0, PLACES, "gauge 17 (place 17) shows too little", ""),  # where none looks for causes
-        (3, 0.2, 15, None, "gauge 3 shows too much", SEARCH),
-    ],
-)
-def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, words, shows, search):
-    estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values, words=words)
-    random, before, estimates = np.random.default_rng(1), None, []
-    for turn in range(begin + 25):
-        shown = wing.sensor_model.mean[0, 1].copy()
-        shown[gauge - 1] *= 1.0 + gain * (turn >= begin)
-        estimates.append(estimator.turn(before, shown + 150e-6 * random.normal(size=24), 1, turn))
-        before = estimates[-1].carried
-    (alarm,) = (notice for one in estimates for notice in one.notices if notice.kind == "alarm")
-    assert alarm.sensors == (gauge,)
-    assert f"{shows}, " in alarm.sentence
-    turn = f" --from-turn {alarm.since}" if alarm.since and search else ""
-    assert alarm.sentence.endswith(f"alarm from 100){search}{turn}")
-    assert abs(alarm.since - begin) <= 6
-    assert not any(estimate.notices for estimate in estimates[:begin])
-    assert estimates[-1].suspicion.gauge_off > 0.5
 
 
 @pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 10)])
@@ -393,6 +346,9 @@ def test_belief_and_decision_follow_what_holds_now(between):
         ahead = found.prediction
         assert np.all(ahead.control_probability[:, 0] >= none - 1e-12)
         np.testing.assert_allclose(ahead.joint.sum(axis=1), ahead.control_probability, atol=1e-12)
+    alarms = [notice for found in course[True] for notice in found.notices if notice.kind == "alarm"]
+    assert [alarm.sensors[0] for alarm in alarms] == [17, 17]
+    assert "least gauges 17 and " in alarms[1].sentence  # of those that are off it was, too
     sentences = [n.sentence for found in course[True] for n in found.notices if n.kind == "hypothesis"]
     assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
     assert "the model explains the gauges again (probability" in sentences[1]
@@ -406,7 +362,12 @@ def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_na
     assert named.scenario.control_names[named.safest] == "3g"
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
-    for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]:
-        turn = twin.turn(row)
+    turns = [twin.turn(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]
+    alarm = next(notice for turn in turns for notice in turn.notices if notice.kind == "alarm")
+    assert ", from the start " in alarm.sentence
+    assert alarm.sentence.endswith(
+        "alarm from 100); to find the cause: uav-twin discrepancy run --from-run DIR"
+    )
+    turn = turns[-1]
     assert turn.suspicion.none_of_these > 0.5
     np.testing.assert_allclose(turn.decision_probability, [1.0])  # the policy decides where nothing is safest

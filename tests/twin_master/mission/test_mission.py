@@ -1,20 +1,30 @@
-"""The mission loop, its truth and its journal: timing, faults, resuming at every turn, what is refused."""
+"""The mission loop, its truth and its journal: timing, faults, resuming at every turn, what is refused.
+
+A run whose FMU hangs or ends stops with one sentence, and goes on when the cause is gone.
+"""
 
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import xarray as xr
 
+from fmu_asset.errors import FmuTimeoutError
 from tests.command_line import said
 from tests.kept import ROOT
-from tests.twin_master.runs import flight_of, journal, of_library, table_of, text_of, written
+from tests.refusals import Inputs
+from tests.twin_master.runs import check_same, flight_of, journal, of_library, table_of, text_of, written
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.fleet.plan import ensemble
+from twin_master.fleet.report import write_fleet_report
+from twin_master.fleet.store import ENDED
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
 from twin_master.mission.loop import fly, kept_in, taken_up
@@ -25,6 +35,8 @@ from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import PURPOSES, generator
 from twin_master.store.writing import open_run
+from uav_twin import ScenarioEnvironment, fly_fleet, open_fleet, resume
+from uav_twin import fly as new_run
 
 Known = tuple[Knowledge, StrainLibrarySource]
 ARRAYS = (
@@ -53,7 +65,7 @@ def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
     whole = part(known, tmp_path)
     assert len(journal(tmp_path)) == 50
     content = (tmp_path / JOURNAL_NAME).read_bytes()
-    for turns in (1, 17, 50):
+    for turns in (17, 50):
         kept = content.splitlines(keepends=True)[: turns + 1]
         (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
         rest = part(known, tmp_path)
@@ -192,20 +204,15 @@ def known(request: pytest.FixtureRequest, library_file: Path) -> Known:
     return of_library("level_turns", library_file, mission=mission)
 
 
-def test_a_line_cut_off_anywhere_is_flown_again(known, tmp_path):
-    part(known, tmp_path)
-    whole = (tmp_path / JOURNAL_NAME).read_bytes()
-    ends = [n + 1 for n, byte in enumerate(whole) if byte == ord("\n")]
-    for cut in [0, 1, ends[0] - 1, ends[0], ends[0] + 70, ends[1] - 1, ends[1], ends[3] + 1, ends[4] - 1]:
-        (tmp_path / JOURNAL_NAME).write_bytes(whole[:cut])
-        assert part(known, tmp_path).resumed_at == sum(end <= cut for end in ends[1:])
-        assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
-
-
-def test_a_changed_or_foreign_journal_is_refused(known, tmp_path):
+def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one_refused(known, tmp_path):
     part(known, tmp_path)
     path = tmp_path / JOURNAL_NAME
     whole = path.read_bytes()
+    ends = [number + 1 for number, byte in enumerate(whole) if byte == ord("\n")]
+    for cut in (0, 1, ends[0] - 1, ends[1] - 1, ends[3] + 1):  # a kill leaves it so: flown again
+        path.write_bytes(whole[:cut])
+        assert part(known, tmp_path).resumed_at == sum(end <= cut for end in ends[1:])
+        assert path.read_bytes() == whole
     with pytest.raises(NotResumableError, match="another configuration"):
         part(known, tmp_path, "other")
     lines = whole.splitlines(keepends=True)
@@ -247,3 +254,89 @@ def test_large_states_are_kept_less_often_and_their_turns_flown_again(known, tmp
     assert last < 11
     assert part(known, tmp_path, kind=Heavy).resumed_at == last + 1
     assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
+
+
+# ---------------------------------------------------------------- an FMU that hangs or ends
+
+INPUTS = Inputs(__file__)
+BINDING = INPUTS.text("hostile_binding.toml")
+
+
+def hostile(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = BINDING) -> Any:
+    written(folder, binding, name="binding.toml")
+    return load_scenario(
+        written(folder, INPUTS.text("hostile.toml"), ("FMU", str(fmu)), *changes, name="scenario.toml")
+    )
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch):
+    fmu, flag = foreign_fmu("hostile2", "HANG", "STATELESS", "AFTER=20"), tmp_path / "flag"
+    monkeypatch.setenv("HOSTILE_FLAG", str(flag))
+    loaded = hostile(tmp_path, fmu, binding=f"{BINDING}limits = {{ step_time = 1.0 }}\n")
+    whole = new_run(loaded, tmp_path / "whole").folder
+    flag.touch()
+    sentence = r"step 20 from t = 20 s: .*longer than 1 s for the step"
+    with pytest.raises(FmuTimeoutError, match=sentence):
+        new_run(loaded, tmp_path / "part")
+    with pytest.raises(FmuTimeoutError, match=sentence):
+        resume(tmp_path / "part")
+    flag.unlink()
+    resume(tmp_path / "part")
+    check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "csv/observed.csv")
+
+
+@pytest.mark.usefixtures("no_report")
+def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
+    foreign_fmu, tmp_path, monkeypatch
+):
+    """In a run, a fleet and an environment."""
+    fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
+    monkeypatch.setenv("HOSTILE_FLAG", str(flag))
+    loaded = hostile(tmp_path, fmu)
+    whole = new_run(loaded, tmp_path / "whole")
+    assert whole.notices == ()
+    flag.touch()
+    part = new_run(loaded, tmp_path / "part")
+    (said,) = part.notices
+    assert said.startswith("The asset ended the mission after 20 of 30 turns: ")
+    assert "The FMU asked to end the simulation in the step from t = 20 s" in said
+    with xr.open_datatree(whole.folder / "run.nc") as long, xr.open_datatree(part.folder / "run.nc") as short:
+        for name in ("observed/y", "truth/y", "truth/state", "truth/sensor_status", "filtered/belief"):
+            if name in long:
+                np.testing.assert_array_equal(short[name].values, long[name].values[:20])
+        assert short["truth/sensor_status"].shape == (20, 1)
+    assert resume(part.folder).notices == part.notices
+    fleet = fly_fleet(ensemble(str(tmp_path / "scenario.toml"), range(4, 5)), tmp_path / "fleet")
+    assert fleet.failures == {}
+    assert [*fleet.ended.values()] == [said.replace(f"{part.folder}/", "")]
+    (group,) = open_fleet(fleet.folder).values()
+    assert group["status"].values.tolist() == [ENDED]
+    assert (group["control_index"].values >= 0).sum() == 20
+    assert "1 of 1 assets ended their simulation" in write_fleet_report(fleet.folder).read_text()
+    with ScenarioEnvironment(loaded) as environment:
+        environment.reset(seed=4)
+        seen = [environment.step(0) for _ in range(20)]
+        assert [terminated for _, _, terminated, _, _ in seen] == [False] * 19 + [True]
+        assert "asked to end" in seen[-1][4]["ended"]
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            environment.step(0)
+
+
+@pytest.mark.usefixtures("no_report")
+def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
+    """Its outputs grow with every step, so that only the way through twin, store and names is looked at."""
+    fmu = foreign_fmu.changed("array3", "names", ('name="calls"', 'name="state/calls"'))
+    changes = ("steps = 30", "steps = 3"), *[("standard_deviation = 0.1", "standard_deviation = 0.05")] * 2
+    binding = INPUTS.text("array_binding.toml")
+    two, three = (
+        hostile(tmp_path, fmu, *changes, ("count = 1", f"count = {count}"), binding=binding)
+        for count in (2, 3)
+    )
+    truth = open_run(new_run(two, tmp_path / "run").folder)["truth"]
+    assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
+    assert (truth["y[1]"].attrs["units"], truth["y"].attrs["units"]) == ("mm", "m")
+    np.testing.assert_allclose(truth["y"].values[:, 1], 1e-3 * truth["y[2]"].values, rtol=1e-6)
+    with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
+        new_run(three, tmp_path / "other")
+    assert not (tmp_path / "other").exists()

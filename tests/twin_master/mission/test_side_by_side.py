@@ -90,41 +90,43 @@ def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
     return StatelessAsset(step)
 
 
-@pytest.mark.parametrize("driven", [lambda asset: asset, Remembering])
-def test_an_asset_that_fails_does_not_touch_the_others(driven, library_file):
+@pytest.mark.parametrize(
+    ("driven", "error"),
+    [
+        (lambda asset: asset, MissionInputError("too soft")),
+        (Remembering, MissionInputError("too soft")),
+        (Remembering, FmuEndedError("It is over.", time=1.0)),
+    ],
+)
+def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_the_others(
+    driven, error, library_file
+):
     knowledge, asset = known("growing_damage", library_file)
-    truths = [knowledge.truth(seed) for seed in range(6)]
+    truths, soft = [knowledge.truth(seed) for seed in range(6)], until_soft(asset, error)
     whole = fly_side_by_side(knowledge, truths, [asset] * 6)
     assert same(whole, fly_side_by_side(knowledge, truths, [driven(asset) for _ in truths]))
-    soft = until_soft(asset, MissionInputError("too soft"))
     found = fly_side_by_side(knowledge, truths, [driven(soft) for _ in truths])
+    assert same(found, fly_one_by_one(knowledge, truths, lambda *_: driven(soft)))
     softened = whole.state[:, :, 0] >= 0.4 - 1e-9
-    assert [text != "" for text in found.failure] == softened.any(axis=1).tolist()
-    assert 0 < sum(text != "" for text in found.failure) < 6
-    for twin in range(6):
-        end = int(np.argmax(softened[twin])) if softened[twin].any() else 35
+    flown = np.where(softened.any(axis=1), softened.argmax(axis=1), 35)
+    assert 0 < np.sum(flown < 35) < 6
+    ends, over = (
+        isinstance(error, FmuEndedError),
+        "The asset ended the mission after {} of 35 turns: It is over.",
+    )
+    assert found.ended == [over.format(n) if ends and n < 35 else "" for n in flown]
+    assert [text != "" for text in found.failure] == [not ends and n < 35 for n in flown]
+    for twin, end in enumerate(flown):
         assert np.array_equal(found.filtered[twin, :end], whole.filtered[twin, :end])
         assert np.isnan(found.filtered[twin, end:]).all()
         assert (found.control_index[twin, end:] == -1).all()
-
-
-def test_an_asset_that_ends_keeps_what_it_has_flown(library_file):
-    knowledge, asset = known("growing_damage", library_file)
-    truths = [knowledge.truth(seed) for seed in range(3)]
-    assets = [Remembering(until_soft(asset, FmuEndedError("It asked to end.", time=1.0))) for _ in truths]
-    found = fly_side_by_side(knowledge, truths, assets)
-    assert same(found, fly_one_by_one(knowledge, truths, lambda twin, _: assets[twin]))
-    flown = (found.control_index >= 0).sum(axis=1)
-    ended = [f"The asset ended the mission after {n} of 35 turns: It asked to end." for n in flown]
-    assert found.ended == [text if n < 35 else "" for text, n in zip(ended, flown, strict=True)]
-    assert found.failure == [""] * 3
-    assert np.sum(flown < 35) > 0
-    kept = outcomes_of(knowledge, found, [Member(row, "", row, {}) for row in range(3)])
-    assert kept["status"].tolist() == [ENDED if text else FLOWN for text in found.ended]
+    kept = outcomes_of(knowledge, found, [Member(row, "", row, {}) for row in range(6)])
     for row, turns in enumerate(flown):
-        np.testing.assert_array_equal(kept["belief"][row], found.filtered[row, turns - 1].astype("f4"))
-        inside = in_credible_set(knowledge.model, found.filtered[row, :turns], found.state[row, :turns])
-        assert kept["credible"][row] == np.float32(inside.mean())
+        if ends or turns == 35:
+            assert kept["status"][row] == (ENDED if found.ended[row] else FLOWN)
+            np.testing.assert_array_equal(kept["belief"][row], found.filtered[row, turns - 1].astype("f4"))
+            inside = in_credible_set(knowledge.model, found.filtered[row, :turns], found.state[row, :turns])
+            assert kept["credible"][row] == np.float32(inside.mean())
 
 
 def test_an_impossible_observation_ends_one_flight_only(library_file):

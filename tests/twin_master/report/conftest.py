@@ -1,13 +1,75 @@
-"""A run as its report reads it."""
+"""Runs of the wing of a strain library as their report reads them, with changes; what a figure shows."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from tests.twin_master.report.drawn import flown, stored
+from tests.twin_master.runs import changed_scenario
 from twin_master.report import page as report
-from twin_master.report.reading import Run
+from twin_master.report.reading import Run, read_run
+from twin_master.scenario.schema import Scenario
+from uav_twin import fly
+
+
+def flown(library: Path, folder: Path, **mission: int) -> Run:
+    """Fly the paper's mission, of another length, with the wing of a strain library, and read the run."""
+    loaded, given = changed_scenario("paper_level_turns", {"mission": mission}), {"strain_library": library}
+    return read_run(fly(loaded, folder, given, report=False).folder)
+
+
+def stored(run: Run, place: Path) -> Path:
+    """Write what a report reads of a run into a folder."""
+    place.mkdir(parents=True)
+    groups = {name: run.tree[name].to_dataset().drop_encoding() for name in run.tree.children}
+    attributes = {name: run.tree.attrs[name] for name in ("seed", "scenario")}
+    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
+    tree.to_netcdf(place / "run.nc", engine="h5netcdf")
+    for name, content in (("config", run.config), ("summary", run.summary)):
+        (place / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
+    return place
+
+
+def altered(run: Run, **values: np.ndarray | None) -> Run:
+    """A run with other values of variables, GROUP__VARIABLE; None takes a group or a variable away."""
+    groups = {name: run.tree[name].to_dataset().copy() for name in run.tree.children}
+    for name, content in values.items():
+        group, _, variable = name.partition("__")
+        if content is None and not variable:
+            del groups[group]
+        elif content is None:
+            groups[group] = groups[group].drop_vars(variable)
+        else:
+            groups[group][variable] = (groups[group][variable].dims, content)
+    return replace(run, tree=xr.DataTree.from_dict({"/": xr.Dataset(attrs=run.tree.attrs), **groups}))
+
+
+def rescripted(run: Run, **tables: dict[str, Any]) -> Run:
+    """A run whose scenario has other values in its tables."""
+    scenario = run.scenario.to_dict()
+    for table, changes in tables.items():
+        if isinstance(scenario[table], dict):
+            scenario[table] |= changes
+        else:
+            scenario[table] = [entry | changes for entry in scenario[table]]
+    config = {**run.config, "scenario": scenario}
+    return replace(run, scenario=Scenario.model_validate(scenario), config=config)
+
+
+def panel(figure: Figure, title: str) -> Axes:
+    (found,) = [axes for axes in figure.axes if title in axes.get_title(loc="left")]
+    return found
+
+
+def line(axes: Axes, label: str) -> np.ndarray:
+    (found,) = [item for item in axes.get_lines() if item.get_label() == label]
+    return np.asarray(found.get_xydata())
 
 
 @pytest.fixture(scope="session")

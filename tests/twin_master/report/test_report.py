@@ -3,6 +3,7 @@
 import html
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,8 @@ from calibration.result.file import run_record
 from reporting.page import ReportFigure
 from reporting.words import number
 from tests.refusals import Inputs, refused
-from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
+from tests.twin_master.report.conftest import altered, flown, line, panel, rescripted, stored
 from twin_master.errors import RunFolderError
-from twin_master.network.planner import BeliefPolicy
 from twin_master.report import page as report
 from twin_master.report.mission import default_now, mission_figure
 from twin_master.report.model import predictive_check, true_value
@@ -164,17 +164,6 @@ def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(run
         assert word in text
 
 
-def test_captions_tell_the_decision_and_what_it_rests_on(run, folder, library_file, tmp_path):
-    asked = run["filtered/decision_probability"][18, 1]
-    sentence = "At the end of turn 18 the twin decided on 3g for the next one: the policy asks for it with "
-    caption = next(report.report_figures(folder, 18)).caption
-    assert f"{sentence}probability {asked:.2f} in the state as just observed." in caption
-    on_belief = BeliefPolicy(run["policy/action_value"].T, np.arange(2))  # in the place of the scenario's
-    flown(library_file, tmp_path / "run", on_belief)
-    told = next(report.report_figures(tmp_path / "run", 18)).caption
-    assert "in the state predicted for that turn." in told
-
-
 def test_the_present_is_chosen_before_the_first_change_of_control(run):
     def now(control: np.ndarray) -> int:
         return default_now(altered(run, observed__control_index=control))
@@ -188,7 +177,7 @@ def test_the_present_is_chosen_before_the_first_change_of_control(run):
 
 
 @pytest.mark.usefixtures("no_drawing")
-@pytest.mark.parametrize(("steps", "horizon"), [(1, 10), (12, 10), (2, 3), (3, 1)])
+@pytest.mark.parametrize(("steps", "horizon"), [(1, 10), (2, 3), (3, 1)])
 def test_short_missions(run, tmp_path, steps, horizon):
     part = {"step": slice(steps), "horizon": slice(horizon), "sensor": slice(5)}
     tree = run.tree.isel(part, missing_dims="ignore")
@@ -242,8 +231,8 @@ def test_a_calibration_file_shows_its_wing(run, make_calibration):
 
 
 @pytest.mark.parametrize(("file", "content", "sentence"), INPUTS.table("damaged.toml")["rows"])
-def test_a_damaged_run_gives_one_sentence(run, tmp_path, file, content, sentence):
-    place = stored(run, tmp_path / "run")
+def test_a_damaged_run_gives_one_sentence(folder, tmp_path, file, content, sentence):
+    place = shutil.copytree(folder, tmp_path / "run", ignore=shutil.ignore_patterns("report.html", "figures"))
     (place / file).unlink()
     if content:
         (place / file).write_text(content, encoding="utf-8")
@@ -254,7 +243,7 @@ def test_a_damaged_run_gives_one_sentence(run, tmp_path, file, content, sentence
 
 @pytest.mark.usefixtures("no_drawing")
 def test_another_layout_gives_one_sentence(run, tmp_path):
-    for missing in ("filtered", "filtered__probability", "observed", "policy__action_value"):
+    for missing in ("filtered__probability", "observed", "policy__action_value"):
         with pytest.raises(RunFolderError, match=f"layout of a run .*{missing.replace('__', '/')}"):
             report.write_report(stored(altered(run, **{missing: None}), tmp_path / missing))
         assert not (tmp_path / missing / "figures").exists()

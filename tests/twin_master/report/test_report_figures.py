@@ -9,8 +9,7 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
-from reporting.figures import to_svg
-from tests.twin_master.report.drawn import altered, line, panel, rescripted, stored
+from tests.twin_master.report.conftest import altered, line, panel, rescripted, stored
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
 from twin_master.report.mission import (
@@ -196,7 +195,13 @@ def test_calibration_shows_draws_posterior_and_measurements(run):
 
 
 def test_the_wing_is_coloured_by_belief_and_its_gauges_by_reading_and_residual(run):
-    planform = planform_of(load_design(), run.scenario)
+    design = load_design()
+    planform, chords = planform_of(design, run.scenario), design.planform
+    above = planform.outline[:, 1]  # on the straight chord line every place has the height zero
+    assert above[0] - above[3] == pytest.approx(chords.root_chord)
+    assert above[1] - above[2] == pytest.approx(chords.tip_chord)
+    assert chords.straight_chord_line * above[2] == pytest.approx((chords.straight_chord_line - 1) * above[1])
+    assert_allclose(planform.gauges[:, 0], [span for span, _ in design.gauges.positions])
     observed = run.observed.copy()
     observed[-1, 4] = np.nan
     changed = altered(run, observed__strain=observed)
@@ -220,7 +225,6 @@ def test_nothing_is_drawn_outside_the_figure(run, tmp_path):
     names = []
     for drawn in report.report_figures(place, 18):
         names.append(drawn.name)
-        to_svg(drawn.figure)
         tight = drawn.figure.get_tightbbox()
         width, height = drawn.figure.get_size_inches()
         assert tight.x0 >= -0.01, drawn.name

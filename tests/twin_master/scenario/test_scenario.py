@@ -138,7 +138,7 @@ class Bellows(AssetSection):
     units: ClassVar = {}
 
     def source(self, scenario: Scenario) -> Any:
-        return BellowsSource(scenario, self)
+        return BellowsSource(scenario)
 
 
 class BellowsSource(AssetSource):
@@ -146,18 +146,14 @@ class BellowsSource(AssetSource):
 
     label = "bellows"
 
-    def __init__(self, scenario: Scenario, section: Bellows) -> None:
-        super().__init__(scenario)
-        self.section, self.count = section, scenario.observation.count
-
     def observation_table(self, draws: Any, model: Any) -> Any:
         loads = np.array([control.values["load_factor"] for control in self._scenario.control])
         left = 1.0 - model.states.coordinates.mean(axis=1)
-        table = loads / (self.section.stiffness * draws.values[:, None, None] * left[None, :, None])
-        return np.repeat(table[..., None], self.count, axis=-1)
+        table = loads / (self._scenario.asset.stiffness * draws.values[:, None, None] * left[None, :, None])
+        return np.repeat(table[..., None], 24, axis=-1)
 
     def open(self) -> Asset:
-        return StatelessAsset(lambda control, health: AssetReading(np.zeros(self.count)))
+        return StatelessAsset(lambda control, health: AssetReading(np.zeros(24)))
 
 
 def test_a_kind_of_one_s_own_is_one_class(tmp_path):

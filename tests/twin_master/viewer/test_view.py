@@ -29,10 +29,9 @@ from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
-from twin_master.report.structure import design_of, planform_of
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import LATEST, Belief, Flight, Request, Teller
-from uav_twin import fly, load_design, load_scenario
+from uav_twin import fly, load_scenario
 
 TURNS = 50
 
@@ -186,18 +185,6 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     assert answer["ahead"]["reward"][0][2] is None  # no error reward of a turn to come
     with pytest.raises(ValueError, match=r"for Request"):
         Request.model_validate_json(json.dumps(asked().__dict__ | {"turn": 1.5}))
-
-
-def test_the_wing_stands_in_its_place(run):
-    design = load_design()
-    planform = planform_of(design_of(run), Flight(run).scenario)
-    chords = planform.outline[:, 1]
-    plan = design.planform
-    assert chords[0] - chords[3] == pytest.approx(plan.root_chord)
-    assert chords[1] - chords[2] == pytest.approx(plan.tip_chord)
-    np.testing.assert_allclose(planform.gauges[:, 0], [span for span, _ in design.gauges.positions])
-    # On the straight chord line every place has the height zero.
-    assert plan.straight_chord_line * chords[2] == pytest.approx((plan.straight_chord_line - 1) * chords[1])
 
 
 @contextmanager

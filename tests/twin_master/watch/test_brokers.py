@@ -193,14 +193,16 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
 
     assert watched(watch, 3, 0, 1, 2).received == 3
     assert watched(watch, 4, 3) == Counts(received=4)  # the third does not come again
+    assert watched(watch, 5, 5).missing == 1  # the end is asked for within the gap before it: it comes again
+    assert watched(watch, 7, 6) == Counts(received=6, missing=1)
     heard = list[Told]()
     publisher.on_message = lambda _client, _data, one: heard.append(json.loads(one.payload))
     publisher.subscribe([(DECISION, 1), (f"{TOPIC}/heartbeat", 1)])
     (watch.folder / "published").write_text("0" * 20)
-    watched(watch, 4)  # nothing more is wanted, and what was not published is
-    wait_until(lambda: len([one for one in heard if "control" in one]) >= 4)
-    assert {one["turn"] for one in heard if one.get("told_again")} == {0, 1, 2, 3}
-    feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 4))
+    watched(watch, 7)  # nothing more is wanted, and what was not published is
+    wait_until(lambda: len([one for one in heard if "control" in one]) >= 7)
+    assert {one["turn"] for one in heard if one.get("told_again")} == {*range(7)}
+    feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 7))
     with pytest.raises(ZeroDivisionError), closing(feed):
         watch.run(feed, lambda decision: decision["turn"] // 0)
     wait_until(lambda: heard[-1].get("state") == "lost")

@@ -148,9 +148,14 @@ def test_a_writer_that_does_not_wait_for_its_reader(begun_log, way):
     assert len(list(path.parent.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
 
 
-def test_a_copy_in_the_place_of_a_log_is_read_on_and_columns_of_a_new_file_are_read_again(begun_log):
+def test_half_rows_are_waited_for_a_copy_is_read_on_and_columns_of_a_new_file_are_read_again(begun_log):
     """The copy as rsync makes it, which begins with the same rows; also behind several rotations."""
-    path, messages = begun_log(0)
+    path, messages = begun_log()
+    for character in row(0)[:-1]:
+        append(path, character)
+        assert new(messages) == []
+    append(path, "\n")
+    assert new(messages) == [0]
     fresh = path.with_name("fresh")
     fresh.write_text(path.read_text() + row(1))
     fresh.rename(path)
@@ -163,18 +168,11 @@ def test_a_copy_in_the_place_of_a_log_is_read_on_and_columns_of_a_new_file_are_r
     assert isinstance(message, Message)
     assert (message.turn, message.observed[1], np.isnan(message.observed[0])) == (4, 1e-4, True)
     assert [told.turn for told in turns if isinstance(told, Message)] == [2, 3]
-
-
-def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(begun_log):
-    path, messages = begun_log()
-    for character in row(0)[:-1]:
-        append(path, character)
-        assert new(messages) == []
-    append(path, "\n" + "1,2e")
-    assert new(messages) == [0]
+    append(path, "1e-4,5e")  # half a row of a dead writer ends with its file
+    assert new(messages) == []
     renamed(path)
-    append(path, row(1) + row(2))  # without a header: it must not be taken for the rest of the row
-    assert new(messages) == ["1,2e", 1, 2]
+    append(path, "2e-4,6\n1e-4,7\n")  # without a header: it must not be taken for the rest of the row
+    assert new(messages) == ["1e-4,5e", 6, 7]
 
 
 @pytest.mark.parametrize(

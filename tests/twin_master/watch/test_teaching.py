@@ -149,7 +149,7 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
-        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, turns=44)
+        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, turns=40)
         records = journal(watch.folder)
         assert not any("model" in record for record in records)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
@@ -214,7 +214,7 @@ def test_a_policy_that_changes_is_told(base):
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
 
 
-def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, mission, tmp_path):
+def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_path):
     """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
     file = of_gauge(tmp_path / "patch.json", -0.12, "g17")
     known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
@@ -224,14 +224,9 @@ def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, mission
         np.testing.assert_array_equal(read.plan.policy, known.plan.policy)
         shown = read.sensor_model.value_per_draw / known.sensor_model.value_per_draw
         np.testing.assert_allclose(shown[..., [15, 16]], [[[[1.0, 0.88]]]] * np.ones_like(shown[..., :2]))
-    twin, observed = taught.twin(), mission.observed.copy()
-    observed[:, 16] *= 0.88
-    turns = [twin.turn(row, int(c)) for row, c in zip(observed, mission.control_index, strict=True)]
-    calls = mission.state[:, 0] > 0.59
-    gentle = known.scenario.control_names.index("2g")
-    assert {turn.next_control for turn in np.array(turns)[calls]} == {gentle}
-    rewards, _ = taught.rewards.expectation(known_control(turns[-1].filtered, gentle, 2), observed[-1])
-    assert rewards[2] > -1.5  # readings are compared with readings
+    observed = taught.sensor_model.mean[0, 0]
+    rewards, _ = taught.rewards.expectation(known_control(taught.model.prior, 0, 2), observed)
+    assert rewards[2] > -0.2  # readings are compared with readings
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:

@@ -332,10 +332,12 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     assert (decisions[-1]["decided_by"], decisions[-1]["next_control"]) == ("none of these", "2g")
     assert 10 < first < 25 < second < 40
     assert gauge["sensors"] == [4]
+    assert abs(gauge["since"] - 10) <= 2
+    assert "gauge 4 shows too little, " in gauge["sentence"]
+    assert f"--from-run '{folder}' --from-turn {gauge['since']}\n" in done.stderr
     assert "no state of the model explains all gauges" in none["sentence"]
     assert decisions[24]["none_of_these"] < 0.5
     assert decisions[-1]["none_of_these"] > 0.999
-    assert f"--from-run '{folder}'" in done.stderr
     again = command("watch", "--resume", "--out", folder)  # nothing is read
     told = [json.loads(line) for line in again.stdout.splitlines()]
     assert [(decision["turn"], decision["told_again"]) for decision in told] == [(59, True)]
