@@ -63,20 +63,6 @@ def test_filters_repeat_bit_for_bit():
     assert np.array_equal(first.likelihood, again.likelihood)
 
 
-def test_kernel_densities_are_those_of_the_ratio_and_of_the_particles():
-    filtered = particle_filter(DATA, seed=3, particle_count=300_000)
-    places = np.linspace(0.93, 1.09, 33)
-    exact = np.exp(pair_log_likelihoods(PUBLISHED_LINE, DATA, places, "ratio"))
-    for found, expected in zip(filtered.likelihood, exact, strict=True):
-        error = np.interp(places, filtered.likelihood_grid, found) - expected
-        assert np.abs(error).max() < 0.03 * expected.max()
-    density, grid = filtered.density, filtered.grid
-    mean = np.trapezoid(density * grid, grid)
-    assert mean == pytest.approx(filtered.mean, abs=1e-5)
-    deviation = np.sqrt(np.trapezoid(density * (grid - mean) ** 2, grid))
-    assert deviation == pytest.approx(filtered.standard_deviation, rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("change", "count", "prior", "words"),
     [
