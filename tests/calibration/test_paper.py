@@ -159,17 +159,6 @@ def test_moments_quantiles_and_intervals_of_a_gaussian():
     assert posterior.cumulative(value) == pytest.approx(below, abs=1e-5)
 
 
-@given(
-    density=st.lists(st.floats(0.0, 1e6), min_size=3, max_size=12).filter(lambda d: max(d) > 1e-3),
-    probability=st.floats(0.0, 1.0),
-)
-def test_quantile_inverts_the_distribution_function(density, probability):
-    posterior = ScalarPosterior(np.linspace(0.0, 1.0, len(density)), np.array(density))
-    value = posterior.quantile(probability)
-    assert 0.0 <= value <= 1.0
-    assert posterior.cumulative(value) == pytest.approx(probability, abs=1e-9)
-
-
 def test_samples_repeat_bit_for_bit_and_follow_the_density():
     """One in each stratum, in random order."""
     _, posterior = gaussian()
