@@ -17,7 +17,7 @@ from calibration.paper.load_test import (
     calibrate_static,
     particle_filter,
 )
-from calibration.paper.procedure import fit_masses, read_published_results
+from calibration.paper.procedure import fit_masses
 from calibration.static.errors_in_variables import (
     assess_fit,
     exact_posterior,
@@ -56,15 +56,11 @@ def test_table_1_of_the_paper():
     assert posterior.standard_deviation == pytest.approx(limit.standard_deviation, rel=0.02)
 
 
-def test_filters_repeat_bit_for_bit_and_with_a_tabulated_curve():
-    curve = stiffness_curve_of(lambda factor: float(PUBLISHED_LINE.stiffness(factor)), (0.85, 1.15))
+def test_filters_repeat_bit_for_bit():
     first, again, other = (particle_filter(DATA, seed=seed, particle_count=20_000) for seed in (7, 7, 8))
     assert first.mean == again.mean != other.mean
     assert np.array_equal(first.density, again.density)
     assert np.array_equal(first.likelihood, again.likelihood)
-    table = particle_filter(DATA, seed=7, curve=curve, particle_count=20_000)
-    assert table.mean == pytest.approx(first.mean, abs=1e-9)
-    assert table.standard_deviation == pytest.approx(first.standard_deviation, abs=1e-9)
 
 
 def test_kernel_densities_are_those_of_the_ratio_and_of_the_particles():
@@ -148,16 +144,6 @@ def test_masses_of_a_closed_solution(factor):
     assert result.samples[0, 2] == pytest.approx(pitot, abs=1e-6)
     assert 2.0 * result.samples[0, 1] + result.samples[0, 2] == pytest.approx(0.472, abs=1e-15)
     assert result.frequency[0, 0] == pytest.approx(5.6492, rel=1e-6)
-
-
-def test_the_authors_table_gives_their_figures(reference):
-    result = read_published_results(reference)
-    assert result.samples.shape == (100, 5)
-    mean, deviation = result.samples.mean(axis=0), result.samples.std(axis=0, ddof=1)
-    assert mean[1:3] == pytest.approx([0.1691, 0.1337], abs=5e-5)
-    assert deviation[1:3] == pytest.approx([0.0039, 0.0077], abs=5e-5)
-    assert mean[3] == pytest.approx(1.030, abs=5e-4)
-    assert mean[4] == pytest.approx(7.66e-4, abs=5e-7)
 
 
 @pytest.mark.parametrize(("changed", "words"), Inputs(__file__).refused("masses"))
