@@ -7,15 +7,16 @@ from scipy.linalg import expm
 from fe.runtime.arrays import PLACE
 from fe.runtime.errors import InvalidStateError, OutsideModelError
 from fe.runtime.patch import ModelPatch, PowerStiffness
-from fe.runtime.patched_wing import HOLDING
+from fe.runtime.patched_wing import PatchedState
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE
-from fe.runtime.transient import ModalIntegrator, TransientState
+from fe.runtime.transient import ModalIntegrator
 from tests.fe.runtime.stepping import exact, second_order
 from tests.wings import wing_integrator
 
 ALPHA, BETA = 1.0735, 7.3124e-4  # Kapteyn et al. 2021, fitted to the ring-down of the real wing
 HEALTHY = {"servo_mass": 0.169, "pitot_mass": 0.134, "damping_alpha": ALPHA, "damping_beta": BETA}
+HOLDING = PatchedState.holding
 
 
 @pytest.fixture(scope="module")
@@ -123,9 +124,6 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(model, integrator):
 
 
 def test_bad_input_is_refused(model, integrator):
-    for values in ([], [1.0, 2.0, 3.0], [0.0, 0.0, np.nan, 0.0]):
-        with pytest.raises(InvalidStateError, match="transient state of 2 modes needs"):
-            TransientState.from_list(values, 2)
     for duration, load in ((0.0, 1.0), (-1.0, 1.0), (np.nan, 1.0), (np.inf, 1.0), (0.1, np.nan)):
         with pytest.raises(InvalidStateError, match="needs a positive duration and a finite load"):
             integrator.advance(integrator.at_rest((1.0, 0.0)), duration, (load, 0.0))
