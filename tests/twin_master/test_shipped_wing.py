@@ -1,6 +1,5 @@
 """The paper's mission on our own wing: the policy, the reliability over many seeds, and the whole chain."""
 
-import json
 import shutil
 import zipfile
 
@@ -9,9 +8,9 @@ import pytest
 import xarray as xr
 
 from benchmarks.seeds import fly_seeds
-from tests.twin_master.runs import changed_scenario, check_resumed, of_wing
+from tests.twin_master.runs import changed_scenario, of_wing
 from twin_master.store.writing import open_run
-from uav_twin import fly, load_scenario
+from uav_twin import fly
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing"), pytest.mark.usefixtures("no_report")]
 
@@ -27,22 +26,6 @@ def test_the_papers_policy_and_its_reliability():
     assert study.within.value >= 0.95
     assert study.early.value <= 0.2
     assert np.all([study.rms[0].value <= 0.045, study.rms[1].value <= 0.13])
-
-
-def test_the_whole_chain_and_its_resumption(wing, tmp_path):
-    loaded = load_scenario("paper_level_turns")
-    outcome = fly(loaded, tmp_path / "whole")
-    figures = {figure.key: figure for figure in outcome.figures}
-    assert figures["policy_switch_damage"].value == pytest.approx(60.0)
-    assert float(figures["strain_error_bound"].value or 0.0) < 3.0
-    with xr.open_datatree(outcome.folder / "run.nc", engine="h5netcdf") as tree:
-        assert tree["truth"]["tip_displacement"].attrs["units"] == "m"
-        assert tree["truth"]["strain_error_bound"].attrs["units"] == "1"
-    config = json.loads((outcome.folder / "config.json").read_text(encoding="utf-8"))
-    assert config["inputs"]["design"] == wing.design_hash
-    assert (outcome.folder / "wing.vtu").stat().st_size > 10_000
-    names = "calibration.json", "wing.vtu", "asset/asset.fmu"
-    check_resumed(outcome.folder, loaded, tmp_path / "part", 23, *names)
 
 
 @pytest.mark.long

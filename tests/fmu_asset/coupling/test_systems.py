@@ -211,11 +211,12 @@ def link(source: str, target: str, **options: Any) -> Connection:
 REFUSED = tables(__file__)
 
 
-def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
+def test_what_does_not_fit_is_one_sentence(base, foreign_fmu, tmp_path) -> None:
     first = base.components[0]
     refused = [({"connections": [link(*ends) for ends in joined]}, w) for joined, w in REFUSED["unjoined"]]
     for name, key, value, words in REFUSED["unset"]:
-        settled = replace(base.component(name), settings={key: Setting(*value)})
+        part = base.component(name) if name in PARTS else Component(name, foreign_fmu(name))
+        settled = replace(part, settings={key: Setting(*value)})
         refused += [({"components": [settled]}, words)]
     refused += [
         ({"components": []}, "has no component"),
@@ -231,7 +232,7 @@ def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
             expand(source, target, ["a", "b"])
 
 
-def test_units_and_types_are_converted(base) -> None:
+def test_units_and_types_are_converted(base, foreign_fmu) -> None:
     """The value of a connection is converted first, and transformed in the unit of the target."""
     seen = link("wing.tip_displacement", "seen", factor=2.0, offset=0.5)
     for options, conversion in (
@@ -247,6 +248,8 @@ def test_units_and_types_are_converted(base) -> None:
     given = {"mass.servo": Setting(150.0, "g"), "response": Setting("transient"), "health.z1": Setting(0.2)}
     wiring = Wiring(replace(base, components=(replace(base.component("wing"), settings=given),)))
     assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
+    switched = Component("a", foreign_fmu("array3"), {"active": Setting(False)})
+    assert Wiring(SystemStructure("one", (switched,))).settings == {"a": {"active": 0.0}}
     # An enumeration and an integer feed each other.
     joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))
     assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)

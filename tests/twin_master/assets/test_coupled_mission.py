@@ -18,7 +18,6 @@ from twin_master.fleet.plan import ensemble
 from twin_master.mission.turns import Plant, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
-from twin_master.store.writing import open_run
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, load_scenario, resume
 
@@ -62,24 +61,6 @@ def changed(
 
 def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
-
-
-def test_a_heat_exchanger_is_watched_and_steered(direct):
-    run = direct["fouling"]
-    tree = open_run(run)
-    observed, truth = tree["observed"], tree["truth"]
-    assert observed["temperature"].shape == (30, 2)
-    found = [observed["temperature"], observed["mass_flow"], truth["heat"], truth["state"]]
-    assert [variable.attrs["units"] for variable in found] == ["degC", "kg/s", "W", "m2.K/W"]
-    estimate = tree["smoothed"]["mean"].values[:, 0]
-    np.testing.assert_allclose(estimate[[3, 12, 25]], [0.0, 1e-4, 2e-4], atol=3e-5)
-    # The exact steady temperatures are those of the formula, not of a wing.
-    flow = observed["mass_flow"].values[0]
-    outlet = 20.0 + 60.0 * (1.0 - np.exp(-6100.0 / (4186.0 * flow)))
-    assert truth["temperature"].values[0, 1] == pytest.approx(outlet, rel=1e-12)
-    headers = [rows(run)[f"{name}.csv"].decode().splitlines()[0] for name in ("observed", "health")]
-    assert headers[0] == "step,temperature_1_degC,temperature_2_degC"
-    assert headers[1].startswith("step,fouling_true_m2.K/W")
 
 
 def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder, tmp_path):
@@ -205,13 +186,3 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
     seedless = scenario.model_copy(update={"asset": scenario.asset.model_copy(update={"seeds": ()})})
     with pytest.raises(FleetError, match="every seed would fly the same life"):
         fly_fleet(replace(fleet, groups=(replace(group, scenarios=(seedless,)),)), tmp_path / "fleet")
-
-
-def test_the_law_of_the_shipped_damage_is_what_the_twin_believes():
-    scenario = load_scenario("three_fmus").scenario
-    values = scenario.asset.component[0].parameters
-    for control in scenario.control:
-        severity = (control.values["load_factor"] / values["reference_load_factor"]) ** values["exponent"]
-        believed = pytest.approx(scenario.transition.probability[control.name], rel=1e-12)
-        assert [values[f"probability.{region}"] * severity for region in ("z1", "z2")] == [believed] * 2
-    assert {factor.levels[1] - factor.levels[0] for factor in scenario.state} == {values["level"]}
