@@ -305,14 +305,10 @@ class DesignSource(_Wing, ReducedModelSource):
         scenario, where = self._scenario, str(self.patch_path)
         ask = strains_with_effects(self.wing, patch, arrays_for(self.wing_design, patch))
         force = scenario.asset.constant_load.get("tip_force", 0.0)
-        try:
-            tables = [
-                asked_table(scenario, model.states.coordinates, partial(ask, e, force))
-                for e in draws.values.tolist()
-            ]
-        except UnacceptableValuesError as error:
-            raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
-        return np.array(tables)
+        before, states = f"the twin's model cannot carry {where}: ", model.states.coordinates
+        with MissionInputError.instead_of(UnacceptableValuesError, before=before):
+            draw = (partial(ask, e, force) for e in draws.values.tolist())
+            return np.array([asked_table(scenario, states, asked) for asked in draw])
 
 
 def strains_with_effects(
