@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from reporting.errors import StandsForOthersError
 from reporting.sentences import Sentences
 
 said = Sentences(__file__).said
@@ -16,7 +17,7 @@ def visible(text: str) -> str:
     return text.translate(_CONTROLS)
 
 
-class FmuError(Exception):
+class FmuError(StandsForOthersError):
     """Any error that this package raises on purpose.
 
     Attributes

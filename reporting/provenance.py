@@ -101,10 +101,14 @@ def source_hash(package: str) -> str:
 def hash_tree(root: Path, *, suffixes: Iterable[str]) -> str:
     """Return the SHA-256 of the files below `root` with one of the suffixes; line ends do not count."""
     wanted = frozenset(suffixes)
-    digest = hashlib.sha256()
     files = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.suffix in wanted}
-    for name in sorted(files):
-        content = files[name].read_bytes().replace(b"\r\n", b"\n")
+    return hash_members({name: path.read_bytes().replace(b"\r\n", b"\n") for name, path in files.items()})
+
+
+def hash_members(members: Mapping[str, bytes]) -> str:
+    """Return the SHA-256 over the names and contents of files, in the order of their names."""
+    digest = hashlib.sha256()
+    for name, content in sorted(members.items()):
         digest.update(f"{name}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()

@@ -215,6 +215,12 @@ def progress() -> "Progress":
     return SilentProgress() if loudness.quiet else RichProgress(lines=loudness.verbose)
 
 
+def failed(text: str, code: int = 1) -> typer.Exit:
+    """Return the end of a command that something was wrong with, and say what on the error stream."""
+    typer.secho(text, fg="red", err=True)
+    return typer.Exit(code)
+
+
 def print_json(record: Mapping[str, Any]) -> None:
     """Print a record as JSON text; a number that is not finite becomes null."""
     from reporting.json_file import plain
@@ -272,8 +278,7 @@ def _interruptible(call: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return call(*arguments, **options)
         except KeyboardInterrupt:
-            typer.secho("Interrupted.", fg="red", err=True)
-            raise typer.Exit(INTERRUPTED) from None
+            raise failed("Interrupted.", INTERRUPTED) from None
         finally:
             reporting.progress.narrator = before
 

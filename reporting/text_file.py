@@ -29,13 +29,17 @@ def read_text(
     error
         The file is not there, cannot be read, or is not text in UTF-8.
     """
+    return decoded(read_bytes(path, error, what=what), f"The {what} {path}", error, otherwise)
+
+
+def read_bytes(path: Path | str, error: type[Exception], *, what: str = "file") -> bytes:
+    """Return the content of a file; raises `error` as `read_text`."""
     try:
-        content = Path(path).read_bytes()
+        return Path(path).read_bytes()
     except OSError as cause:
         raise error(f"The {what} {path} cannot be read: {cause.strerror or cause}.") from cause
     except ValueError:
         raise error(f"{str(path)!r} is no name of a {what}.") from None
-    return decoded(content, f"The {what} {path}", error, otherwise)
 
 
 def decoded(content: bytes, subject: str, error: type[Exception], otherwise: str | None = None) -> str:

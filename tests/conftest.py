@@ -43,7 +43,7 @@ settings.register_profile("developer", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 
-SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_reduction", "plate_model")
+SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_reduction")
 """Fixtures of several files that take three to ten seconds each."""
 
 LARGEST, COMPILING = "wing", "compiling"
@@ -371,17 +371,11 @@ def write_beam() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def beam_file(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The structure file of the beam."""
-    return write_beam(tmp_path_factory.mktemp("beam"))
-
-
-@pytest.fixture(scope="session")
-def beam(beam_file: Path) -> Structure:
-    """Its full model."""
+def beam(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Structure:
+    """The full model of the beam."""
     from fe.structure.operators import load_and_assemble
 
-    return load_and_assemble(beam_file)
+    return load_and_assemble(write_beam(tmp_path_factory.mktemp("beam")))
 
 
 @pytest.fixture(scope="session")
@@ -393,30 +387,14 @@ def beam_reduction(beam: Structure) -> Reduction:
 
 
 @pytest.fixture(scope="session")
-def plate_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A coarse plate with a hole, four regions around it, its reduced model good to half a per cent."""
+def plate_pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Structure, ReducedModel]:
+    """A coarse plate with a hole, four regions around it, and its reduced model, good to half a per cent."""
     from benchmarks.study_regions import plate
+    from fe.reduction.reduced_basis import reduce_structure
+    from fe.structure.operators import load_and_assemble
 
     file = plate(tmp_path_factory.mktemp("plate"), 4, around=8, across=3)
     with file.open("a", encoding="utf-8") as text:
         text.write("\n[reduction]\ntolerance = 5e-3\n")
-    return file
-
-
-@pytest.fixture(scope="session")
-def coarse_plate(plate_file: Path) -> Structure:
-    """Its full model."""
-    from fe.structure.operators import load_and_assemble
-
-    return load_and_assemble(plate_file)
-
-
-@pytest.fixture(scope="session")
-def plate_model(coarse_plate: Structure) -> ReducedModel:
-    """Its reduced model."""
-    from fe.reduction.reduced_basis import reduce_structure
-
-    def reduced() -> ReducedModel:
-        return reduce_structure(coarse_plate).model
-
-    return kept("coarse-plate", reduced, FE, coarse_plate.design_hash)
+    full = load_and_assemble(file)
+    return full, kept("coarse-plate", lambda: reduce_structure(full).model, FE, full.design_hash)

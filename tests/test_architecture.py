@@ -1,11 +1,9 @@
 """The house: floors, rooms and files import downwards only, and stay small enough to live in."""
 
 import ast
-import io
 import re
-import tokenize
+import sys
 import tomllib
-from bisect import bisect
 from collections.abc import Iterator
 from functools import cache
 from itertools import chain
@@ -149,42 +147,35 @@ def test_modules_and_functions_are_short_or_say_why_not():
         place = path.relative_to(ROOT).as_posix()
         if text.count("\n") > LONGEST_MODULE:
             long[place] = text.count("\n")
-        functions = [node for node in nodes(path) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-        # Most are short with their comments, too.
-        functions = [node for node in functions if (node.end_lineno or 0) - node.lineno >= LONGEST_FUNCTION]
-        lines = sorted(code_lines(text)) if functions else []
-        for node in functions:
-            length = bisect(lines, node.end_lineno or 0) - bisect(lines, node.lineno - 1)
-            if length > LONGEST_FUNCTION:
-                long[f"{place}:{node.name}"] = length
+        for node in nodes(path):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and lines(node) > LONGEST_FUNCTION:
+                long[f"{place}:{node.name}"] = lines(node)
     assert {place: length for place, length in long.items() if place not in LONGER} == {}
     assert not set(LONGER) - set(long), "no longer long"
 
 
-def code_lines(text: str) -> set[int]:
-    """Return the rows of a module that hold code: no comment, no docstring, not blank."""
-    ignored = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
-    rows: set[int] = set()
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type not in ignored:
-            rows.update(range(token.start[0], token.end[0] + 1))
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):  # a docstring
-            rows.difference_update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    return rows
+@cache
+def lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Return the number of lines on which a part of a function begins or ends, its docstring left out."""
+    rows = {
+        row
+        for statement in function.body[ast.get_docstring(function) is not None :]
+        for part in ast.walk(statement)
+        if hasattr(part, "lineno")
+        for row in (part.lineno, part.end_lineno)
+    }
+    return len(rows) + function.body[0].lineno - function.lineno
 
 
-def test_modules_of_posix_alone_are_imported_where_they_are_used():
-    posix = {"fcntl", "grp", "pwd", "resource", "termios"}
-    wrong = [
-        name
-        for name, path in modules().items()
-        for node in nodes(path)
-        if not node.col_offset  # neither in a function nor after a question
-        and isinstance(node, ast.Import)
-        and posix & {item.name for item in node.names}
-    ]
-    assert not wrong
+def test_the_runtime_imports_numpy_the_standard_library_and_itself_only():
+    """By relative imports: its folder goes into FMUs as it is."""
+    for name, path in modules().items():
+        for node in nodes(path) if name.startswith("fe.runtime") else ():
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                assert node.level <= len(path.relative_to(ROOT / "fe" / "runtime").parts), name
+                names = [] if node.level else [str(node.module)]
+            assert {item.split(".")[0] for item in names} <= {"numpy", *sys.stdlib_module_names}, name
 
 
 def test_every_package_is_distributed():

@@ -6,7 +6,6 @@ says that the reader has by then.
 
 import ast
 import contextlib
-import itertools
 import re
 import shutil
 from collections.abc import Callable
@@ -20,6 +19,7 @@ import pytest
 from calibration.result.file import save_calibration
 from calibration.result.record import Calibration
 from tests import command_line
+from tests.meshes import box
 from tests.refusals import Inputs
 
 ROOT, INPUTS = Path(__file__).parents[1], Inputs(__file__)
@@ -37,36 +37,22 @@ def blocks(page: Path, language: str) -> list[str]:
 WITH_PYTHON = {str(page.relative_to(ROOT)): page for page in PAGES if blocks(page, "python")}
 
 
-def reference(name: str) -> Path:
-    """Return a folder of the authors' published data; skips where it is not at hand."""
-    folder = REFERENCE / name
-    if not folder.is_dir():
-        pytest.skip(f"the authors' published data are not at {folder}")
-    return folder
+def linked(place: str, target: Path) -> Callable[[Path], None]:
+    """Return what puts a link to a folder, or to a file, at a place in the reader's folder."""
 
+    def link(folder: Path) -> None:
+        if not target.exists():
+            pytest.skip(f"{target} is not there")
+        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        (folder / place).symlink_to(target)
 
-def calibration_data(folder: Path) -> None:
-    (folder / "UAV-Experimental-Calibration").symlink_to(reference("uav_experimental_calibration"))
-
-
-def strain_library(folder: Path) -> None:
-    (folder / "path" / "to").mkdir(parents=True)
-    (folder / "path" / "to" / "UAV-Digital-Twin").symlink_to(reference("uav_digital_twin"))
-
-
-def checkout(folder: Path) -> None:
-    """The folder of the project, where the shipped bindings are."""
-    (folder / "scenarios").symlink_to(ROOT / "scenarios")
+    return link
 
 
 def patch_file(folder: Path) -> None:
     """The patch that the page shows."""
     (patch,) = (text for text in blocks(ROOT / "docs" / "fmu.md", "json") if "uav-twin patch" in text)
     (folder / "patch.json").write_text(patch, encoding="utf-8")
-
-
-def empty_cart(folder: Path) -> None:
-    (folder / "my_cart").mkdir()
 
 
 def command(folder: Path, *words: str) -> None:
@@ -77,7 +63,9 @@ def command(folder: Path, *words: str) -> None:
 
 def converted_wing(folder: Path) -> None:
     """The first three seconds of three ring-downs: the search in all of them takes longer still."""
-    published = reference("uav_experimental_calibration") / "step3"
+    published = REFERENCE / "uav_experimental_calibration" / "step3"
+    if not published.is_dir():
+        pytest.skip(f"the authors' published data are not at {published}")
     short = folder / "UAV-Experimental-Calibration" / "step3"
     short.mkdir(parents=True)
     for trial in (1, 2, 3):
@@ -87,23 +75,14 @@ def converted_wing(folder: Path) -> None:
     command(folder, "discrepancy", "convert", "real_wing", "--data", "UAV-Experimental-Calibration")
 
 
-def rig(folder: Path) -> None:
-    """The wing's FMU as the model of a rig."""
-    shutil.copy(INPUTS.folder / "rig.toml", folder)
-
-
 def bracket(folder: Path) -> None:
     """Write the structure of the page, and a mesh with its sets."""
     text, *_ = blocks(ROOT / "docs" / "structures.md", "toml")  # the others are of scenarios
     (folder / "bracket.toml").write_text(text, encoding="utf-8")
-    places = np.array([*itertools.product(range(13), range(3), range(3))])
-    number = {tuple(place): node for node, place in enumerate(places)}
-    corners = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
-    cells = itertools.product(range(12), range(2), range(2))
-    hexahedra = [[number[tuple(np.add(cell, corner))] for corner in corners] for cell in cells]
-    ends = {"ROOT": places[:, 0] == 0, "TOP": places[:, 2] == 2}
+    points, cells = box("hexahedron", (12, 2, 2))
+    ends = {"ROOT": points[:, 0] == 0.0, "TOP": points[:, 2] == 1.0}
     sets = {"BODY": [np.arange(48)], "LUG": [np.arange(8)]}
-    mesh = meshio.Mesh(10.0 * places - [0, 10, 0], [("hexahedron", hexahedra)], cell_sets=sets)
+    mesh = meshio.Mesh(points * [120, 20, 20] - [0, 10, 0], [("hexahedron", cells)], cell_sets=sets)
     mesh.point_sets = {name: np.flatnonzero(there) for name, there in ends.items()}
     mesh.write(folder / "bracket.inp")
 
@@ -117,12 +96,18 @@ VERDICT = (
 
 READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
     "docs/another_asset.md": ("library sample pump_wear --out pump.nc",),
-    "docs/calibration.md": (calibration_data,),
+    "docs/calibration.md": (
+        linked("UAV-Experimental-Calibration", REFERENCE / "uav_experimental_calibration"),
+    ),
     "docs/campaign.md": ("discrepancy example static my_campaign --seed 1",),
-    "docs/cart_in_ten_minutes.md": (empty_cart,),
-    "docs/fmu_models.md": (WING_FMU, rig),
-    "docs/fmu.md": (checkout, patch_file, "fmu build --patch patch.json --out wing_with_effects.fmu"),
-    "docs/inference.md": (strain_library,),
+    "docs/cart_in_ten_minutes.md": (lambda folder: (folder / "my_cart").mkdir(),),
+    "docs/fmu_models.md": (WING_FMU, linked("rig.toml", INPUTS.folder / "rig.toml")),
+    "docs/fmu.md": (
+        linked("scenarios", ROOT / "scenarios"),
+        patch_file,
+        "fmu build --patch patch.json --out wing_with_effects.fmu",
+    ),
+    "docs/inference.md": (linked("path/to/UAV-Digital-Twin", REFERENCE / "uav_digital_twin"),),
     # The page packs the FMU itself.
     "docs/python.md": ("fmu build --out drafted.fmu", "fmu bind drafted.fmu --out wing.toml", *VERDICT),
     "docs/real_wing.md": (converted_wing,),

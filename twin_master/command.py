@@ -105,8 +105,7 @@ def _interruptible(fly: "Callable[[], parts.RunOutcome]", folder: Path) -> "part
     except KeyboardInterrupt:
         begun = (folder / "config.json").is_file()
         hint = f"continue with `uav-twin run --resume {folder}`" if begun else "no run was begun"
-        typer.secho(f"Interrupted; nothing is lost: {hint}.", fg="red", err=True)
-        raise typer.Exit(terminal.INTERRUPTED) from None
+        raise terminal.failed(f"Interrupted; nothing is lost: {hint}.", terminal.INTERRUPTED) from None
 
 
 def show_outcome(outcome: "parts.RunOutcome") -> None:

@@ -2,12 +2,13 @@
 
 from collections.abc import Collection, Iterable, Mapping
 
+from reporting.errors import StandsForOthersError
 from reporting.sentences import Sentences
 
 said = Sentences(__file__).said
 
 
-class TwinMasterError(Exception):
+class TwinMasterError(StandsForOthersError):
     """Any failure of `twin_master` that has a cause which the user can act upon."""
 
 

@@ -168,8 +168,7 @@ def fly_and_show(
         outcome = parts.fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
     except KeyboardInterrupt:
         sentence = f"Interrupted; what was flown is kept in {folder}: repeat the command to go on."
-        typer.secho(sentence, fg="red", err=True)
-        raise typer.Exit(terminal.INTERRUPTED) from None
+        raise terminal.failed(sentence, terminal.INTERRUPTED) from None
     if report:
         _report(outcome.folder)
     figures = _figures([outcome.folder])

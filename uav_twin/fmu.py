@@ -20,7 +20,7 @@ from reporting.files import atomic_write_bytes, atomic_write_text, refuse_existi
 from reporting.words import counted
 from scenarios import asset_scripts, scenario_files
 from uav_twin import parts
-from uav_twin.options import answer, refused, said, show
+from uav_twin.options import answer, said, show
 from uav_twin.structure import fmu as build_structure
 from uav_twin.structure import names_structure
 
@@ -67,7 +67,7 @@ def check(
     findings = [asdict(finding) for finding in result.findings]
     answer("fmu check", record={"file": str(file), "passed": result.passed, "findings": findings}, json=json)
     if not result.passed:
-        raise refused(f"{file}: {counted(len(result.problems), 'problem')}.")
+        raise terminal.failed(f"{file}: {counted(len(result.problems), 'problem')}.")
 
 
 def build(
@@ -379,6 +379,6 @@ def sample(
     except KeyboardInterrupt:
         kept = parts.blocks_folder(out).is_dir()
         hint = "go on with the same command and --resume" if kept else "nothing was sampled yet"
-        typer.secho(f"Interrupted; finished blocks are kept: {hint}.", fg="red", err=True)
-        raise typer.Exit(terminal.INTERRUPTED) from None
+        told = f"Interrupted; finished blocks are kept: {hint}."
+        raise terminal.failed(told, terminal.INTERRUPTED) from None
     show("library", found=found, library=found.library)

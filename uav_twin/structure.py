@@ -19,7 +19,7 @@ from reporting.files import atomic_write_text, refuse_existing, refuse_filled
 from reporting.progress import stage
 from scenarios import structure_files
 from uav_twin import parts
-from uav_twin.options import answer, refused, said, show
+from uav_twin.options import answer, said, show
 
 
 def wing(*, design: Path | None = None, vtu: Path | None = None, as_json: bool = False) -> None:
@@ -71,7 +71,9 @@ def end_with(checks: "Sequence[parts.Check]") -> None:
     """End with 1, and say which limits are broken, if any is."""
     broken = [f"{check.group}, {check.name}" for check in checks if not check.passed]
     if broken:
-        raise refused(f"{len(broken)} of {len(checks)} checks broke their limit: {'; '.join(broken)}.")
+        raise terminal.failed(
+            f"{len(broken)} of {len(checks)} checks broke their limit: {'; '.join(broken)}."
+        )
 
 
 RESPONSE_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-6

@@ -57,15 +57,23 @@ def arrays_to_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
     ValueError
         If an array holds Python objects.
     """
+    members = {}
+    for name, array in arrays.items():
+        content = io.BytesIO()
+        np.lib.format.write_array(content, np.asarray(array, order="C"), allow_pickle=False)
+        members[f"{name}.npy"] = content.getvalue()
+    return archive_bytes(members)
+
+
+def archive_bytes(members: Mapping[str, bytes], first: str = "") -> bytes:
+    """Return a zip archive with fixed dates and order; stored, since compression differs between versions."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(arrays):
-            entry = zipfile.ZipInfo(f"{name}.npy", date_time=_TIMESTAMP)
-            entry.external_attr = 0o644 << 16
+        for name in sorted(members, key=lambda name: (name != first, name)):
+            entry = zipfile.ZipInfo(name, date_time=_TIMESTAMP)
             entry.create_system = 3
-            content = io.BytesIO()
-            np.lib.format.write_array(content, np.asarray(arrays[name], order="C"), allow_pickle=False)
-            archive.writestr(entry, content.getvalue())
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, members[name])
     return buffer.getvalue()
 
 

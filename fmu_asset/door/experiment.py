@@ -3,8 +3,6 @@
 Inputs are read from CSV, outputs written as CSV or NetCDF.
 """
 
-import csv
-import io
 import math
 import re
 from collections import Counter
@@ -18,7 +16,7 @@ from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.errors import BindingError, FmuInputError, said
 from fmu_asset.instances.plan import Floats
 from reporting.files import atomic_write_bytes, atomic_write_text
-from reporting.table_file import TableErrors, read_table
+from reporting.table_file import TableErrors, read_table, table_text
 
 from .binding import INPUT_ROLES, Binding, Header, Input, Parameter, Vector
 from .draft import bindable, observable
@@ -105,12 +103,9 @@ def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history:
     if path.suffix == ".nc":
         atomic_write_bytes(path, _netcdf(asset, source, history))
         return
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([_TIME, *asset.binding.observation_variables, *history.extra])
-    rows = np.column_stack([history.time, history.values, *history.extra.values()])
-    writer.writerows(rows.tolist())
-    atomic_write_text(path, text.getvalue())
+    observed = dict(zip(asset.binding.observation_variables, history.values.T, strict=True))
+    observed[_TIME] = history.time
+    atomic_write_text(path, table_text({_TIME: history.time, **observed, **(history.extra | observed)}))
 
 
 def _check_time(path: Path, time: Floats, binding: Binding) -> None:

@@ -14,10 +14,7 @@ two class attributes, both optional:
 The script runs once in this process, to be asked for its variables.
 """
 
-import hashlib
-import io
 import os
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution, version
@@ -28,10 +25,13 @@ from typing import Any
 from uuid import UUID
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from fe.runtime.arrays import archive_bytes
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
 from fmu_asset.errors import FmuBuildError, FmuError, said
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
+from reporting.provenance import hash_members
+from reporting.text_file import read_bytes
 from reporting.units import BASE_UNITS
 
 PYTHONFMU_VERSION = "0.7.0"
@@ -41,7 +41,6 @@ BASE_CLASS_FILES = (
     "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
 )  # fmt: skip
 """Files of pythonfmu that its base class needs."""
-_DATE = (1980, 1, 1, 0, 0, 0)
 _TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
 # Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
 _GUID_PLACES = {
@@ -232,15 +231,6 @@ def python_members(
 # ---------------------------------------------------------------- content hash
 
 
-def content_hash_of(template: Mapping[str, bytes]) -> str:
-    """Return the SHA-256 over names and contents, the placeholder standing for the hash itself."""
-    digest = hashlib.sha256()
-    for name in sorted(template):
-        digest.update(f"{name}\0{len(template[name])}\0".encode())
-        digest.update(template[name])
-    return digest.hexdigest()
-
-
 def guid_of(content_hash: str) -> str:
     """Return the GUID that a content hash gives."""
     return f"{{{UUID(content_hash[:32])}}}"
@@ -251,6 +241,8 @@ def sealed(
 ) -> tuple[bytes, str]:
     """Return the archive of the files, tag and GUID in the place of the placeholder, and the GUID.
 
+    The hash is over names and contents, the placeholder standing for the hash itself.
+
     Parameters
     ----------
     template : mapping of str to bytes
@@ -258,11 +250,11 @@ def sealed(
     binaries : callable, optional
         Makes further files of these and of the tag; they are not part of the hash.
     """
-    content_hash = content_hash_of(template)
+    content_hash = hash_members(template)
     tag, guid = content_hash[: len(PLACEHOLDER)], guid_of(content_hash)
     members = exchanged(template, (PLACEHOLDER, PLACEHOLDER), (tag, guid))
     further = {} if binaries is None else binaries(members, tag)
-    return archive_bytes(members | further), guid
+    return archive_bytes(members | further, "modelDescription.xml"), guid
 
 
 def exchanged(members: Mapping[str, bytes], old: tuple[str, str], new: tuple[str, str]) -> dict[str, bytes]:
@@ -276,18 +268,6 @@ def exchanged(members: Mapping[str, bytes], old: tuple[str, str], new: tuple[str
         return data.replace(old[0].encode(), new[0].encode())
 
     return {name.replace(old[0], new[0]): text(name, data) for name, data in members.items()}
-
-
-def archive_bytes(members: Mapping[str, bytes], first: str = "modelDescription.xml") -> bytes:
-    """Return a zip archive with fixed dates and order; stored, since compression differs between versions."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(members, key=lambda name: (name != first, name)):
-            entry = zipfile.ZipInfo(name, date_time=_DATE)
-            entry.create_system = 3
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, members[name])
-    return buffer.getvalue()
 
 
 def build_script_fmu(
@@ -318,10 +298,7 @@ def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
     file = Path(script)
     if not file.stem.isidentifier() or file.suffix != ".py":
         raise FmuBuildError(said("script.name", file=file))
-    try:
-        source = file.read_bytes()
-    except OSError as error:
-        raise FmuBuildError(f"The model script {file} cannot be read ({error.strerror or error}).") from error
+    source = read_bytes(file, FmuBuildError, what="model script")
     pythonfmu_version()
     model = _model_class(file)
     module, name = f"{file.stem}_{PLACEHOLDER}", model.__name__

@@ -182,15 +182,13 @@ def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
         name = row.get("id", row.get("identifier"))
         if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name):
             raise PatchFileError(said("patch.identifier", where=where, number=number, name=name))
-        try:
+        with PatchFileError.instead_of(InvalidPatchError):
             patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
             for item in patch:
                 if item.windows or item.courses:
                     raise PatchFileError(said("patch.windows", where=where, name=name, item=item))
                 if isinstance(item, PortForce) and item.magnitude:
                     item.check()
-        except InvalidPatchError as cause:
-            raise PatchFileError(str(cause)) from cause
         if not len(patch):
             raise PatchFileError(f"{where}: the effect {name!r} has no primitives.")
         unique, count = name, 1

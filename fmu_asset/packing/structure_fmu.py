@@ -39,12 +39,12 @@ from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.progress import Progress
+from reporting.provenance import hash_members
 
 from .contents import (
     FmuInfo,
     check_start,
     checked_target,
-    content_hash_of,
     exchanged,
     guid_of,
     python_members,
@@ -144,7 +144,7 @@ def build_fmu(
         raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
     name, kept = stem_of(model), {}
     if patch is not None:
-        effects = patch.for_gauges(model.gauge_count).plain
+        effects = patch.for_gauges(len(model.gauges)).plain
         values |= {switch_of(effect): float(options.get("activate", False)) for effect in effects}
         table += effect_rows(effects, len(table), values)
         kept = _patched_members(model, effects, options.get("arrays"))
@@ -202,10 +202,8 @@ def _patched_members(
         raise PatchFileError(said("packing.no_arrays"))
     if arrays.design_hash != model.design_hash:
         raise PatchFileError(said("packing.other_design", arrays=arrays, model=model))
-    try:
+    with PatchFileError.instead_of(FiniteElementError, before="The wing cannot carry the patch: "):
         ModalIntegrator(PatchedWing(arrays), model.nominal, *model.damping.tolist(), patch).modes  # noqa: B018
-    except FiniteElementError as cause:
-        raise PatchFileError(f"The wing cannot carry the patch: {cause}") from cause
     if not len(patch.of(LocalStiffnessLoss)):  # strips, which only that needs, are most of the bytes
         strips = ("strip_stiffness", "strip_of", "term_of")
         arrays = changed(arrays, **{name: getattr(arrays, name)[:0] for name in strips})
@@ -285,7 +283,7 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
     found = re.search(r'(?:guid|instantiationToken)="([^"]*)"', root)
     declared = "" if found is None else found[1]
-    return declared, guid_of(content_hash_of(exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER))))
+    return declared, guid_of(hash_members(exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER))))
 
 
 def pack_wing(

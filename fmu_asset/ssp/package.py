@@ -15,13 +15,14 @@ from urllib.parse import unquote, urlsplit
 
 from lxml import etree
 
+from fe.runtime.arrays import archive_bytes
 from fmu_asset.archive.fmu_file import check_archive
 from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import rendered
 from fmu_asset.errors import FmuFileError, SspError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.packing.contents import archive_bytes, checked_target
+from fmu_asset.packing.contents import checked_target
 from reporting.files import atomic_write_bytes
 from reporting.units import BASE_UNITS
 
@@ -75,10 +76,8 @@ class SspPackage:
         self.path = Path(path)
         if not self.path.is_file():
             raise SspError(said("ssp.absent", self=self))
-        try:
+        with SspError.instead_of(FmuFileError):
             self.names = check_archive(self.path, self.path.stat().st_size, "SSP", "export")
-        except FmuFileError as error:
-            raise SspError(error.sentence) from error
         if SSD_NAME not in self.names:
             raise SspError(f"{self.path} is an archive without {SSD_NAME}, so it is no SSP file.")
 

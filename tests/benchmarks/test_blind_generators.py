@@ -20,7 +20,6 @@ from benchmarks.blind.cases import (
 from benchmarks.blind.changes import Changes
 from benchmarks.blind.effects import DRAWS, LUMPED, Hidden, spread_cubic_stiffness
 from benchmarks.blind.instruments import Chance, draw_chance, true_signals
-from benchmarks.blind.laws import BOUC_WEN, POWER, Law
 from benchmarks.blind.lumped_rig import model_text
 from benchmarks.blind.traps import TRAPS
 from benchmarks.blind.writing import write_case
@@ -147,16 +146,3 @@ def test_generators_share_no_code_with_what_names():
             names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             assert not [name for name in names if name.startswith(forbidden)], file
-
-
-def test_motion_that_runs_away_is_no_campaign():
-    """A law that takes more stiffness from a joint than it has lets it snap; some releases nothing holds."""
-    work = workbench("lumped")
-    joint, end = work.bench.joint, work.bench.free
-    chance = draw_chance(np.random.default_rng(1), work.plan)
-    for law, runs_away in (
-        (Law(joint.port, BOUC_WEN, (0.5 * joint.stiffness, 0.3 * joint.displacement, 1.0)), False),
-        (Law(joint.port, BOUC_WEN, (3.0 * joint.stiffness, 0.3 * joint.displacement, 1.0)), True),
-        (Law("end", POWER, (-2.0 * end.stiffness / work.bench.release**2, 3.0, 0.0)), True),
-    ):
-        assert (finite_signals(work, chance, Changes(laws=(law,))) is None) is runs_away

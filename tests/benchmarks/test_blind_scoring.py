@@ -47,12 +47,9 @@ def test_interval_is_compared_at_the_port_where_the_effect_was_named():
         identifiers=["free_play"], places={"free_play": "root"}, truth={"free_play.stiffness": 4.0}
     )
     estimates = {"free_play.stiffness": [3.0, 4.0, 5.0], "gauge_gain.gain": [0.0, 0.1, 0.2]}
-    assert coverage(local, _said(kind="named", estimates=estimates, places={"free_play": "root"})) == {
-        "free_play.stiffness": True
-    }
-    assert coverage(local, _said(kind="named", estimates=estimates, places={"free_play": "tip"})) == {
-        "free_play.stiffness": None
-    }
+    for place, wanted in (("root", True), ("tip", None)):
+        verdict = _said(kind="named", estimates=estimates, places={"free_play": place})
+        assert coverage(local, verdict) == {"free_play.stiffness": wanted}
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 10), (10, 10), (97, 100), (1, 3)])

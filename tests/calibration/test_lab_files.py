@@ -65,8 +65,13 @@ def test_the_published_figures_are_those_of_the_authors_folder(reference):
     assert read.input_hashes == published.input_hashes
     assert [origin.read for origin in read.origins] == [True, True, False]
     assert "left aside" in read.origins[2].text
-    assert read.authors.samples.shape == (100, 5)
     assert read.trials is None
+    authors = read.authors.samples
+    assert authors.shape == (100, 5)
+    mean, deviation = authors.mean(axis=0), authors.std(axis=0, ddof=1)
+    assert mean[1:3] == pytest.approx([0.1691, 0.1337], abs=5e-5)
+    assert deviation[1:3] == pytest.approx([0.0039, 0.0077], abs=5e-5)
+    assert mean[3:] == pytest.approx([1.030, 7.66e-4], rel=7e-4)
 
 
 def test_digitised_records_are_fitted_by_their_extremes(reference):

@@ -18,7 +18,7 @@ from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.verdict import read_patch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
-from discrepancy.model_choice import ModelKind, choose_model
+from discrepancy.model_choice import choose_model
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.sensing import observe
@@ -34,7 +34,7 @@ from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
 from tests import command_line
 from tests.discrepancy.core.kit import problem_of
-from tests.discrepancy.rigs import MODEL, chosen, fmu_rig, hiding
+from tests.discrepancy.rigs import chosen, fmu_rig, hiding
 
 
 def run(*words, failed=False):
@@ -333,15 +333,6 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings():
 
 
 # ---------------------------------------------------------------- models by name or file
-
-
-def test_models_by_name_and_file(tmp_path):
-    shipped = choose_model(MODEL)
-    assert shipped.kind is ModelKind.LUMPED
-    assert shipped.path is None
-    own = choose_model(shutil.copy(SHIPPED_MODELS / f"{MODEL}.toml", tmp_path / "rig.toml"))
-    assert own.source_hash == shipped.source_hash
-    assert own.label == "rig.toml"
 
 
 def test_a_structure_needs_no_cache(write_beam, tmp_path, monkeypatch):

@@ -56,6 +56,12 @@ def beam_model(request: pytest.FixtureRequest) -> ReducedModel:
 
 
 @pytest.fixture(scope="session")
+def plate_model(plate_pair: tuple[object, ReducedModel]) -> ReducedModel:
+    """The plate with a hole, reduced."""
+    return plate_pair[1]
+
+
+@pytest.fixture(scope="session")
 def ours(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OurFmus:
     """Pack our own FMUs: `ours("compiled")` is a path."""
     return OurFmus(tmp_path_factory.mktemp("ours"), request.getfixturevalue)
@@ -68,7 +74,8 @@ def _packed(name: str) -> Any:
     return pytest.fixture(scope="session")(made)
 
 
-fmu, compiled_fmu, spring_mass = map(_packed, ("python", "compiled", "spring_mass"))
+NAMED = "python", "compiled", "spring_mass", "sensing", "patched"
+fmu, compiled_fmu, spring_mass, sensing, patched = map(_packed, NAMED)
 
 
 @pytest.fixture(scope="session")

@@ -133,7 +133,7 @@ def group(draw: st.DrawFn) -> Group:
     return Group(told, {**coords, **beside}, {"parameter": "e"} if draw(st.booleans()) else {})
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(groups=st.dictionaries(st.sampled_from(["one", "two", "three/inner"]), group(), min_size=1))
 def test_xarray_and_we_read_what_was_written(groups, tmp_path_factory):
     """To the last bit; and what is written twice has equal bytes."""

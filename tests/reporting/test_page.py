@@ -213,7 +213,6 @@ def test_text_is_mathematics_where_the_program_says_so(said):
         axes.set_title("of $x^2$" if said else r"of $\frac{1$ and of $x^2$", **said)
         axes.legend()
     assert (DOLLAR in figures.to_svg(figure)) == (not said)
-    assert figures.to_png(figure, 40)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")

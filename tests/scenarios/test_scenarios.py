@@ -5,23 +5,10 @@ import tomllib
 import pytest
 
 from fe.wing.design import SHIPPED_DESIGN
-from scenarios import asset_scripts, binding_files, recording_files, scenario_files
+from scenarios import recording_files, scenario_files
 from twin_master.mission.turns import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
-
-
-def test_what_is_shipped() -> None:
-    wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
-    wings |= {"level_turns_learning", "paper_level_turns", "three_regions", "inspected_wing"}
-    assert set(scenario_files()) == {*wings, "pump_wear", "watched_wing", "bracket", "stiffened_panel"}
-    assert set(binding_files()) == {
-        *("gear_pump", "three_fmus", "uav_wing", "uav_wing_fmi3"),
-        "uav_wing_laboratory",
-    }
-    assert set(asset_scripts()) == {"gear_pump"}
-    assert load_scenario("watched_wing").scenario.watch.recording == recording_files()["watched_wing"]
-
 
 SHAPES = {
     "bracket": (81, 40, 4),
@@ -39,6 +26,10 @@ def test_each_scenario_can_be_flown(name: str) -> None:
     scenario = load_scenario(name).scenario
     model = build_graphical_model(scenario)
     assert (model.states.size, *Truth(scenario, model, 0).noise.shape) == SHAPES.get(name, (25, 50, 24))
+
+
+def test_the_shipped_watch_reads_the_shipped_recording() -> None:
+    assert load_scenario("watched_wing").scenario.watch.recording == recording_files()["watched_wing"]
 
 
 def test_the_wing_with_a_third_region_is_the_shipped_one_with_a_third_region() -> None:

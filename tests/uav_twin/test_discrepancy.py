@@ -93,33 +93,6 @@ TWO = {
 }
 
 
-def test_everything_that_is_not_said_is_named_at_once():
-    for name, content in TWO.items():
-        Path(name).write_bytes(content)
-    sentence = refused("discrepancy", "import", *TWO, "--kind", "swing.csv=ringdown")
-    for part in (
-        "13 answers are missing, and nothing was written",
-        "--decimal NAME=... for 'pull.csv' (. or ,: '1,234' in line 2 can be read as both)",
-        "--decimal NAME=... for 'swing.csv' (. or ,: '1,000' in line 2 can be read as both)",
-        "--unit NAME=... for 'F', 'Weg' and 'q' (such as mm, kN or ms",
-        "--quantity NAME=... for 'U' (signal or voltage: V is a unit of each)",
-        "--release NAME=... for 'swing.csv' (how far the point was held",
-    ):
-        assert part in sentence
-    assert sorted(path.name for path in Path().iterdir()) == sorted(TWO)
-    columns = [
-        word for item in ("Weg=x", "F=force", "q=-", "Temp=-", "U=bridge") for word in ("--column", item)
-    ]
-    units = ("--quantity", "U=signal", "--unit", "F=kgf", "--unit", "Weg=in", "--release", "-0.5in")
-    given = (*columns, *units, "--kind", "pull.csv=static", "--decimal", ",")
-    taken(*TWO, "--kind", "swing.csv=ringdown", *given, "--out", "lab")
-    read = read_campaign("lab")
-    assert read.trials[0].force.tolist() == [9.80665, 2 * 9.80665]
-    assert read.trials[0].values[0].tolist() == [1.234 * 0.0254, 0.0]
-    assert read.trials[1].time.tolist()[1] == 0.002
-    assert read.trials[1].release.displacement == -0.0127
-
-
 def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
     for name in ("n1", "n2"):
         rest = "".join(f"{k / 100},{(k * 7) % 11 - 5},20\n" for k in range(40))
@@ -157,10 +130,13 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
 
 
 def test_the_force_of_a_ring_down_is_none_though_a_column_gives_it():
-    rows = "".join(f"{k / 100},{k % 5},{k}\n" for k in range(16))
-    Path("push.csv").write_text(f"time [s],force [N],x [mm]\n{rows}", "utf-8")
-    taken("push.csv", "--kind", "ringdown", "--column", "x=x", "--release", "1mm", "--out", "b")
-    assert read_campaign("b").trials[0].force.tolist() == [0.0] * 16
+    rows = "".join(f"{k / 100},{k % 5},{k},7\n" for k in range(16))
+    Path("push.csv").write_text(f"time [s],force [N],x [in],q\n{rows}", "utf-8")
+    given = ("--kind", "ringdown", "--column", "x=x", "--column", "q=-", "--release", "-0.5in")
+    taken("push.csv", *given, "--out", "b")
+    (trial,) = read_campaign("b").trials
+    assert (trial.force.tolist(), trial.values.shape) == ([0.0] * 16, (16, 1))
+    assert (trial.values[1, 0], trial.release.displacement) == (0.0254, -0.0127)
 
 
 def test_the_documented_files_print_the_documented_tables():

@@ -22,6 +22,7 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
+from reporting.text_file import read_bytes
 from twin_master.assets.parameter import ParameterDraws, draw_parameter
 from twin_master.errors import MissionInputError, said
 from twin_master.network.graphical_model import GraphicalModel
@@ -372,13 +373,7 @@ def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:
     MissionInputError
         One cannot be read.
     """
-    contents = {}
-    for copy, path in files.items():
-        try:
-            contents[copy] = path.read_bytes()
-        except OSError as error:
-            raise MissionInputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    return contents
+    return {copy: read_bytes(path, MissionInputError) for copy, path in files.items()}
 
 
 def keep_files(folder: Path, contents: Mapping[str, bytes]) -> None:

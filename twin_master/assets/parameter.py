@@ -90,12 +90,10 @@ def draw_parameter(
         assert mean is not None  # the schema asks for it
         if calibration.source == "fixed":
             return ParameterDraws(name, np.array([mean]), mean, 0.0, "fixed in the scenario")
-        from scipy.special import ndtri
-
-        from calibration.static.posterior import stratified
+        from calibration.static.posterior import GaussianPrior, stratified
 
         random = generator(seed, "calibration")
-        values = mean + deviation * ndtri(stratified(random, count))
+        values = GaussianPrior(mean, deviation).quantile(stratified(random, count))
         others = {} if found is None else found.given(name, values)
         source = "normal distribution of the scenario"
         return ParameterDraws(name, values, mean, deviation, source, others=others)

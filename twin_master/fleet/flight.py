@@ -10,11 +10,11 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reporting.files import atomic_write_bytes, atomic_write_text, written
+from reporting.files import atomic_write_text, written
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
-from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.asset_source import AssetSource, keep_files
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError, said
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
@@ -274,9 +274,7 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
 def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
     """Return what `fly_shard` wants of a scenario, what belongs to it made in a folder."""
     located = scenario.portable().moved(folder)
-    for name, content in source_of(scenario, real=real).files().items():
-        if not (folder / name).exists():
-            atomic_write_bytes(folder / name, content)
+    keep_files(folder, source_of(scenario, real=real).files())
     source = source_of(located, real=real)
     source.prepare(folder, SilentProgress())
     if not (folder / KNOWLEDGE_NAME).is_file():

@@ -339,7 +339,8 @@ class Twin:
         InvalidModelError
             It is no such state.
         """
-        try:
+        causes = ReducedModelFileError, KeyError, ValueError, TypeError
+        with InvalidModelError.instead_of(*causes, before="this is no saved state of a twin: "):
             arrays = arrays_from_bytes(state, "the state of the twin")
             turns, proposed = arrays["turns"].tolist()
             seen: list[_Seen] = []
@@ -352,8 +353,6 @@ class Twin:
                 }
                 control = int(arrays[f"{len(seen)}/control"])
                 seen.append(_Seen(arrays[f"{len(seen)}/observation"], Carried(control, own)))
-        except (ReducedModelFileError, KeyError, ValueError, TypeError) as error:
-            raise InvalidModelError(f"this is no saved state of a twin: {error}") from error
         self._turns, self._proposed = turns, proposed
         self._seen.clear()
         self._seen.extend(seen)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.model_choice import choose_model
 from discrepancy.models.fmu import FmuModel
@@ -21,7 +21,7 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, Primitive
-from tests.discrepancy.asking import FloatArray, integrated
+from tests.discrepancy.asking import FloatArray, campaign, integrated
 from tests.discrepancy.asking import seen as shown
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import chosen, fmu_rig, laws, measured
@@ -93,6 +93,12 @@ def test_a_changed_binding_is_another_model(foreign_fmu, tmp_path: Path) -> None
         (tmp_path / "rig_binding.toml").write_text(INPUTS.text("binding.toml", *changes), encoding="utf-8")
         hashes.append(choose_model(path).source_hash)
     assert len(set(hashes)) == 3
+
+
+def test_scales_are_at_the_parameters_of_a_campaign(rig: FmuModel) -> None:
+    given = Campaign("", {}, (LOADS,), None, {"stiffness_factor": (1.04, 0.01)}, "")
+    assert rig.scales(given).tip_stiffness == pytest.approx(1.04 * STIFFNESS, rel=1e-7)
+    assert rig.scales(campaign()).angular_frequency == pytest.approx(FREQUENCY, rel=1e-7)
 
 
 MOVED = {

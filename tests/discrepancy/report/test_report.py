@@ -18,7 +18,7 @@ from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability
 from discrepancy.models.structures import WingModel
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.page import parameter_rows, render_report
-from discrepancy.report.residual_figures import gauge_places, planform_figure, size, size_table
+from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.text import (
     WORDS,
     formula,
@@ -248,19 +248,6 @@ def test_a_headline_has_one_probability(drag):
     sentence = f"The nearest is outflow; {flow.name} closes 74 %."
     said = headline(replace(drag.verdict, sentence=sentence, effects=(flow,), hypotheses=()))
     assert said.startswith(f"The nearest is {flow.name}; {flow.name} closes 74 %")
-
-
-def test_sizes_are_one_for_noise_and_follow_what_is_added():
-    bench = Bench(amplitudes=(200.0, 150.0))
-    residuals = bench.fit(np.random.default_rng(3))
-    channels, _, table = size_table(residuals)
-    assert table.shape == (4, 3)
-    assert channels == ["g1", "g2", "g3", "g4"]
-    assert np.all(np.abs(table[:, :2] - 1.0) < 0.25)
-    item = residuals.trials[0]
-    louder = replace(item, residual=3.0 * item.residual)
-    assert size([louder], "g3") == pytest.approx(3.0 * size([item], "g3"), rel=1e-12)
-    assert min(table[2]) < size(residuals.trials, "g3") < max(table[2])
 
 
 def test_gauges_lie_where_the_design_has_them():

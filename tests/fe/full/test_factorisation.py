@@ -10,8 +10,7 @@ from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
 from fe.full import factorisation, subspace
-from fe.full.dissection import elimination_blocks
-from fe.full.factorisation import Factorisation, analyse, lowest_eigenpairs
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.full.subspace import OrthonormalBasis, ProjectedBasis, solved_near
 from fe.runtime.errors import SolutionError
 from fe.structure.affine import affine_sum
@@ -33,16 +32,6 @@ def random_matrix(seed: int, size: int, share: float, copies: int = 1) -> sparse
     block = random.standard_normal((copies, copies))
     matrix = sparse.kron(half + half.T + sparse.eye_array(size), block + block.T + 10.0 * np.eye(copies))
     return sparse.csr_array(matrix + sparse.diags_array(np.asarray(abs(matrix).sum(axis=1)) + 1e-3))
-
-
-def test_a_slender_body_is_cut_across():
-    # 60 x 6 x 4 vertices: the first separator, which comes last, is a section of 24.
-    body = grid(60, 6, 4)
-    held = np.bincount(elimination_blocks(body, np.ones(1440), 100))
-    assert held[-1] <= 30
-    assert held.max() <= 100
-    sizes = [(front.end - front.start, len(front.boundary)) for front in analyse(body)[1]]
-    assert sum(own * (own + boundary) for own, boundary in sizes) < 160_000
 
 
 @settings(max_examples=50, deadline=None)
@@ -104,22 +93,15 @@ def test_what_is_not_positive_definite_is_refused(matrix, sentence):
         Factorisation(sparse.csr_array(matrix)).solve(np.arange(float(matrix.shape[0])))
 
 
-def test_a_pattern_met_before_is_not_analysed_again(monkeypatch):
-    calls = []
-    monkeypatch.setattr(factorisation, "analyse", lambda matrix: calls.append(1) or analyse(matrix))
-    first = grid(9, 7, 3)
+def test_a_pattern_met_before_comes_with_other_values_and_may_change_in_place():
+    """What is kept of a pattern does not follow a matrix that is changed."""
+    first, third, right = grid(9, 7, 3), grid(7, 9, 3), np.arange(189.0)
     second = first.copy()
     second.data = second.data * np.where(second.data < 0.0, 0.5, 2.0)
-    third = grid(7, 9, 3)
-    right = np.arange(189.0)
     for matrix in (first, second, third, first):
         assert matrix @ Factorisation(matrix).riesz(right) == pytest.approx(right, abs=1e-10)
-    assert len(calls) == 2
-    second.indices[:] = third.indices  # what is kept does not follow a matrix that is changed in place
-    second.indptr[:] = third.indptr
-    second.data[:] = third.data
+    second.indices[:], second.indptr[:], second.data[:] = third.indices, third.indptr, third.data
     assert second @ Factorisation(second).riesz(right) == pytest.approx(right, abs=1e-10)
-    assert len(calls) == 2
 
 
 # ---------------------------------------------------------------- several at once
@@ -169,42 +151,36 @@ def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_no
 
 
 def test_a_basis_holds_what_it_was_given_and_says_what_it_dropped():
-    """Blocks with copies, zeros and directions of all sizes: orthonormal, and the rest is below the bound."""
-    rng = np.random.default_rng(5)
-    basis, own = OrthonormalBasis(SIZE, drop=1e-8), rng.normal(size=(SIZE, 12))
+    """Blocks with copies, zeros and directions of all sizes: orthonormal in energy, with its terms projected.
+
+    The rest is below the bound; a load and its answer are whitened alike.
+    """
+    random, factors = np.random.default_rng(5), Factorisation(WHOLE)
+    plain, basis = OrthonormalBasis(SIZE, drop=1e-8), ProjectedBasis(factors, TERMS, (WHOLE,), drop=1e-8)
+    assert plain.extend(np.zeros((SIZE, 3))).shape == (0, 3)
+    assert (plain.vectors.shape, plain.dropped_square) == ((SIZE, 0), 0.0)
+    own = random.normal(size=(SIZE, 12))
+    whitened = factors.whitened(WHOLE @ own)
+    np.testing.assert_allclose(factors.unwhitened(whitened), own, rtol=1e-9, atol=1e-9)
     blocks = [
         own[:, :4],
-        np.column_stack((own[:, :4] @ rng.normal(size=(4, 3)), own[:, 4:8], np.zeros(SIZE))),
-        own[:, :8] @ rng.normal(size=(8, 5)) + 10.0 ** -np.arange(1.0, 14.0, 2.6) * own[:, 7:12],
+        np.column_stack((own[:, :4] @ random.normal(size=(4, 3)), own[:, 4:8], np.zeros(SIZE))),
+        own[:, :8] @ random.normal(size=(8, 5)) + 10.0 ** -np.arange(1.0, 14.0, 2.6) * own[:, 7:12],
     ]
-    coordinates = [basis.extend(block) for block in blocks]
-    vectors = basis.vectors
-    np.testing.assert_allclose(vectors.T @ vectors, np.eye(vectors.shape[1]), atol=1e-7)
-    left = [b - vectors[:, : len(c)] @ c for b, c in zip(blocks, coordinates, strict=True)]
+    left = []
+    for block in blocks:
+        known = basis.vectors.shape[1]
+        images, _ = basis.add(block)
+        np.testing.assert_array_equal(images[0], TERMS[0] @ basis.displacements[:, known:])
+        coordinates = plain.extend(block)
+        left.append(block - plain.vectors @ coordinates)
+    np.testing.assert_array_equal(basis.vectors, plain.vectors)
     missing = np.linalg.norm(np.concatenate(left, axis=1), axis=0)
-    assert 8 < vectors.shape[1] < 12
+    assert 8 < basis.vectors.shape[1] < 12
     assert 0.0 < missing.max() <= np.sqrt(basis.dropped_square) * (1.0 + 1e-6) + 1e-12
     assert np.sqrt(basis.dropped_square) < 1e-6
-    nothing = OrthonormalBasis(SIZE, drop=1e-8)
-    assert nothing.extend(np.zeros((SIZE, 3))).shape == (0, 3)
-    assert (nothing.vectors.shape, nothing.dropped_square) == ((SIZE, 0), 0.0)
-
-
-def test_a_basis_of_displacements_is_orthonormal_in_energy_with_its_terms_projected():
-    """Also with nearly dependent vectors; a load and its answer are whitened alike."""
-    random, factors = np.random.default_rng(5), Factorisation(WHOLE)
-    basis, first = ProjectedBasis(factors, TERMS, (WHOLE,), drop=1e-9), random.normal(size=(SIZE, 5))
-    loads = WHOLE @ first
-    np.testing.assert_allclose(factors.unwhitened(factors.whitened(loads)), first, rtol=1e-9, atol=1e-9)
-    near = loads + 1e-6 * random.normal(size=first.shape)
-    for block in (
-        loads,
-        np.concatenate((near, loads @ random.normal(size=(5, 3)), np.zeros((SIZE, 1))), axis=1),
-    ):
-        images, _ = basis.add(factors.whitened(block))
-        np.testing.assert_array_equal(images[0], TERMS[0] @ basis.displacements[:, -5:])
     vectors, (inner, whole) = basis.displacements, basis.inner
-    np.testing.assert_allclose(vectors.T @ WHOLE @ vectors, np.eye(10), atol=1e-9)
-    np.testing.assert_allclose(whole[0], np.eye(10), atol=1e-9)
-    for term, own in zip(TERMS, inner, strict=True):
-        np.testing.assert_allclose(own, vectors.T @ term @ vectors, atol=1e-9)
+    for found in (vectors.T @ WHOLE @ vectors, whole[0], basis.vectors.T @ basis.vectors):
+        np.testing.assert_allclose(found, np.eye(len(found)), atol=1e-7)
+    for term, projected in zip(TERMS, inner, strict=True):
+        np.testing.assert_allclose(projected, vectors.T @ term @ vectors, atol=1e-9)

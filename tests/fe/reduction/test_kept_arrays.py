@@ -1,21 +1,21 @@
-"""What is kept: arrays in files, read to the last bit or refused; entries of the cache, built once."""
+"""What is kept: arrays in files, read to the last bit or refused; entries of the cache, built once; loops."""
 
 import errno
+import importlib.util
 import io
 import multiprocessing
 import os
 import subprocess
 import sys
-import time
 import zipfile
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from threading import Timer
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,16 +23,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from threadpoolctl import threadpool_limits
 
+from fe.compilation import compiled
 from fe.reduction import model_cache
 from fe.reduction.built_once import built_once, cache_folder
-from fe.reduction.model_cache import (
-    MODELLING_ROOMS,
-    WingFields,
-    entry,
-    patch_arrays,
-    reduced_model,
-    wing_fields,
-)
+from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
 from fe.runtime import arrays as array_records
 from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
@@ -53,18 +47,6 @@ def test_archives_give_back_what_they_were_given(values):
             np.testing.assert_array_equal(arrays["values"], values)
             assert (arrays["values"].shape, arrays["values"].dtype) == (values.shape, values.dtype)
             assert (str(arrays["text"]), arrays["number"].shape) == ("µ", ())
-
-
-def test_bytes_depend_on_the_arrays_only():
-    values = np.arange(6.0).reshape(2, 3)
-    first = arrays_to_bytes({"a": values, "b": values[0]})
-    assert first == arrays_to_bytes({"b": values[0].copy(), "a": np.asfortranarray(values)})
-    assert first != arrays_to_bytes({"a": values, "b": values[1]})
-    with zipfile.ZipFile(io.BytesIO(first)) as archive:
-        assert archive.namelist() == ["a.npy", "b.npy"]
-        assert {member.date_time for member in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
-    with pytest.raises(ValueError, match="Object arrays"):
-        arrays_to_bytes({"bad": np.array([object()])})
 
 
 def refuses(content: bytes, words: str = "not a sound archive of plain arrays") -> None:
@@ -177,7 +159,6 @@ def builds(monkeypatch: pytest.MonkeyPatch, coarse_fields, coarse_patch_arrays) 
     def building(made: KeptArrays) -> Callable[..., KeptArrays]:
         def build(design: WingDesign, *_: object) -> KeptArrays:
             built.append(design.name)
-            time.sleep(0.05)
             return replace(made, design_hash=design.hash)
 
         return build
@@ -185,12 +166,6 @@ def builds(monkeypatch: pytest.MonkeyPatch, coarse_fields, coarse_patch_arrays) 
     monkeypatch.setattr(model_cache, "build_fields", building(coarse_fields))
     monkeypatch.setattr(model_cache, "build_patch_arrays", building(coarse_patch_arrays))
     return built
-
-
-def test_cache_lies_where_the_user_says(own_cache, monkeypatch):
-    assert cache_folder() == own_cache
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache_folder() == Path.home() / ".cache" / "uav-twin"
 
 
 def test_what_is_unchanged_is_built_once_and_what_is_changed_anew(
@@ -232,25 +207,6 @@ def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, kind, make, 
     assert len(builds) == 1 + (kind != "wing")  # the model alone is among the fields
 
 
-def test_many_at_once_build_once_and_agree(builds, coarse_design):
-    with ThreadPoolExecutor(6) as threads:
-        results = list(threads.map(lambda _: reduced_model(coarse_design).to_bytes(), range(6)))
-    assert len(set(results)) == len(builds) == 1
-
-
-def test_failed_build_keeps_nothing_and_the_next_succeeds(builds, coarse_design, own_cache, monkeypatch):
-    def failing(*_: object) -> WingFields:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as broken:
-        broken.setattr(model_cache, "build_fields", failing)
-        with pytest.raises(KeyboardInterrupt):
-            reduced_model(coarse_design)
-    assert {path.suffix for path in own_cache.iterdir()} == {".lock"}
-    reduced_model(coarse_design)
-    assert len(builds) == 1
-
-
 def test_without_a_place_to_keep_it_the_model_is_still_given(
     builds, coarse_design, tmp_path, monkeypatch, caplog
 ):
@@ -258,6 +214,8 @@ def test_without_a_place_to_keep_it_the_model_is_still_given(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a file"))
     assert reduced_model(coarse_design).design_hash == coarse_design.hash
     assert "could not be kept" in caplog.text
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert cache_folder() == Path.home() / ".cache" / "uav-twin"
 
 
 def test_every_file_that_shapes_the_model_counts_for_the_key():
@@ -310,9 +268,68 @@ def test_a_wait_is_said_and_ends_with_the_other(tmp_path, caplog, killed):
     other.join(60.0)
 
 
-def test_a_full_disk_stops_no_build(tmp_path, monkeypatch):
+def test_a_full_disk_stops_no_build_and_a_build_that_fails_keeps_nothing(tmp_path, monkeypatch):
     def full(handle: int, content: bytes, at: int) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    def failing() -> str:
+        raise KeyboardInterrupt
+
+    path = tmp_path / "model.npz"
+    with pytest.raises(KeyboardInterrupt):
+        built_once(path, path.read_text, failing, path.write_text)
+    assert [left.suffix for left in tmp_path.iterdir()] == [".lock"]
     monkeypatch.setattr(os, "pwrite", full)
-    assert ours(tmp_path / "model.npz") == "ours"
+    assert ours(path) == "ours"
+
+
+# ---------------------------------------------------------------- loops
+
+
+def test_without_a_folder_for_the_cache_it_still_compiles(monkeypatch):
+    assert compiled(lambda value: 2.0 * value)(3.0) == 6.0
+    njit, asked = numba.njit, []
+
+    def no_folder(**options):
+        asked.append(options)
+        if options.get("cache"):
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(**options)
+
+    monkeypatch.setattr(numba, "njit", no_folder)
+    assert compiled(lambda value: 2.0 * value)(3.0) == 6.0
+    assert [options.get("cache", False) for options in asked] == [True, False]
+
+
+INNER = (
+    "from fe.compilation import compiled\nSTEP = {step}\n@compiled\ndef inner(x):\n    return x + {added}\n"
+)
+OUTER = (
+    "from fe.compilation import compiled\nfrom inner import STEP, inner\n"
+    "@compiled\ndef outer(x):\n    return STEP * inner(x)\n"
+)
+
+
+@pytest.mark.parametrize("change", [{"added": 5.0}, {"step": 7.0}])
+def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(tmp_path, monkeypatch, change):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
+
+    def outer(**numbers: float) -> tuple[float, int]:
+        """Write both modules; return what the outer gives for 1, and how often it compiled."""
+        (tmp_path / "inner.py").write_text(INNER.format_map({"step": 1.0, "added": 1.0} | numbers))
+        (tmp_path / "outer.py").write_text(OUTER)
+        for name in ("inner", "outer"):
+            specification = importlib.util.spec_from_file_location(name, tmp_path / f"{name}.py")
+            assert specification is not None
+            assert specification.loader is not None
+            module = importlib.util.module_from_spec(specification)
+            monkeypatch.setitem(sys.modules, name, module)
+            specification.loader.exec_module(module)
+        return module.outer(1.0), sum(module.outer.stats.cache_misses.values())
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    assert outer() == (2.0, 1)
+    assert outer() == (2.0, 0)
+    changed = change.get("step", 1.0) * (1.0 + change.get("added", 1.0))
+    assert outer(**change) == (changed, 1)
+    assert outer() == (2.0, 0)

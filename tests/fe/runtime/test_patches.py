@@ -2,13 +2,11 @@
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 from scipy.special import hyp1f1
 
 from fe.high_pass import filtered_record, high_pass
@@ -192,24 +190,6 @@ def test_what_cannot_be_is_refused_in_one_sentence(kind, given, sentence):
 
 
 # ---------------------------------------------------------------- high-pass
-
-
-@pytest.mark.parametrize("order", [1.0, 2.0, 3.0])
-@pytest.mark.parametrize("held", [None, 0.0])
-def test_high_pass_against_an_integrator(order, held):
-    times, signal, tau = np.arange(60) * 0.02, np.random.default_rng(2).normal(size=60), 0.11
-
-    def slope(t: float, low: np.ndarray) -> np.ndarray:
-        # each stage is given what the one before leaves of the signal
-        given = np.interp(t, times, signal) - np.concatenate(([0.0], np.cumsum(low)[:-1]))
-        return (given - low) / tau
-
-    low = [np.zeros(int(order))]
-    low[0][0] = signal[0] if held is None else held
-    for begin, end in pairwise(times):
-        low.append(solve_ivp(slope, (begin, end), low[-1], rtol=1e-10, atol=1e-12).y[:, -1])
-    expected = signal - np.sum(low, axis=1)
-    assert high_pass(signal, 0.02, tau, order, held) == pytest.approx(expected, abs=1e-8)
 
 
 @given(st.floats(0.0, 4.0), st.floats(1e-4, 50.0))

@@ -152,7 +152,7 @@ def watched(step: float, kind: str) -> Any:
 
 
 COUPLED = [({}, {}), ({"exchange": True}, {}), ({"substeps": 3}, {}), ({"delayed": True}, {}), ({}, JACOBI),
-           ({"exchange": True, "substeps": 3}, JACOBI)]  # fmt: skip
+           ({"exchange": True, "substeps": 3}, JACOBI), ({}, {"iterations": 50})]  # fmt: skip
 
 
 @pytest.mark.parametrize(("system_options", "asset_options"), COUPLED)
@@ -171,30 +171,6 @@ def test_the_error_of_a_system_falls_with_the_square_of_the_step(
     assert apart["linear", 40] < 0.3 * apart["zero-order", 40]
 
 
-def test_iterations_make_lines_between_both_ends(foreign_fmu) -> None:
-    """Settled, each input is the line between the other's states: no extrapolation is left in it."""
-    options = {"isolated": False, "iterations": 50, "tolerance": 1e-13}
-    with CoupledAsset(circle(foreign_fmu("follow2")), watched(0.1, "linear"), **options) as asset:
-        seen = [asset.observe().values, *(asset.step().values for _ in range(3))]
-    lost = 1.0 - np.exp(-0.1)
-    for before, after in pairwise(seen):
-        for own, factor in ((0, -2.0), (1, 1.5)):
-            u, slope = factor * before[1 - own], factor * (after - before)[1 - own] / 0.1
-            expected = before[own] + lost * (u - before[own]) + slope * (0.1 - lost)
-            assert abs(after[own] - expected) < 1e-11
-
-
-def test_a_system_with_lines_is_restored(foreign_fmu) -> None:
-    structure = circle(foreign_fmu("follow2"), exchange=True)
-    with CoupledAsset(structure, watched(0.1, "linear"), isolated=False) as asset:
-        asset.simulate(steps=3)
-        kept = asset.save_state()
-        there = [asset.step().values.tobytes() for _ in range(3)]
-        asset.restore_state(kept)
-        assert [asset.step().values.tobytes() for _ in range(3)] == there
-        assert [name for name, part in asset._parts.items() if part.linear] == ["first", "second"]
-
-
 # ---------------------------------------------------------------------- wiring
 
 
@@ -211,11 +187,12 @@ def link(source: str, target: str, **options: Any) -> Connection:
 REFUSED = tables(__file__)
 
 
-def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
+def test_what_does_not_fit_is_one_sentence(base, foreign_fmu, tmp_path) -> None:
     first = base.components[0]
     refused = [({"connections": [link(*ends) for ends in joined]}, w) for joined, w in REFUSED["unjoined"]]
     for name, key, value, words in REFUSED["unset"]:
-        settled = replace(base.component(name), settings={key: Setting(*value)})
+        part = base.component(name) if name in PARTS else Component(name, foreign_fmu(name))
+        settled = replace(part, settings={key: Setting(*value)})
         refused += [({"components": [settled]}, words)]
     refused += [
         ({"components": []}, "has no component"),
@@ -231,7 +208,7 @@ def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
             expand(source, target, ["a", "b"])
 
 
-def test_units_and_types_are_converted(base) -> None:
+def test_units_and_types_are_converted(base, foreign_fmu) -> None:
     """The value of a connection is converted first, and transformed in the unit of the target."""
     seen = link("wing.tip_displacement", "seen", factor=2.0, offset=0.5)
     for options, conversion in (
@@ -247,6 +224,8 @@ def test_units_and_types_are_converted(base) -> None:
     given = {"mass.servo": Setting(150.0, "g"), "response": Setting("transient"), "health.z1": Setting(0.2)}
     wiring = Wiring(replace(base, components=(replace(base.component("wing"), settings=given),)))
     assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
+    switched = Component("a", foreign_fmu("array3"), {"active": Setting(False)})
+    assert Wiring(SystemStructure("one", (switched,))).settings == {"a": {"active": 0.0}}
     # An enumeration and an integer feed each other.
     joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))
     assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)

@@ -4,7 +4,7 @@ A start is a start: a reset that does nothing is not believed.
 """
 
 import logging
-from contextlib import closing
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,36 +12,27 @@ import pytest
 
 from fmu_asset import errors
 from fmu_asset.check import check_fmu
-from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import Component
 from fmu_asset.door import session
 from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import BINDINGS, BINDINGS_FOLDER, HOSTILE, INPUTS, KINDS
-from tests.fmu_asset.making import bound, changed, system
-from twin_master.library.grid import GridSampler, SamplingGrid
+from tests.fmu_asset.door.kinds import BINDINGS, HOSTILE, INPUTS, KINDS, bounces
+from tests.fmu_asset.making import archive_of, bound, changed, members
 
 # ---------------------------------------------------------------------- the wing
 
 
-def test_a_state_that_the_fmu_refuses_breaks_the_asset(fmu, binding) -> None:
-    with FmiAsset(fmu, binding) as asset:
-        asset.step({"load_factor": 2.0})
-        saved = asset.save_state()
-        with pytest.raises(errors.FmuStateError, match=r"refused the state"):
-            asset.restore_state(saved[:-40] + b"\0" * 8)
-        with pytest.raises(errors.FmuStateError, match="reset the asset"):
-            asset.step()
-        asset.reset()
-        assert asset.step({"load_factor": 2.0}).time == 1.0
+@pytest.mark.parametrize(("name", "changes", "tables", "kind", "sentence"), INPUTS["unfit"])
+def test_what_does_not_fit_the_fmu_is_one_sentence(
+    fmu, foreign_fmu, name, changes, tables, kind, sentence
+) -> None:
+    path = fmu if name == "uav_wing" else foreign_fmu.changed(name, "other", *changes)
+    with pytest.raises(getattr(errors, kind), match=sentence):
+        FmiAsset(path, changed(BINDINGS[name], **tables))
 
 
-def test_what_does_not_fit_the_fmu_is_one_sentence(fmu, binding) -> None:
-    for table, sentence in INPUTS["unfit"]:
-        with pytest.raises(errors.BindingError, match=sentence):
-            FmiAsset(fmu, changed(binding, **table))
-    for parameters, kind, sentence in INPUTS["parameters"]:
-        with pytest.raises(getattr(errors, kind), match=sentence):
-            FmiAsset(fmu, binding, parameters=parameters)
+@pytest.mark.parametrize(("parameters", "kind", "sentence"), INPUTS["parameters"])
+def test_parameters_that_do_not_fit_are_one_sentence(fmu, binding, parameters, kind, sentence) -> None:
+    with pytest.raises(getattr(errors, kind), match=sentence):
+        FmiAsset(fmu, binding, parameters=parameters)
 
 
 # ---------------------------------------------------------------------- in the midst of a run
@@ -49,31 +40,34 @@ def test_what_does_not_fit_the_fmu_is_one_sentence(fmu, binding) -> None:
 NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD = 1, 2, 3, 4, 5
 
 
-@pytest.mark.parametrize("bad", [0, 1, 9])
 @pytest.mark.parametrize(("behaviour", "kind", "sentence"), INPUTS["wrong"])
 def test_a_step_that_goes_wrong_ends_a_run_there(
-    spring_mass, spring_binding, isolated, behaviour, kind, sentence, bad, monkeypatch
+    spring_mass, spring_binding, isolated, behaviour, kind, sentence, monkeypatch
 ) -> None:
     """Whatever blocks it is made in; as single steps end there."""
     monkeypatch.setattr(session, "_BLOCK_BYTES", 3 * 6 * 8)
-    push, load = np.linspace(0.0, 1.0, 10), {"misbehaviour": np.where(np.arange(10) == bad, behaviour, 0)}
+    push = np.linspace(0.0, 1.0, 10)
     with (
         FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset,
         FmiAsset(spring_mass, spring_binding, isolated=False) as other,
     ):
-        for one in (asset, other):
-            one.step({"push": 0.3}, load={"misbehaviour": 0})
-        with pytest.raises(getattr(errors, kind), match=sentence):
-            asset.simulate({"push": push}, load=load)
-        for value in push[:bad]:
-            other.step({"push": value})
-        assert asset.step_index == bad + 1 + (behaviour == NOT_A_NUMBER)  # after which the step was made
-        if behaviour == DISCARD:  # it is where it was before
-            assert asset.save_state() == other.save_state()
-            assert asset.step().values.tobytes() == other.step().values.tobytes()
-        elif behaviour == RAISE:
-            with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
-                asset.simulate(steps=2)
+        for bad in (0, 1, 9):
+            for one in (asset, other):
+                one.reset()
+                one.step({"push": 0.3}, load={"misbehaviour": 0})
+            with pytest.raises(getattr(errors, kind), match=sentence):
+                asset.simulate(
+                    {"push": push}, load={"misbehaviour": np.where(np.arange(10) == bad, behaviour, 0)}
+                )
+            for value in push[:bad]:
+                other.step({"push": value})
+            assert asset.step_index == bad + 1 + (behaviour == NOT_A_NUMBER)  # after which the step was made
+            if behaviour == DISCARD:  # it is where it was before
+                assert asset.save_state() == other.save_state()
+                assert asset.step().values.tobytes() == other.step().values.tobytes()
+            elif behaviour == RAISE:
+                with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
+                    asset.simulate(steps=2)
 
 
 def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass, spring_binding) -> None:
@@ -132,27 +126,6 @@ def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu, state, isolated
         with asset.sibling() as other:
             other.restore_state(kept)
             assert other.simulate({"u": LINE[3:]}).values.tobytes() == there.values.tobytes()
-
-
-@pytest.mark.parametrize("interface", ["co-simulation", "model-exchange"])
-def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu, interface) -> None:
-    binding, seen = changed(LINES, header={"interface": interface, "step_size": 0.1, "decimation": 3}), []
-    for kind in ("zero-order", "linear"):
-        held = binding.with_header(interpolation=kind)
-        with FmiAsset(foreign_fmu("follow2"), held, isolated=False) as asset:
-            asset.reset(control={"u": 0.7})
-            seen.append(asset.simulate(steps=5).values.tobytes())
-    assert seen[0] == seen[1]
-
-
-def test_a_line_that_goes_on_is_no_event(foreign_fmu) -> None:
-    mode, record = {"mode": {"variable": "mode", "unit": "1"}}, {"variables": ["events"]}
-    binding = changed(LINES, header={"interface": "model-exchange"}, load=mode, record=record)
-    with FmiAsset(foreign_fmu("follow2"), binding, isolated=False) as asset:
-        asset.reset({}, control={"u": 0.0}, load={"mode": 0})
-        smooth = asset.simulate({"u": [0.3, 0.1, 0.4]}).extra["events"]
-        assert len(set(smooth.tolist())) == 1
-        assert asset.step({"u": 0.5}, load={"mode": 1}).extra["events"] == smooth[-1] + 1
 
 
 # ---------------------------------------------------------------------- starts
@@ -233,27 +206,8 @@ def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fm
         assert len(set(seen[7:])) == 1
 
 
-def test_a_library_is_sampled_from_fresh_starts(foreign_fmu) -> None:
-    """Every point is the equilibrium; without a new start the mass would stay where it was."""
-    binding = BINDINGS_FOLDER / "spring2.toml"
-    fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING", "STANDS_STILL_ONCE_TERMINATED", "FRICTION=4.0")
-    grid = SamplingGrid(
-        fmu=str(fmu), binding=str(binding), role="motion", parameter="", draws=(0.0,), settling_steps=200,
-        states={"spring": (4.0, 5.0, 8.0)}, controls={"weak": {"push": 2.0}, "strong": {"push": 4.0}},
-    )  # fmt: skip
-    with closing(GridSampler(grid)) as sampler:
-        found = sampler.block(0, 6)[:, 0]
-    np.testing.assert_allclose(found, [0.5, 1.0, 0.4, 0.8, 0.25, 0.5], rtol=1e-9)
-
-
-def test_a_check_names_it_and_components_of_a_system_start_anew(foreign_fmu) -> None:
-    fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING")
-    watched = bound(0.1, {"x": ("spring.position", "m")}, control={"push": ("spring.force", "N")})
-    with CoupledAsset(system([Component("spring", fmu)], []), watched) as asset:
-        first = flown(asset)
-        asset.reset()
-        assert flown(asset) == first
-    (problem,) = check_fmu(fmu, step_size=0.1).problems
+def test_a_check_names_a_reset_that_does_nothing(foreign_fmu) -> None:
+    (problem,) = check_fmu(foreign_fmu("spring2", "RESET_DOES_NOTHING"), step_size=0.1).problems
     assert problem.startswith("Its reset returns OK and does not bring it back to its start")
     assert check_fmu(foreign_fmu("hostile2", "NEGATIVE_ZERO_AFTER_RESET")).passed
 
@@ -272,9 +226,6 @@ def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, sc
     with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=isolated) as asset:
         asset.step({"u": 2.0})
         forks = [asset.fork() for _ in range(3)]
-        for number, fork in enumerate(forks):
-            assert (fork.time, fork.step_index) == (1.0, 1)
-            assert fork.step({"u": float(number)}).values[0] == 2.0 + number
         forks[0].close()
         process = asset.worker_process_id
         for _ in range(20):
@@ -283,7 +234,7 @@ def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, sc
         assert asset.worker_process_id == process
     assert not isolated or not (Path("/proc") / str(process)).exists()  # gone at once
     assert len([*scratch.rglob("modelDescription.xml")]) == 1
-    assert [fork.step().values[0] for fork in forks[1:]] == [4.0, 6.0]
+    assert [fork.step({"u": 1.0}).values[0] for fork in forks[1:]] == [3.0, 3.0]
     for fork in forks:
         fork.close()
     assert not list(scratch.iterdir())
@@ -295,12 +246,117 @@ def test_siblings_have_parameters_of_their_own(foreign_fmu) -> None:
     np.testing.assert_allclose(seen, (1.0 - np.exp(-0.3)) * np.array([[2.0], [3.0]]), rtol=1e-12)
 
 
-def test_after_a_crash_the_files_are_extracted_again(foreign_fmu, scratch) -> None:
-    with FmiAsset(foreign_fmu("hostile2", "ABORT"), HOSTILE) as asset, asset.fork() as fork:
-        asset.step(), asset.step()
+# ---------------------------------------------------------------------- what others' FMUs do
+
+LAG, FIXED, ARRAY, BALL = (BINDINGS[name] for name in ("lag1", "fixed2", "array3", "ball2"))
+
+
+def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu, isolated) -> None:
+    """Of FMI 1, by replay; a refusal between two observations leaves nothing to go on from."""
+    with FmiAsset(foreign_fmu("lag1"), LAG, isolated=isolated, parameters={"gain": 3.0}) as asset:
+        held = asset.step({"speed": 2.0}).values
         saved = asset.save_state()
-        with pytest.raises(Exception, match="SIGABRT"):
-            asset.step()
+        with pytest.raises(errors.FmuInputError, match=r"parameter\.gain = 101\.0 lies outside .* 0 to 100"):
+            asset.reset({"gain": 101.0})
+        with pytest.raises(errors.FmuCallError, match=r"(?s)fmiDoStep returned Error.*saturates"):
+            asset.step({"speed": 1500.0})
         asset.restore_state(saved)
-        assert len([*scratch.rglob("modelDescription.xml")]) == 2
-        assert fork.step().values[0] == 1.0
+        np.testing.assert_array_equal(asset.observe().values, held)
+    with FmiAsset(foreign_fmu("fixed2"), FIXED, isolated=isolated) as asset:
+        asset.step({"u": 3.0})
+        saved = asset.save_state()
+        following = asset.step({"u": -1.0}).values
+        with pytest.raises(errors.FmuCallError, match=r"It was step 5\d of the 100 between two observations"):
+            asset.step({"u": 2e6})
+        asset.restore_state(saved)
+        np.testing.assert_array_equal(asset.step({"u": -1.0}).values, following)
+
+
+def test_fmi_3_asks_to_end_or_returns_early(foreign_fmu, isolated) -> None:
+    with FmiAsset(foreign_fmu("array3"), ARRAY, isolated=isolated) as asset:
+        for offset, words in ((99, "asked to end the simulation in the step"), (98, "returned early")):
+            asset.reset()
+            with pytest.raises(errors.FmuCallError, match=words):
+                asset.step(load={"offset": offset})
+
+
+def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(foreign_fmu, tmp_path) -> None:
+    contents = {
+        name.replace("ball2", "ball-2"): text.replace(b'modelIdentifier="ball2"', b'modelIdentifier="ball-2"')
+        for name, text in members(foreign_fmu("ball2", "NOMINAL=0.0")).items()
+    }
+    with FmiAsset(archive_of(tmp_path / "ball-2.fmu", contents), BALL, isolated=False) as asset:
+        history = asset.simulate(steps=8)
+    expected = [bounces(0.7, 9.81, time)[:2] for time in history.time]
+    np.testing.assert_allclose(history.values * [1e-3, 1.0], expected, rtol=1e-6)
+
+
+SECOND_BOUNCE = math.sqrt(2.0 / 9.81) * 2.4
+
+
+ENDS = {  # what is observed, the step, where it ends, and what is seen there
+    "hostile2": ("y", "m", 1.0, 2.5, 2.5),
+    "ball2": ("h", "m", 0.1, SECOND_BOUNCE, 0.0),
+    "decay1": ("x", "K", 0.3, 1.0, math.exp(-1.0)),
+    "swing3": ("a", "1", 0.3, 1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("model", ENDS)
+def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(foreign_fmu, isolated, model) -> None:
+    """Discard and `fmi2Terminated`; events of model exchange in FMI 2, 1 and 3."""
+    name, unit, size, end, value = ENDS[model]
+    sent = {"control": {"u": ("u", "m/s")}} if model == "hostile2" else {}
+    binding = bound(size, {"y": (name, unit)}, **sent)
+    with FmiAsset(foreign_fmu(model, "ENDS"), binding, isolated=isolated) as asset:
+        history = asset.simulate(steps=50)
+        assert f"ended at t = {end:g} s" in history.ended
+        whole = int(end / size)
+        np.testing.assert_allclose(history.time, [*(size * np.arange(1, whole + 1)), end], rtol=1e-6)
+        assert history.values[-1, 0] == pytest.approx(value, abs=1e-5)
+        with pytest.raises(errors.FmuEndedError, match="has ended its simulation at t = "):
+            asset.step()
+        asset.reset()
+        assert [asset.step().values[0] for _ in range(whole)] == history.values[:whole, 0].tolist()
+        with pytest.raises(errors.FmuEndedError, match="asked to end the simulation in the step") as caught:
+            asset.step()
+        assert caught.value.time == pytest.approx(end, rel=1e-6)
+        assert asset.observe().values[0] == history.values[-1, 0]
+
+
+def test_ports_are_sent_and_read(foreign_fmu) -> None:
+    root, tip = BINDINGS["port_root"], BINDINGS["port_tip"]
+    beam = foreign_fmu.changed("room2", "beam", *INPUTS["beam"])
+    with FmiAsset(beam, root) as asset:
+        shown = asset.step(port={"p.force": 1.0e6})
+        steady = 283.15 + 1000.0 / 100.0
+        expected = steady + (293.15 - steady) * math.exp(-60.0 * 100.0 / 5e4)
+        assert shown.extra["p.displacement"] == pytest.approx(1e3 * expected)
+        assert asset.recorded_units == {"p.displacement": "mm", "p.velocity": "m/s"}
+    # Elements of an array go in, a whole array comes out.
+    fmu = foreign_fmu.changed("array3", "forces", ('min="-10" max="10"', 'min="-10" max="10" unit="N"'))
+    with FmiAsset(fmu, tip) as asset:
+        shown = asset.step(port={"p.force": [0.002, -0.001]})
+        found = [shown.extra["p.displacement[1]"], shown.extra["p.displacement[2]"]]
+        np.testing.assert_allclose(found, [-1e-3, 2e-3], rtol=1e-12)
+        with pytest.raises(errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"):
+            asset.step(port={"p.force": 1.0})
+
+
+def test_a_model_without_states_is_solved_as_well(foreign_fmu) -> None:
+    both = foreign_fmu.changed(
+        "fixed2", "both", ("<CoSimulation", '<ModelExchange modelIdentifier="fixed2"/><CoSimulation')
+    )
+    header = {"interface": "model-exchange"}
+    solved = bound(0.01, {"y": ("y", "1")}, control={"u": ("u", "1")}, header=header)
+    with FmiAsset(both, solved) as asset:
+        assert asset.step({"u": 3.0}).values[0] == 0.0
+
+
+def test_events_that_pile_up_are_one_sentence(foreign_fmu) -> None:
+    with FmiAsset(foreign_fmu("ball2"), bound(1.0, {"h": ("h", "mm")})) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(errors.FmuCallError, match=r"10000 events in the step from t = 2 s .* pile up"):
+            asset.step()
+        with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
+            asset.step()

@@ -6,7 +6,7 @@ Both sides hold the wing in the same few vectors; what can differ is the physics
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from fmu_asset.slaves.effects import output_channels
 from tests.command_line import command, refused, said
 from tests.fmu_asset.door.kinds import BINDINGS, KINDS
 from tests.fmu_asset.making import tables
-from tests.fmu_asset.ours import OurFmus, wing_arrays
+from tests.fmu_asset.ours import wing_arrays
 from tests.refusals import refused as no_line_end
 
 HERE, REFUSED = Path(__file__).parent, tables(__file__)
@@ -61,13 +61,10 @@ def on(*names: str) -> dict[str, float]:
 
 
 @pytest.fixture(scope="module")
-def sensing(ours: OurFmus) -> Path:
-    return ours("sensing")
-
-
-@pytest.fixture(scope="module")
-def patched(ours: OurFmus) -> Path:
-    return ours("patched")
+def flying(patched: Path) -> Iterator[FmiAsset]:
+    """The wing with effects, started anew by each test."""
+    with FmiAsset(patched, WARM, isolated=False) as asset:
+        yield asset
 
 
 @pytest.fixture(scope="module")
@@ -87,18 +84,19 @@ def flown(fmu: Path, rows: Sequence[Sequence[float]], start: float = 0.0, **para
 # ---------------------------------------------------------------------- files
 
 
-def test_the_table_only_grows_at_its_end(fmu, sensing) -> None:
-    plain, more = (read_model_description(str(path)).modelVariables for path in (fmu, sensing))
-    for one, other in zip(plain, more, strict=False):
-        assert (one.name, one.valueReference, one.start) == (other.name, other.valueReference, other.start)
-    assert len(more) > len(plain)
-
-
-def test_what_is_on_and_how_much_show_in_the_guid(model, sensing, tmp_path) -> None:
-    active = build_fmu(model, tmp_path / "on.fmu", patch=parse_patch(content()), activate=True)
+def test_the_table_only_grows_at_its_end_and_the_guid_tells_what_is_on(fmu, sensing, model, tmp_path) -> None:
+    active = build_fmu(model, tmp_path / "on.fmu", patch=parse_patch(content()), activate=True).path
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
-    other = build_fmu(model, tmp_path / "other.fmu", patch=changed)
-    assert len({read_model_description(str(path)).guid for path in (sensing, active.path, other.path)}) == 3
+    other = build_fmu(model, tmp_path / "other.fmu", patch=changed).path
+    plain, *more = (read_model_description(str(path)) for path in (fmu, sensing, active, other))
+    for one, another in zip(plain.modelVariables, more[0].modelVariables, strict=False):
+        assert (one.name, one.valueReference, one.start) == (
+            another.name,
+            another.valueReference,
+            another.start,
+        )
+    assert len(more[0].modelVariables) > len(plain.modelVariables)
+    assert len({each.guid for each in more}) == 3
 
 
 def test_the_patch_of_a_verdict_has_channels_that_are_outputs() -> None:
@@ -210,7 +208,7 @@ def expected(model: WingModel, given: Trial, patch: ModelPatch, health: np.ndarr
 
 
 @pytest.mark.parametrize(("kind", "name"), NAMED)
-def test_records_are_those_of_the_naming_side(kind, name, patched, naming_side) -> None:
+def test_records_are_those_of_the_naming_side(kind, name, flying, naming_side) -> None:
     """Within 1e-6 of the largest strain and the largest displacement."""
     patch, chosen, damage, columns = patch_of(name), OFF.get(name, on(name)), np.zeros((1, 2)), 26
     time = np.arange({TrialKind.RINGDOWN: 61, TrialKind.STATIC: len(FORCES), TrialKind.FLIGHT: 5}[kind])
@@ -233,10 +231,9 @@ def test_records_are_those_of_the_naming_side(kind, name, patched, naming_side) 
         health = dict(zip(("z1", "z2"), damage.T, strict=True))
         acting, course = {"load_factor": FACTORS}, {"control": {"load_factor": FACTORS}, "health": health}
     trial = Trial.plain("trial", kind, (), (1.0 if kind == TrialKind.FLIGHT else 0.01) * time, **acting)
-    with FmiAsset(patched, WARM, isolated=False, parameters=chosen) as asset:
-        asset.reset(control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]})
-        begin = [asset.observe().values] * (kind == TrialKind.RINGDOWN)
-        shown = np.array([*begin, *asset.simulate(**course).values])[:, :columns]
+    flying.reset(chosen, control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]})
+    begin = [flying.observe().values] * (kind == TrialKind.RINGDOWN)
+    shown = np.array([*begin, *flying.simulate(**course).values])[:, :columns]
     wanted, plain = (
         expected(naming_side, trial, each, damage)[:, :columns] for each in (patch, ModelPatch())
     )

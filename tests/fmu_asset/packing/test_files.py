@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from fmpy import read_model_description
 
-from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import WING, DigitalState
 from fmu_asset import errors
@@ -29,7 +28,6 @@ from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts, binding_files
-from tests.command_line import said
 from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python, tables
 from tests.fmu_asset.ours import STRUCTURES
 
@@ -60,7 +58,7 @@ def test_a_packed_fmu_is_sound(ours, name) -> None:
         found = [*check_file(inspect_fmu(ours(name))[0])]
     else:
         binding = load_binding(binding_files()["uav_wing_fmi3"]) if name == "fmi3" else None
-        check = check_fmu(ours(name), binding, cycles=20 if name in ("compiled", "fmi3", "exchange3") else 0)
+        check = check_fmu(ours(name), binding, cycles=5 if name in ("compiled", "fmi3", "exchange3") else 0)
         found = [(finding.check, finding.verdict, finding.text) for finding in check.findings]
         assert name == "exchange3" or {verdict for _, verdict, _ in found} == {"ok"}
     assert "problem" not in {verdict for _, verdict, _ in found}
@@ -229,6 +227,7 @@ def test_it_needs_numpy_alone(ours, tmp_path) -> None:
         texts = {entry: text for entry, text in members(ours(name)).items() if entry.endswith(".py")}
         assert not [entry for entry, text in texts.items() if project.search(text)]
     shutil.unpack_archive(ours("python"), tmp_path, "zip")
+    assert {path.name for path in (tmp_path / "binaries").iterdir()} == {"linux64", "win64"}
     for folder in Path(np.__file__).parents[1].glob("numpy*"):
         (tmp_path / "resources" / folder.name).symlink_to(folder)
     environment = {"PYTHONPATH": str(tmp_path / "resources")}
@@ -262,24 +261,8 @@ def test_a_damaged_data_file_is_refused_with_a_sentence(ours, binding, tmp_path,
         FmiAsset(archive_of(tmp_path / "damaged.fmu", contents), binding, isolated=isolated).step()
 
 
-@pytest.mark.long
-def test_fmpy_compiles_the_sources(ours, binding, tmp_path) -> None:
-    """As a user of another platform does: the sources alone, through fmpy's own CMake project."""
-    installed("cmake")
-    kept = {n: c for n, c in members(ours("compiled")).items() if not n.startswith("binaries/")}
-    path = archive_of(tmp_path / "wing.fmu", kept)
-    words = [BIN / "fmpy", "compile", path, "--all-warnings", "--warning-as-error"]
-    found = {**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
-    run(words, check=True, env=found)
-    assert check_fmu(path).passed
-    with FmiAsset(path, binding) as theirs, FmiAsset(ours("compiled"), binding) as mine:
-        for z1 in (0.0, 0.5):
-            seen = [asset.step({"load_factor": 3.0}, {"z1": z1}) for asset in (theirs, mine)]
-            np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)
-
-
 def test_cmake_builds_the_sources(model, compiler, tmp_path) -> None:
-    """As a user without fmpy does: the project among the sources puts the binary in its place."""
+    """As on another platform: the project among the sources puts the binary in its place."""
     cmake, wing = installed("cmake"), tmp_path / "wing"
     shutil.unpack_archive(build_fmu(model, tmp_path / "wing.fmu", kind="source", fmi=3).path, wing, "zip")
     place = ["-S", wing / "sources", "-B", tmp_path / "build", "-DCMAKE_C_FLAGS=-O0 -Werror"]
@@ -310,25 +293,7 @@ def test_compilers_that_are_not_there_fail_or_are_chosen(compiler, model, tmp_pa
     assert not (tmp_path / "wing.fmu").exists()
 
 
-# ---------------------------------------------------------------------- command lines
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("wing")
-def test_the_command_line_builds_the_shipped_wing(compiler, binding, tmp_path) -> None:
-    """Sound, without a warning, and with the numbers of its model."""
-    model, parameters = reduced_model(), {"young_modulus_factor": 1.0073}
-    for kind, platforms in {"compiled": {"linux64"}, "python": {"linux64", "win64"}}.items():
-        path = tmp_path / f"{kind}.fmu"
-        said("fmu", "build", "--kind", kind, "--out", path)
-        assert {name.split("/")[1] for name in members(path) if name.startswith("binaries/")} == platforms
-        assert {finding.verdict for finding in check_fmu(path).findings} == {"ok"}
-        with FmiAsset(path, binding, parameters=parameters) as asset:
-            for loss in ((0.0, 0.0), (0.6, 0.2), (0.8, 0.8)):
-                seen = asset.step({"load_factor": 3.0}, dict(zip(("z1", "z2"), loss, strict=True)))
-                expected = model.static_response(**parameters, stiffness_loss=loss, load_factor=3.0)
-                np.testing.assert_allclose(seen.values, expected.strain, rtol=1e-9 * (kind == "compiled"))
-                assert 0.0 < seen.extra["strain_error_bound"] < 1e-3 * seen.values.max()
+# ---------------------------------------------------------------------- another host
 
 
 @pytest.mark.parametrize("kind", ["compiled", "python"])

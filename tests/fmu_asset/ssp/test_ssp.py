@@ -293,15 +293,6 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu, tmp_path) -> None:
         Wiring(replace(wiring.structure, connections=(array,)))
 
 
-def test_what_is_no_single_number_or_no_start_is_not_set(foreign_fmu) -> None:
-    for model, name, words in CASES["unset"]:
-        wrong = Component("a", foreign_fmu(model), {name: Setting(1.0)})
-        with pytest.raises(CouplingError, match=re.escape(f"a.{name} cannot be set: {words}")):
-            Wiring(SystemStructure("one", (wrong,)))
-    switched = Component("a", foreign_fmu("array3"), {"active": Setting(False)})
-    assert Wiring(SystemStructure("one", (switched,))).settings == {"a": {"active": 0.0}}
-
-
 def test_start_values_of_outputs_are_set(foreign_fmu) -> None:
     """SSP 1.0, 5.2.3: what a parameter binding can set is everything that starts with a given value."""
     ball = Component("ball", foreign_fmu("ball2"), {"h": Setting(3.0), "v": Setting(-1.0)})

@@ -153,9 +153,6 @@ def test_a_model_error_reaches_the_twin(library_file, tmp_path):
     sensors = prepare_knowledge(scenario, asset_source(scenario), 1).sensor_model
     expected = np.hypot(125e-6, np.arange(24) / 100.0 * sensors.mean)
     np.testing.assert_allclose(sensors.total_standard_deviation, expected, rtol=1e-12)
-    assert Scenario.model_validate(scenario.to_dict()) == scenario
-    one = load_scenario(written(tmp_path, TEXT, ("# model_error_percent", "model_error_percent"))).scenario
-    assert one.observation.model_error == pytest.approx(0.03)
 
 
 @pytest.mark.slow

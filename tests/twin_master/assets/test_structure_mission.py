@@ -75,28 +75,6 @@ def test_the_twin_finds_the_damage_of_the_full_model(flown):
     assert not (flown / "wing.vtu").exists()
 
 
-def test_damage_between_two_levels_does_not_condemn_a_sound_region(tmp_path):
-    """The heel stands at 70 %, half way between two levels, and the gauge of the arm is lost.
-
-    A twin that takes it to be at a level believes with certainty that the arm has lost 80 %.
-    """
-    coarse = {"levels_percent": [0, 20, 40, 60, 80], "prior": [1, 0, 0, 0, 0]}
-    noise = {"standard_deviation_microstrain": 3}
-    truth = {
-        "gains": [{"state": "z_heel", "first_step": 1, "last_step": 5, "gain_percent": 14}],
-        "noise": noise,
-        "sensor_faults": [{"kind": "dropout", "sensors": [2], "first_step": 0}],
-    }
-    loaded = short(
-        state=[factor | coarse for factor in STATES],
-        observation=noise,
-        transition={"probability": {"smooth": 0.02, "rough": 0.08}},
-        truth=truth,
-    )
-    probability = fly(loaded, tmp_path / "run")["filtered"]["probability"].values.reshape(-1, 5, 5)
-    assert np.all(probability[-3:, :, 0].sum(axis=1) > 0.4)
-
-
 @pytest.mark.long
 def test_damage_is_found_from_frequencies_alone(tmp_path):
     """Three natural frequencies in the place of gauges; those flown are the full model's."""

@@ -231,7 +231,7 @@ def twins() -> dict[str, Twin]:
 EXTREME = st.floats(allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308, np.nan])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(rows=st.lists(st.tuples(EXTREME, EXTREME), min_size=1, max_size=6), late=st.integers(0, 6))
 def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, late):
     ordinary = drawn(np.random.default_rng(2), 4, 2)
@@ -346,6 +346,9 @@ def test_belief_and_decision_follow_what_holds_now(between):
         ahead = found.prediction
         assert np.all(ahead.control_probability[:, 0] >= none - 1e-12)
         np.testing.assert_allclose(ahead.joint.sum(axis=1), ahead.control_probability, atol=1e-12)
+    alarms = [notice for found in course[True] for notice in found.notices if notice.kind == "alarm"]
+    assert [alarm.sensors[0] for alarm in alarms] == [17, 17]
+    assert "least gauges 17 and " in alarms[1].sentence  # of those that are off it was, too
     sentences = [n.sentence for found in course[True] for n in found.notices if n.kind == "hypothesis"]
     assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
     assert "the model explains the gauges again (probability" in sentences[1]

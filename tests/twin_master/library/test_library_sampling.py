@@ -74,7 +74,7 @@ def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, request)
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, former))
     slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 20)))
-    whole = sample_library(slow, tmp_path / "whole.nc", workers=2)
+    whole = sample_library(slow, tmp_path / "whole.nc", workers=1)
     fmu, binding = files
     out = tmp_path / "part.nc"
     command = [sys.executable, "-m", "uav_twin", "library", "sample", "--quiet", "--workers", "1"]

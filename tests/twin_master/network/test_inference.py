@@ -135,10 +135,3 @@ REFUSED = [
 def test_what_does_not_fit_is_refused(make, sentence):
     with pytest.raises((InvalidModelError, InvalidObservationError), match=sentence):
         make()
-
-
-def test_an_empty_history_is_no_error():
-    filtered = filter_sequence(MODEL, [], np.zeros((0, 25)))
-    assert filtered.filtered.shape == (0, 25)
-    assert smooth(MODEL, [], filtered.log_filtered).shape == (0, 25)
-    assert predict(MODEL, MODEL.prior, 1, POLICY, 0).joint.shape == (0, 25, 2)

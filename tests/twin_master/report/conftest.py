@@ -12,17 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tests.twin_master.runs import changed_scenario
-from twin_master.network.planner import BeliefPolicy
 from twin_master.report import page as report
 from twin_master.report.reading import Run, read_run
 from twin_master.scenario.schema import Scenario
 from uav_twin import fly
 
 
-def flown(library: Path, folder: Path, policy: BeliefPolicy | None = None, **mission: int) -> Run:
+def flown(library: Path, folder: Path, **mission: int) -> Run:
     """Fly the paper's mission, of another length, with the wing of a strain library, and read the run."""
     loaded, given = changed_scenario("paper_level_turns", {"mission": mission}), {"strain_library": library}
-    return read_run(fly(loaded, folder, given, policy=policy, report=False).folder)
+    return read_run(fly(loaded, folder, given, report=False).folder)
 
 
 def stored(run: Run, place: Path) -> Path:

