@@ -164,7 +164,7 @@ def test_a_driven_damper_shows_its_forces_and_those_of_laws() -> None:
     moving = np.abs(spline(time, 1)) > 0.02
     expected = 3.0 * np.sign(spline(time, 1)) + 5.0 * (motion / 0.02) ** 3
     np.testing.assert_allclose(rest[moving], expected[moving], atol=1e-6)
-    # where a drive begins at rest its spline's slope is not quite zero, and friction, which takes its sign, is
+    # where a drive begins at rest its spline's slope is not quite zero, but friction, of its sign, is
     time = 0.025 * np.arange(100.0)
     for motion, begin in ((-0.02 * np.cos(9.0 * time), 0.0), (0.02 * np.sin(9.0 * time), 3.0)):
         what = trial(time, actuator(motion - motion[0]))
