@@ -109,8 +109,6 @@ def test_structural_parameters_of_a_binding(foreign_fmu):
             assert other.step(control={"u": [0.0, 0.0, 1.0]}).values.tolist() == [1.0, 2.0, 16.0]
         with pytest.raises(FmuFileError, match=r"'w' of .* has 3 elements but 2 start values"):
             asset.reset({"one": 5.0}, control={"u": [1.0, 2.0, 3.0]})
-        with pytest.raises(FmuFileError, match=r"'u' of .* has 3 elements but 2 start values"):
-            asset.reset({})
     content["binding"]["structural_parameters"] = {"rows": 3}
     wrong = r"structural_parameters\.rows of the binding r names 'rows', which is not a variable"
     with pytest.raises(BindingError, match=wrong):

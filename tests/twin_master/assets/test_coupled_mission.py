@@ -1,16 +1,30 @@
-"""Any FMU with a binding and a scenario flies, and so do coupled ones: in a worker, resumed, from an SSP."""
+"""Any FMU with a binding and a scenario flies, and so do coupled ones: in a worker, resumed, from an SSP.
+
+The shipped wing, too: the paper's policy and its reliability.
+"""
 
 import shutil
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from benchmarks.seeds import fly_seeds
 from fmu_asset.errors import FmuError, SspError
 from reporting.progress import SilentProgress
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import check_resumed, journal, table_of, text_of, written
+from tests.twin_master.runs import (
+    changed_scenario,
+    check_resumed,
+    journal,
+    of_wing,
+    table_of,
+    text_of,
+    written,
+)
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
@@ -19,10 +33,11 @@ from twin_master.mission.turns import Plant, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from uav_twin import fly as new_run
-from uav_twin import fly_fleet, load_scenario, resume
+from uav_twin import fly_fleet, load_scenario, open_run, resume
 
 pytestmark = pytest.mark.usefixtures("no_report")
 INPUTS = Inputs(__file__)
+WING = pytest.mark.xdist_group("wing")
 BOTH = pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
 
 
@@ -161,7 +176,7 @@ def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("wing")
+@WING
 def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
     quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
@@ -186,3 +201,33 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
     seedless = scenario.model_copy(update={"asset": scenario.asset.model_copy(update={"seeds": ()})})
     with pytest.raises(FleetError, match="every seed would fly the same life"):
         fly_fleet(replace(fleet, groups=(replace(group, scenarios=(seedless,)),)), tmp_path / "fleet")
+
+
+@pytest.mark.slow
+@WING
+def test_the_papers_policy_and_its_reliability():
+    """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
+    knowledge, source = of_wing("paper_level_turns", 0)
+    z1 = knowledge.model.states.coordinates[:, 0]
+    np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
+    assert knowledge.draws.mean == pytest.approx(1.0073, abs=0.002)
+    assert knowledge.draws.standard_deviation == pytest.approx(0.0103, abs=0.001)
+    study = fly_seeds(knowledge.scenario, source, range(80))
+    assert study.within.value >= 0.95
+    assert study.early.value <= 0.2
+    assert np.all([study.rms[0].value <= 0.045, study.rms[1].value <= 0.13])
+
+
+@pytest.mark.long
+@WING
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(tmp_path):
+    trees = []
+    for packed in ("python", "compiled"):
+        loaded = changed_scenario("paper_level_turns", {"asset": {"packed": packed}})
+        trees.append(open_run(new_run(loaded, tmp_path / packed, {"in_process": packed == "python"}).folder))
+    with zipfile.ZipFile(tmp_path / "compiled" / "asset" / "asset.fmu") as archive:
+        assert not any(name.endswith(".py") for name in archive.namelist())
+    for group in ("observed", "filtered", "smoothed", "predicted", "truth"):
+        plain, compiled = (tree[group].to_dataset() for tree in trees)
+        xr.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-12)

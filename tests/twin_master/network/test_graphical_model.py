@@ -171,15 +171,13 @@ def test_a_noise_whose_unit_was_forgotten_is_refused(key, number, tmp_path, libr
 
 
 def test_only_a_noise_beyond_all_that_its_kind_of_sensor_shows_is_refused():
-    predicted = np.zeros((1, 2, 1, 3))
-    predicted[0, :, 0, 0] = 1e-3, 2e-3
-    predicted[0, :, 0, 2] = 300.0
-    # The second gauge shows nothing at all, as one on the neutral axis; the third is a thermometer.
+    """The second gauge shows nothing at all, as one on the neutral axis; the third is a thermometer."""
+    predicted = np.array([[[[1e-3, 0.0, 300.0]], [[2e-3, 0.0, 300.0]]]])
     check_noise("noise", [1e-4, 1e-4, 0.5], predicted, ("1", "1", "K"))
-    for noise, named in (
-        ([1e-4, 3e-3, 0.5], "strain"),
-        ([1e-4, 1e-4, 500.0], "in K"),
-        ([1e-4, 125.0, 0.5], "sensor 2"),
+    for *noise, named in (
+        (1e-4, 3e-3, 0.5, "strain"),
+        (1e-4, 1e-4, 500.0, "in K"),
+        (1e-4, 125.0, 0.5, "sensor 2"),
     ):
         with pytest.raises(InvalidModelError, match=named):
             check_noise("noise", noise, predicted, ("1", "1", "K"))

@@ -4,11 +4,9 @@ import io
 import json
 import os
 import random
-import shutil
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +18,7 @@ import pytest
 
 import uav_twin
 from reporting.progress import SilentProgress
-from tests.command_line import command, refused, said
+from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
 from tests.twin_master.watch.watches import (
     begun,
@@ -37,7 +35,7 @@ from twin_master.mission.journal import JOURNAL_NAME, whole_record
 from twin_master.mission.loop import BelievedModel, journalled_decision
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines, mappings
+from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.opening import flown, resumed_watch
@@ -220,8 +218,16 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
     lines = file.read_bytes().splitlines(keepends=True)
     file.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"turn": 2}', b'"turn": 1}'), *lines[4:]]))
     ran(watch, feed, 198)
-    with pytest.raises(NotResumableError, match=r"line 4 .*; 3 before it are whole"):
+    with pytest.raises(
+        NotResumableError, match=r"line 4 .*damaged.*; 3 before it are whole, and 195 behind it"
+    ):
         watch.told(0)
+    # Another watch takes in all but what the line said, and refuses that by name; the refusal says so.
+    fed = [*FolderFeed(watch.folder, watch.scenario).messages(None)]
+    assert "line 4 of journal.jsonl was changed or is damaged" in str(fed.pop(2)[0])
+    others = np.delete(np.arange(198), 2)
+    np.testing.assert_array_equal([message.turn for message, _ in fed], others)
+    np.testing.assert_array_equal([message.observed for message, _ in fed], observed[others])
     changed = lines[-2].replace(b'"turn": 1', b'"turn": 2')
     for wrong, sentence in (
         ([*lines[:3], *lines[4:]], r"line 196 .*lines before it are missing"),
@@ -231,6 +237,10 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
         with pytest.raises(NotResumableError, match=sentence):
             ran(watch, feed)
         assert file.read_bytes() == b"".join(wrong)
+    monkeypatch.undo()
+    with pytest.raises(NotResumableError, match=sentence) as caught:
+        resumed_watch(watch.folder, None, SilentProgress()).__enter__()
+    assert f"--observations {watch.folder}" in caught.value.__notes__[-1]
 
 
 @pytest.mark.parametrize("source", ["standard input", "a file that grows"])
@@ -249,6 +259,10 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
         feed = CsvFeed(path, watch.scenario, follow=True)
     watching = threading.Thread(target=watch.run, args=(feed, told.append), kwargs={"turns": 3})
     watching.start()
+    for _ in range(50_000 if source == "standard input" else 0):  # messages that are all refused are no turn
+        if not told:
+            os.write(write, b'{"turn": 0, "no_sensor": 1.0}\n')
+    assert told or source != "standard input"
 
     def kinds(count: int) -> list[tuple[int, list[str]]]:
         wait_until(lambda: len(told) >= count)
@@ -299,24 +313,6 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_pat
         (tmp_path / "watch" / "summary.json").unlink()
 
 
-def test_a_changed_journal_and_other_folders_are_refused(scenario, whole, tmp_path):
-    copy = Path(shutil.copytree(whole, tmp_path / "copy"))
-    file = copy / JOURNAL_NAME
-    file.write_bytes(file.read_bytes().replace(b'"turn": 9}', b'"turn": 8}', 1))
-    sentence = r"line 11 .*damaged.*; 10 before it are whole, and 40 behind it"
-    with pytest.raises(NotResumableError, match=sentence) as caught:
-        resumed_watch(copy, None, SilentProgress()).__enter__()
-    # Another watch takes in all but what the line said, and refuses that by name.
-    assert f"--observations {copy}" in caught.value.__notes__[-1]
-    fed = [list(FolderFeed(folder, scenario.scenario).messages(None)) for folder in (whole, copy)]
-    assert "line 11 of journal.jsonl was changed or is damaged" in str(fed[1].pop(9)[0])
-    del fed[0][9]
-    rows = [[(message.turn, *message.observed) for message, _ in own] for own in fed]
-    np.testing.assert_array_equal(*rows)
-    with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
-        uav_twin.fly(scenario, tmp_path / "run")
-
-
 def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     """The gauge that comes loose at turn 10, and the skin that softens from turn 25 on."""
     monkeypatch.setattr(Watch, "store", lambda *_arguments, **_options: None)
@@ -362,9 +358,21 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
         uav_twin.open_run(folder)
     uav_twin.watch(scenario, recorded, folder, decide=decide, turns=20, report=False)
     np.testing.assert_array_equal(opened[0], mission.filtered[:8])
+    with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
+        uav_twin.fly(scenario, tmp_path / "none")
     with pytest.raises(MissionInputError, match="names no recording: give the observations"):
         uav_twin.watch(scenario, folder=tmp_path / "none")
     assert not (tmp_path / "none").exists()
+    slip, none = tmp_path / "slip.csv", {"report": False, "turns": 2}
+    slip.write_text(edited(recorded.read_text(), ("strain_24", "strian_24")))
+    passed = uav_twin.watch(scenario, slip, tmp_path / "slip", allow_unknown=True, **none)
+    assert [line["lost_sensors"] for line in journalled(base, passed)] == [1, 1]
+    with pytest.raises(RunFolderError, match="holds a run already"):
+        uav_twin.watch(scenario, recorded, folder)
+    for source in (passed, passed / "run.nc"):
+        with pytest.raises(MissionInputError, match="choose another --out"):
+            uav_twin.watch(scenario, source, passed, replace=True)
+    assert len(journal(passed)) == 2
     with pytest.raises(MissionInputError, match="give nothing beside --resume"):
         uav_twin.watch(None, recorded, folder, {"seed": 3}, resume=True)
     uav_twin.watch(None, recorded, folder, decide=decide, resume=True, turns=30, report=False)
@@ -377,30 +385,3 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     for group in ("filtered", "smoothed"):
         np.testing.assert_array_equal(run[group]["probability"].values, getattr(mission, group)[40:])
     assert last_line(folder) == last_line(whole)
-
-
-def test_a_slip_of_the_pen_is_passed_over_on_request_and_no_run_replaced_by_its_watch(
-    scenario, recorded, whole, tmp_path
-):
-    (tmp_path / "m.csv").write_text(edited(recorded.read_text(), ("strain_24", "strian_24")))
-    words = ("watch", scenario.path, "--observations", tmp_path / "m.csv", "--turns", 2, "--allow-unknown")
-    passed = said(*words, "--out", tmp_path / "watch", "--no-report")
-    assert [json.loads(line)["lost_sensors"] for line in passed.splitlines()] == [1, 1]
-    assert "holds a run already" in refused("watch", scenario.path, "--out", whole)
-    copy = Path(shutil.copytree(whole, tmp_path / "copy"))
-    for source in (copy, copy / "run.nc"):
-        again = ("watch", scenario.path, "--out", copy, "--replace", "--observations", source)
-        assert "choose another --out" in refused(*again)
-    check_same(copy, whole, JOURNAL_NAME)
-
-
-def test_silence_is_told_among_messages_that_are_all_refused(hasty):
-    told = list[dict[str, Any]]()
-
-    def flood():
-        end = time.monotonic() + 60.0
-        while not told and time.monotonic() < end:
-            yield {"turn": 0, "no_sensor": 1.0}
-
-    hasty.run(mappings(hasty.scenario, flood()), told.append)
-    assert [notice["kind"] for notice in told[0]["notices"]] == ["quiet"]
