@@ -49,18 +49,6 @@ def test_archives_give_back_what_they_were_given(values):
             assert (str(arrays["text"]), arrays["number"].shape) == ("µ", ())
 
 
-def test_bytes_depend_on_the_arrays_only():
-    values = np.arange(6.0).reshape(2, 3)
-    first = arrays_to_bytes({"a": values, "b": values[0]})
-    assert first == arrays_to_bytes({"b": values[0].copy(), "a": np.asfortranarray(values)})
-    assert first != arrays_to_bytes({"a": values, "b": values[1]})
-    with zipfile.ZipFile(io.BytesIO(first)) as archive:
-        assert archive.namelist() == ["a.npy", "b.npy"]
-        assert {member.date_time for member in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
-    with pytest.raises(ValueError, match="Object arrays"):
-        arrays_to_bytes({"bad": np.array([object()])})
-
-
 def refuses(content: bytes, words: str = "not a sound archive of plain arrays") -> None:
     with refused(ReducedModelFileError, words):
         arrays_from_bytes(content, "x.npz", ["a"])

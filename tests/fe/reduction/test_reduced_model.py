@@ -3,7 +3,7 @@
 import re
 from dataclasses import replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import meshio
 import numpy as np
@@ -187,37 +187,6 @@ def test_low_modes_keep_their_digits(pair):
         assert other.followed == one.followed
 
 
-def test_many_states_at_once_equal_one_by_one(pair):
-    model, vectors = pair.model, states(pair.model, 40)
-    columns = dict(zip(model.chosen, vectors.T, strict=True))
-    np.testing.assert_array_equal(model.vectors(columns), vectors)
-    found = [model.static_response(named(model, vector)) for vector in vectors]
-    one_by_one = [np.append(one.strain, one.displacement) for one in found]
-    np.testing.assert_allclose(model.static_outputs(vectors), one_by_one, rtol=1e-11, atol=1e-16)
-    name = model.regions[0]
-    alone = np.tile(model.nominal, (40, 1))
-    alone[:, model.chosen.index(name)] = columns[name]
-    np.testing.assert_array_equal(model.vectors({name: columns[name]}), alone)
-    assert model.static_outputs(model.vectors({name: 0.1})).shape == (1, len(model.static_output))
-
-
-def test_the_bound_allows_for_rounding_and_is_zero_without_a_load(pair):
-    # Residuals do not show what rounding does to the solution itself, of which 5e-6 is the least allowed for.
-    model = pair.model
-    assert model.rounding_allowance >= 5e-6
-    assert model.residual_allowance >= 1e-7
-    for vector in states(model, 3):
-        response = model.static_response(vector)
-        without = replace(model, rounding_allowance=0.0).static_response(vector)
-        for kind in ("strain", "displacement"):
-            added = getattr(response, f"{kind}_error_bound") - getattr(without, f"{kind}_error_bound")
-            size = np.linalg.norm(getattr(response, kind))
-            assert added == pytest.approx(model.rounding_allowance * size, rel=1e-9)
-    idle = model.static_response(load=np.zeros(len(model.static_load)))
-    assert not np.any([*idle.strain, *idle.displacement])
-    assert idle.strain_error_bound == idle.displacement_error_bound == 0.0
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e9, -1e9])
 def test_values_outside_validity_are_refused_by_name(pair, bad):
     model = pair.model
@@ -290,22 +259,6 @@ STIFFNESS = tuple(term.matrix for term in SYSTEM.stiffness_terms)
 TERMS = ReductionTerms(SYSTEM)
 
 
-def values(state: Any) -> dict[str, float]:
-    return dict(zip(("young_modulus_factor", *SYSTEM.regions), state, strict=True))
-
-
-def test_bound_is_not_wildly_pessimistic():
-    """Of a model so small that its errors are far above rounding."""
-    rough = rough_springs().model
-    ratios = []
-    for state in TERMS.training()[::5]:
-        found = rough.static_response(values(state))
-        wanted = static_response(SYSTEM, values(state) | {"load_factor": 1.0, "tip_force": 0.0}).strain
-        ratios.append(found.strain_error_bound / np.abs(found.strain - wanted).max())
-    assert min(ratios) >= 1.0
-    assert np.median(ratios) < 1.8
-
-
 def test_the_rounding_that_was_measured_is_allowed_for():
     """On a soft first spring the chain moves far and stretches little: digits of the stretches are lost."""
     assert reduced_springs(2).model.rounding_allowance == 5e-6  # the least
@@ -340,15 +293,6 @@ def test_pymor_reduces_and_bounds_alike():
         energy_bound = float(reduced.estimate_error(mu).ravel()[0])
         coercivity = min(theta / reference["theta"])
         assert np.linalg.norm(residual) / coercivity == pytest.approx(energy_bound, rel=1e-6)
-
-
-@pytest.mark.parametrize(("regions", "tolerance"), [(1, 5e-3), (2, SETTINGS.bound_tolerance), (4, 5e-3)])
-def test_search_ends_below_the_tolerance_and_starts_high(regions, tolerance):
-    """Few regions have a bound of each, and many one together."""
-    found = reduced_springs(regions)
-    assert found.bound_history[-1] <= tolerance < found.bound_history[0]
-    assert len(found.bound_history) <= len(found.snapshots) == len(set(found.snapshots))
-    assert found.model.dual_output.shape[::2] == {1: (2, 1), 2: (4, 1), 4: (1, 12)}[regions]
 
 
 def test_same_system_gives_the_same_bytes():

@@ -152,7 +152,7 @@ def watched(step: float, kind: str) -> Any:
 
 
 COUPLED = [({}, {}), ({"exchange": True}, {}), ({"substeps": 3}, {}), ({"delayed": True}, {}), ({}, JACOBI),
-           ({"exchange": True, "substeps": 3}, JACOBI)]  # fmt: skip
+           ({"exchange": True, "substeps": 3}, JACOBI), ({}, {"iterations": 50})]  # fmt: skip
 
 
 @pytest.mark.parametrize(("system_options", "asset_options"), COUPLED)
@@ -169,30 +169,6 @@ def test_the_error_of_a_system_falls_with_the_square_of_the_step(
     assert 1.7 < apart["zero-order", 20] / apart["zero-order", 40] < 2.4
     assert 3.3 < apart["linear", 20] / apart["linear", 40] < 4.8
     assert apart["linear", 40] < 0.3 * apart["zero-order", 40]
-
-
-def test_iterations_make_lines_between_both_ends(foreign_fmu) -> None:
-    """Settled, each input is the line between the other's states: no extrapolation is left in it."""
-    options = {"isolated": False, "iterations": 50, "tolerance": 1e-13}
-    with CoupledAsset(circle(foreign_fmu("follow2")), watched(0.1, "linear"), **options) as asset:
-        seen = [asset.observe().values, *(asset.step().values for _ in range(3))]
-    lost = 1.0 - np.exp(-0.1)
-    for before, after in pairwise(seen):
-        for own, factor in ((0, -2.0), (1, 1.5)):
-            u, slope = factor * before[1 - own], factor * (after - before)[1 - own] / 0.1
-            expected = before[own] + lost * (u - before[own]) + slope * (0.1 - lost)
-            assert abs(after[own] - expected) < 1e-11
-
-
-def test_a_system_with_lines_is_restored(foreign_fmu) -> None:
-    structure = circle(foreign_fmu("follow2"), exchange=True)
-    with CoupledAsset(structure, watched(0.1, "linear"), isolated=False) as asset:
-        asset.simulate(steps=3)
-        kept = asset.save_state()
-        there = [asset.step().values.tobytes() for _ in range(3)]
-        asset.restore_state(kept)
-        assert [asset.step().values.tobytes() for _ in range(3)] == there
-        assert [name for name, part in asset._parts.items() if part.linear] == ["first", "second"]
 
 
 # ---------------------------------------------------------------------- wiring

@@ -128,16 +128,6 @@ def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu, state, isolated
             assert other.simulate({"u": LINE[3:]}).values.tobytes() == there.values.tobytes()
 
 
-def test_a_line_that_goes_on_is_no_event(foreign_fmu) -> None:
-    mode, record = {"mode": {"variable": "mode", "unit": "1"}}, {"variables": ["events"]}
-    binding = changed(LINES, header={"interface": "model-exchange"}, load=mode, record=record)
-    with FmiAsset(foreign_fmu("follow2"), binding, isolated=False) as asset:
-        asset.reset({}, control={"u": 0.0}, load={"mode": 0})
-        smooth = asset.simulate({"u": [0.3, 0.1, 0.4]}).extra["events"]
-        assert len(set(smooth.tolist())) == 1
-        assert asset.step({"u": 0.5}, load={"mode": 1}).extra["events"] == smooth[-1] + 1
-
-
 # ---------------------------------------------------------------------- starts
 
 

@@ -130,17 +130,6 @@ def test_what_goes_wrong_at_the_end_leaves_nothing(hostile, scratch, what) -> No
     await_nothing(scratch)
 
 
-def test_an_fmu_that_removes_its_files_is_extracted_again(hostile, scratch) -> None:
-    free = changed(HOSTILE, limits={"programs": True})  # it removes them by a program
-    with hostile("REMOVE_FILES", binding=free) as asset:
-        for _ in range(4):
-            asset.step()
-        asset.close()
-        asset.reset()
-        assert asset.step().values[0] == 1.0
-    assert not list(scratch.iterdir())
-
-
 @cases("state")
 def test_a_state_that_lies_is_found_and_can_be_replayed(hostile, what, kind, sentence) -> None:
     with hostile(what) as asset:
