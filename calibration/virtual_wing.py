@@ -111,7 +111,7 @@ class VirtualWing:
     frequency_error: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_recorded(self.model.gauge_count)
+        check_recorded(len(self.model.gauges))
         if not all(math.isfinite(error) and error > -1.0 for error in self.frequency_error):
             given = " and ".join(f"{error:g}" for error in self.frequency_error)
             raise ExperimentDataError(said("virtual.frequency_error", given=given))

@@ -238,11 +238,7 @@ class StaticReduction:
         """
         worst = 0.0
         for number, found in enumerate(self.responses(model, state)):
-            kinds = (
-                (found.strain, found.strain_error_bound),
-                (found.displacement, found.displacement_error_bound),
-            )
-            present = [(values, error) for values, error in kinds if values.size]
+            present = [(values, error) for values, error in found.bounded if values.size]
             for (values, error), floor in zip(present, self.least[:, number], strict=True):
                 worst = max(worst, error / max(float(np.abs(values).max()), floor))
         return worst

@@ -294,11 +294,8 @@ def measured_errors(
     for number, vector in enumerate(vectors):
         values = dict(zip(model.chosen, vector.tolist(), strict=True))
         full, found = static_response(structure, values), model.static_response(vector)
-        kinds = (
-            (full.strain, found.strain, found.strain_error_bound),
-            (full.output, found.displacement, found.displacement_error_bound),
-        )
-        for kind, (wanted, came, bound) in enumerate(kinds):
+        wholes = full.strain, full.output
+        for kind, (wanted, (came, bound)) in enumerate(zip(wholes, found.bounded, strict=True)):
             if wanted.size:
                 size = np.abs(wanted).max()
                 errors[:, number, kind] = np.abs(came - wanted).max() / size, bound / size

@@ -71,15 +71,6 @@ def motion_basis(
     return np.asarray(basis)
 
 
-HOLDING = 3
-"""Number of the load of `PatchedState` that holds the wing before a release."""
-MODE_COUNT = 6
-"""Modes that move; those whose frequencies the FMU shows."""
-ON_MODES = frozenset(STATION_PORTS)
-"""Ports whose position in motion is that of the modes alone. Beyond the modes, neighbouring stations move one
-another half as much as themselves, which a flexibility of each port by itself does not hold."""
-
-
 class PatchedWing(WingRows):
     """The wing in a basis that holds the changes of `fe.runtime.patch`.
 
@@ -197,7 +188,10 @@ class PatchedState:
         Rows of the strains across the gauges, and of shear.
     """
 
-    holding, mode_count, on_modes = HOLDING, MODE_COUNT, ON_MODES
+    holding, mode_count, on_modes = 3, 6, frozenset(STATION_PORTS)
+    """Number of the load that holds the wing before a release; modes that move, whose frequencies the FMU
+    shows; ports whose position in motion is that of the modes alone: beyond the modes, neighbouring stations
+    move one another half as much as themselves, which a flexibility of each port by itself does not hold."""
 
     def __init__(self, wing: PatchedWing, stiffness: FloatArray, mass: FloatArray, patch: ModelPatch) -> None:
         self._arrays = arrays = wing.arrays
@@ -251,7 +245,7 @@ class PatchedState:
     @cached_property
     def modes(self) -> Modes:
         """The modes that move."""
-        return self.lowest(MODE_COUNT, self._held)
+        return self.lowest(self.mode_count, self._held)
 
     shapes = property(lambda self: self.modes.shapes, doc="Their shapes (n, M).")
     to_modes = property(lambda self: self.modes.to_modes, doc="Modal coordinates (M, n) of a displacement.")

@@ -59,6 +59,11 @@ class StaticResponse:
     displacement_error_bound: float
     coordinates: FloatArray
 
+    @property
+    def bounded(self) -> tuple[tuple[FloatArray, float], ...]:
+        """Strains and displacements, each with their bound."""
+        return (self.strain, self.strain_error_bound), (self.displacement, self.displacement_error_bound)
+
 
 @dataclass(frozen=True, slots=True)
 class Modes:
@@ -146,11 +151,6 @@ class ReducedModel(ReducedArrays):
         tables = ((self.stiffness_factors, of_stiffness), (self.load_factors, of_load))
         return [np.where(factors > 0, factors + offsets, 0).T for factors, offsets in tables]
 
-    @property
-    def gauge_count(self) -> int:
-        """Number of strain gauges G."""
-        return len(self.gauges)
-
     @cached_property
     def validity(self) -> Mapping[str, tuple[float, float]]:
         """Least and largest value for which the model was made, by name (SI units)."""
@@ -179,8 +179,11 @@ class ReducedModel(ReducedArrays):
         """
         if isinstance(values, np.ndarray):
             return values
-        losses = dict(zip(self.regions, self.losses(stiffness_loss), strict=True))
-        return np.asarray(self.vectors({**losses, **(values or {}), **named})[0])
+        found, first = self.nominal.copy(), len(self.parameters)
+        found[first : first + len(self.regions)] = self.losses(stiffness_loss)
+        for name, value in {**(values or {}), **named}.items():
+            found[self._place(name)] = value
+        return found
 
     def vectors(self, columns: Mapping[str, npt.ArrayLike]) -> FloatArray:
         """Return all that can be chosen, (B, V), of columns (B,) or numbers by name; the others are nominal.
@@ -193,13 +196,16 @@ class ReducedModel(ReducedArrays):
         arrays = np.broadcast_arrays(np.zeros(1), *(np.asarray(column) for column in columns.values()))
         found = np.tile(self.nominal, (len(arrays[0]), 1))
         for name, array in zip(columns, arrays[1:], strict=True):
-            if name not in self.chosen:
-                raise OutsideModelError(
-                    f"The structure {self.name} has nothing named {name!r} to be chosen; it has "
-                    f"{', '.join(self.chosen)}."
-                )
-            found[:, self.chosen.index(name)] = array
+            found[:, self._place(name)] = array
         return found
+
+    def _place(self, name: str) -> int:
+        if name not in self.chosen:
+            raise OutsideModelError(
+                f"The structure {self.name} has nothing named {name!r} to be chosen; it has "
+                f"{', '.join(self.chosen)}."
+            )
+        return self.chosen.index(name)
 
     def check_validity(self, values: Sequence[float]) -> None:
         """Check that each of the values (V,) lies in the validity box; also refuses NaN and infinity.

@@ -8,7 +8,6 @@ modes: `fe.runtime.motion` steps them, and omitted modes follow their forces wit
 NumPy and relative imports only: this file is copied into the FMU. Laws are imported where there are any.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import exp, isfinite
@@ -22,7 +21,6 @@ from .errors import InvalidStateError
 from .modal_system import ModalSystem, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
-    from .motion import Laws
     from .motion_arrays import ModalMotion
     from .patched_wing import PatchedWing
     from .reduced import ReducedModel
@@ -52,32 +50,6 @@ class TransientState:
     velocity: FloatArray
     load: FloatArray
     memory: FloatArray = field(default_factory=lambda: np.zeros((0, HEAD)))
-
-    def to_list(self) -> list[float]:
-        """Return the state as 2 M + L + J (5 + E) plain floats; `from_list` gives it back to the last bit."""
-        parts = (self.displacement, self.velocity, self.load, self.memory)
-        return [float(value) for part in parts for value in part.ravel()]
-
-    @classmethod
-    def from_list(
-        cls, values: Sequence[float], mode_count: int, laws: "Laws | None" = None
-    ) -> "TransientState":
-        """Return the state of M modes, none at rest, under the same laws, that `to_list` wrote.
-
-        Raises
-        ------
-        InvalidStateError
-            If there are too few values, or one is not finite.
-        """
-        if len(values) < 2 * mode_count or not all(isfinite(value) for value in values):
-            raise InvalidStateError(
-                f"A transient state of {mode_count} modes needs at least {2 * mode_count} finite numbers, "
-                f"but {len(values)} came, {sum(isfinite(value) for value in values)} of them finite."
-            )
-        memory = np.zeros((0, HEAD)) if laws is None else laws.memory()
-        ends = (mode_count, 2 * mode_count, len(values) - memory.size)
-        place, velocity, load, rest = np.split(np.array(values, dtype=np.float64), ends)
-        return cls(place, velocity, load, rest.reshape(memory.shape))
 
 
 class ModalIntegrator:

@@ -154,27 +154,23 @@ class CalculixDeck:
         blocks = [(nodes, *block) for nodes, block in zip(corners, heavy, strict=True)]
         side, still = HEXAHEDRA_20.places[:8] * _BLOCK, np.diff(held.expansion.indptr) == 0
         file = resources.files("fe.verification").joinpath("templates/calculix.inp.jinja")
-        template = Template(
-            file.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
-        )
-        return str(
-            template.render(
-                deck=self,
-                numbers=number_line,
-                materials=self._materials,
-                cells=np.column_stack((np.arange(len(self.body.mesh.cells)), self.body.mesh.cells)) + 1,
-                motion_nodes=range(len(points) + 1, first),
-                held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
-                springs=[*self.terms(held.springs)],
-                blocks=[
-                    (mass, [*zip(nodes, shares @ points + side, strict=True)])
-                    for nodes, mass, shares in blocks
-                ],
-                block_side=_BLOCK,
-                probe_nodes=range(first_probe, first_probe - (-len(self.probes) // 3)),
-                equations=self._equations([(nodes, shares) for nodes, _, shares in blocks], first_probe),
-                steps=steps,
-            )
+        source = file.read_text(encoding="utf-8")
+        template: Template = Template(source, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+        return template.render(
+            deck=self,
+            numbers=number_line,
+            materials=self._materials,
+            cells=np.column_stack((np.arange(len(self.body.mesh.cells)), self.body.mesh.cells)) + 1,
+            motion_nodes=range(len(points) + 1, first),
+            held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
+            springs=[*self.terms(held.springs)],
+            blocks=[
+                (mass, [*zip(nodes, shares @ points + side, strict=True)]) for nodes, mass, shares in blocks
+            ],
+            block_side=_BLOCK,
+            probe_nodes=range(first_probe, first_probe - (-len(self.probes) // 3)),
+            equations=self._equations([(nodes, shares) for nodes, _, shares in blocks], first_probe),
+            steps=steps,
         )
 
     def _equations(

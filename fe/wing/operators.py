@@ -418,7 +418,7 @@ def eigenmodes(
     SolutionError
         If the iteration did not converge to `MODE_RESIDUAL_LIMIT`.
     """
-    masses = {"servo_mass": servo_mass, "pitot_mass": pitot_mass}
+    masses = point_masses(servo_mass, pitot_mass)
     values = wing_values(operators, young_modulus_factor, stiffness_loss, **masses)
     frequency, shapes = natural_frequencies(operators, count, values)
     shapes = shapes * np.where(operators.tip_row @ shapes < 0.0, -1.0, 1.0)

@@ -131,25 +131,26 @@ class Skin(Part):
         return moduli[np.searchsorted([band.end for band in self.bands], station)]
 
 
-class Web(Part):
+class Wall(Part):
+    """A wall between the skins."""
+
+    thickness: Thickness
+    young_modulus: Modulus
+    poisson_ratio: PoissonRatio
+    density: Density
+
+
+class Web(Wall):
     """Spanwise web at a chordwise place; the first and the last close the box."""
 
     chord: Fraction
-    thickness: Thickness
-    young_modulus: Modulus
     shear_modulus: Modulus
-    poisson_ratio: PoissonRatio
-    density: Density
 
 
-class Rib(Part):
+class Rib(Wall):
     """Rib at a fraction of the span, isotropic, over the whole height and width of the box."""
 
     station: Fraction
-    thickness: Thickness
-    young_modulus: Modulus
-    poisson_ratio: PoissonRatio
-    density: Density
 
 
 class Rod(Part):

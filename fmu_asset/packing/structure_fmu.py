@@ -144,7 +144,7 @@ def build_fmu(
         raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
     name, kept = stem_of(model), {}
     if patch is not None:
-        effects = patch.for_gauges(model.gauge_count).plain
+        effects = patch.for_gauges(len(model.gauges)).plain
         values |= {switch_of(effect): float(options.get("activate", False)) for effect in effects}
         table += effect_rows(effects, len(table), values)
         kept = _patched_members(model, effects, options.get("arrays"))

@@ -123,25 +123,23 @@ class StructureBehaviour:
 
     def state(self) -> list[float]:
         """Return all that is remembered, without the parameters."""
-        parts: tuple[Sequence[float] | None, ...] = (
-            None if self._vector is None else self._vector.tolist(),
-            None if self._acting is None else self._acting.values,
-            None if self._state is None else self._state.to_list(),
-            (self._begun,),
-            self._filters,
-            self._shown,
-        )
+        now, values = self._state, None if self._acting is None else self._acting.values
+        motion = () if now is None else (now.displacement, now.velocity, now.load, *now.memory)
+        parts = (self._vector, values, (self._begun,), self._filters, self._shown, *motion)
         # a part that is not there has the length -1
-        return [number for part in parts for number in ((-1.0,) if part is None else (len(part), *part))]
+        told = (item for part in parts for item in ((-1.0,) if part is None else (len(part), *part)))
+        return [float(len(parts)), *map(float, told)]
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
         """Take back what `state` returned; `parameters` are those of that moment."""
+        if not np.isfinite(list(state)).all():
+            raise ValueError("it holds a number that is not finite")
         numbers = iter(state)
         parts = [
             None if length < 0.0 else [next(numbers) for _ in range(int(length))]
-            for length in (next(numbers) for _ in range(6))
+            for length in (next(numbers) for _ in range(int(next(numbers))))
         ]
-        vector, values, motion, begun, filters, shown = parts
+        vector, values, begun, filters, shown, *motion = parts
         self._keep(parameters)
         self._static = None
         self._begun, self._filters, self._shown = (begun or [0.0])[0], filters, shown or []
@@ -149,10 +147,10 @@ class StructureBehaviour:
         if self._effects is not None and values is not None:
             self._acting = self._effects.acting(values)
         self._integrator = self._state = None
-        if motion is not None and self._vector is not None:
+        if motion and self._vector is not None:
             self._integrator = self._made(self._vector)
-            count = len(self._integrator.modes.frequency) if self._moves else 0
-            self._state = TransientState.from_list(motion, count, self._integrator.structure.laws)
+            place, velocity, load, *memory = map(np.array, motion)
+            self._state = TransientState(place, velocity, load, *([np.array(memory)] if memory else []))
 
     # ------------------------------------------------------------ parts
 

@@ -78,34 +78,6 @@ def test_what_is_hidden_has_its_size(number):
     assert bench.left(truth, without) == pytest.approx(facts["remainder"])
 
 
-def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path):
-    bench = small("damper")
-    truth = Truth(bench.factors, "coulomb_friction", 0.1)
-
-    def made(name: str, variant: str) -> tuple[str, np.ndarray]:
-        write(tmp_path / name / "case", bench, truth, variant, (1, 2))
-        read_campaign(tmp_path / name / "case")
-        rows = np.genfromtxt(tmp_path / name / "case/1.csv", delimiter=",", skip_header=1)
-        return (tmp_path / name / "case/campaign.toml").read_text("utf-8"), rows
-
-    text, plain = made("one", "plain")
-    again, rows = made("two", "plain")
-    assert text == again
-    np.testing.assert_array_equal(plain, rows)
-    _, rows = made("blanks", "blanks")
-    assert np.isnan(rows[: SAMPLES // 5, 2]).all()
-    np.testing.assert_array_equal(rows[SAMPLES // 5 :], plain[SAMPLES // 5 :])
-    _, rows = made("gaps", "gaps")
-    assert 0 < np.isnan(rows[:, 2]).sum() < 0.2 * SAMPLES
-    _, rows = made("jitter", "jitter")
-    steps = np.diff(rows[:, 0]) / bench.rig.interval
-    assert 0.005 < steps.std() < 0.1
-    changed, rows = made("offset", "offset")
-    assert "offset_deviation = 0.0003" in changed
-    np.testing.assert_array_equal(rows[:, :2], plain[:, :2])
-    assert np.abs(rows[:, 2] - plain[:, 2]).max() > bench.noise[0]
-
-
 FIRST, *OTHERS = Inputs(__file__).table("outcomes.toml")["rigs"]
 
 

@@ -63,20 +63,6 @@ def test_filters_repeat_bit_for_bit():
     assert np.array_equal(first.likelihood, again.likelihood)
 
 
-def test_kernel_densities_are_those_of_the_ratio_and_of_the_particles():
-    filtered = particle_filter(DATA, seed=3, particle_count=300_000)
-    places = np.linspace(0.93, 1.09, 33)
-    exact = np.exp(pair_log_likelihoods(PUBLISHED_LINE, DATA, places, "ratio"))
-    for found, expected in zip(filtered.likelihood, exact, strict=True):
-        error = np.interp(places, filtered.likelihood_grid, found) - expected
-        assert np.abs(error).max() < 0.03 * expected.max()
-    density, grid = filtered.density, filtered.grid
-    mean = np.trapezoid(density * grid, grid)
-    assert mean == pytest.approx(filtered.mean, abs=1e-5)
-    deviation = np.sqrt(np.trapezoid(density * (grid - mean) ** 2, grid))
-    assert deviation == pytest.approx(filtered.standard_deviation, rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("change", "count", "prior", "words"),
     [
@@ -171,17 +157,6 @@ def test_moments_quantiles_and_intervals_of_a_gaussian():
     value = np.array([0.95, 1.0, 1.01])
     below = norm.cdf(value, prior.mean, prior.standard_deviation)
     assert posterior.cumulative(value) == pytest.approx(below, abs=1e-5)
-
-
-@given(
-    density=st.lists(st.floats(0.0, 1e6), min_size=3, max_size=12).filter(lambda d: max(d) > 1e-3),
-    probability=st.floats(0.0, 1.0),
-)
-def test_quantile_inverts_the_distribution_function(density, probability):
-    posterior = ScalarPosterior(np.linspace(0.0, 1.0, len(density)), np.array(density))
-    value = posterior.quantile(probability)
-    assert 0.0 <= value <= 1.0
-    assert posterior.cumulative(value) == pytest.approx(probability, abs=1e-9)
 
 
 def test_samples_repeat_bit_for_bit_and_follow_the_density():

@@ -324,7 +324,7 @@ def strains_with_effects(
 
     effects = patch.plain
     rows, roles = structure_table(wing, {})
-    behaviour = StructureBehaviour(wing, rows, roles, Effects(effects, wing.gauge_count, arrays))
+    behaviour = StructureBehaviour(wing, rows, roles, Effects(effects, len(wing.gauges), arrays))
     on = {switch_of(effect): 1.0 for effect in effects}
     behaviour.tune({row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, on)}, 0.0)
     nominal = {row.name: row.start or 0.0 for row in rows}
@@ -334,6 +334,6 @@ def strains_with_effects(
         losses = {f"health.{name}": loss for name, loss in health.items()}
         given = {**nominal, "tip_force": force, **control, **losses}
         start = {**nominal, "young_modulus_factor": e}
-        return np.array(behaviour.start(start, 0.0, [given[name] for name in inputs])[: wing.gauge_count])
+        return np.array(behaviour.start(start, 0.0, [given[name] for name in inputs])[: len(wing.gauges)])
 
     return ask

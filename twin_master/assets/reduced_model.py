@@ -260,7 +260,7 @@ class ReducedModelSource(NamedStructure):
     @property
     def _outputs(self) -> slice:
         """Which outputs of the model are observed, where those at rest are."""
-        gauges = self.wing.gauge_count
+        gauges = len(self.wing.gauges)
         return slice(0, gauges) if self._scenario.observation.role == "strain" else slice(gauges, None)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:

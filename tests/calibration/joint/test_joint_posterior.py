@@ -17,7 +17,7 @@ from calibration.joint.posterior import (
     measured_modes,
     modal_readings,
 )
-from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, weighed, wing_priors
+from calibration.joint.wing_table import MODEL_ERROR, WingTable, weighed, wing_priors
 from calibration.result.record import STATE, ParameterPrior
 from calibration.static.experiments import published_measurements
 from calibration.static.posterior import PUBLISHED_LINE, stiffness_line
@@ -142,22 +142,6 @@ OVERDAMPED = modal_readings((5.6492, 29.9699, 0.01, 0.3), (0.06, 0.3, 1e-4, 1e-3
 def test_readings_and_states_that_cannot_be(ask, kind, sentence):
     with pytest.raises(kind, match=sentence):
         ask()
-
-
-@pytest.mark.slow
-def test_our_wing():
-    from fe.reduction.model_cache import reduced_model
-
-    model = reduced_model()
-    wing = tabulate_wing(model)
-    assert wing.error < 1e-5
-    generator = np.random.default_rng(5)
-    points = wing.limits[:, 0] + generator.random((20, 3)) * np.diff(wing.limits)[:, 0]
-    for point, found in zip(points.tolist(), wing.frequency(points), strict=True):
-        shapes = model.modes(
-            young_modulus_factor=point[0], stiffness_loss=(0.0, 0.0), servo_mass=point[1], pitot_mass=point[2]
-        )
-        np.testing.assert_allclose(found, shapes.frequency[list(shapes.followed)], rtol=1e-5)
 
 
 # ---------------------------------------------------------------- what the ring-down is made to say

@@ -8,14 +8,11 @@ from math import pi
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from benchmarks.cantilever import LENGTH, Cantilever
+from benchmarks.cantilever import LENGTH
 from benchmarks.effect_pictures import FLOWS
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.catalogue.effect_file import loss_integral
-from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.catalogue.needs import mains_lines
 from discrepancy.errors import CatalogueError
@@ -256,63 +253,3 @@ def test_lines_that_a_sampling_rate_can_show(setting, rate, lines):
 
 
 # ---------------------------------------------------------------- what a campaign cannot carry
-
-
-class OutputsOnly(Cantilever):
-    """The cantilever behind a door that shows neither its inside nor its ports."""
-
-    ports, stations = (), None
-
-    def supports(self, primitive):
-        return False
-
-
-def names_available(setting, *kinds, model=None, **changes):
-    """Return the effects that are offered without the trials of some kinds."""
-    trials = tuple(trial for trial in setting.campaign.trials if trial.kind not in kinds)
-    campaign = replace(setting.campaign, **{"trials": trials, **changes})
-    given = replace(setting, campaign=campaign, model=model or setting.model)
-    reasons = {effect.identifier: effect.unavailable(given) for effect in library()}
-    for reason in reasons.values():
-        assert reason is None or (reason.endswith(".") and reason[0].isupper())
-    return {name for name, reason in reasons.items() if reason is None}
-
-
-FORCED = {"load_place", "load_cell", "seating_offset"}
-FLOWN = {"washout", "inertia_relief"}
-MOVING = {
-    "point_mass", "coulomb_friction", "structural_damping", "quadratic_damping", "stiffness_drift",
-    "high_pass", "clock_error", "mains_hum", "unmodelled_mode",
-}  # fmt: skip
-
-
-def test_what_a_campaign_cannot_carry_is_not_offered(setting):
-    static, released = TrialKind.STATIC, TrialKind.RINGDOWN
-    given, forced, flight = setting.campaign, TrialKind.FORCED, TrialKind.FLIGHT
-    assert (FORCED | FLOWN | MOVING | WARM | {"gauge_gain"}) <= names_available(setting)
-    assert names_available(setting, released, forced, flight).isdisjoint(MOVING | FLOWN)
-    assert names_available(setting, static, forced, flight).isdisjoint(FORCED | FLOWN | {"thermal_strain"})
-    # temperatures that were not recorded, or did not vary
-    assert names_available(setting, reference_temperature=None).isdisjoint(WARM)
-    cool = tuple(trial for trial in given.trials if trial.name != "warm")
-    assert names_available(setting, trials=cool).isdisjoint(WARM)
-    # a free gain absorbs a gain error
-    free = {name: replace(channel, gain_deviation=np.inf) for name, channel in given.channels.items()}
-    assert "gauge_gain" not in names_available(setting, channels=free)
-    # a model that carries nothing still has sensors
-    bare, closed = names_available(setting, model=OutputsOnly()), replace(setting, model=OutputsOnly())
-    assert "has no port where an internal force can act" in by_name("coulomb_friction").unavailable(closed)
-    assert "cannot carry the primitive 'point_mass'" in by_name("point_mass").unavailable(closed)
-    assert {"gauge_gain", "gauge_zero_drift", "thermal_strain", "clock_error", "mains_hum"} <= bare
-    assert bare.isdisjoint({"point_mass", "coulomb_friction", "cubic_stiffness", "load_place", "washout"})
-
-
-@given(st.floats(-3.0, 3.0), st.floats(-2.0, 2.0))
-def test_steps_of_sizes_are_straight_in_the_value(u, step):
-    """What grows with a value is followed exactly; no step passes zero; other priors are straight already."""
-    prior = Prior("log_normal", 0.01, 1.0)
-    slope = (prior.value(u + 1e-6) - prior.value(u - 1e-6)) / 2e-6
-    target = prior.value(u) + slope * step
-    reached = prior.value(prior.stepped(u, step))
-    assert reached == pytest.approx(max(target, LEAST_SHRINKAGE * prior.value(u)), rel=1e-6)
-    assert Prior("normal", -1.0, 1.0).stepped(u, step) == u + step

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.lumped import LumpedModel
@@ -60,16 +59,6 @@ def test_a_body_falls_as_galilei_says_and_drag_makes_it_a_hyperbolic_tangent() -
     speed = terminal * np.tanh(9.81 * time / terminal)
     np.testing.assert_allclose(found[:, 0], -speed, atol=1e-5)
     np.testing.assert_allclose(found[:, 1], 0.5 * speed**2 / 2.0, atol=1e-4)
-
-
-@pytest.mark.parametrize("hold", [Hold.LINEAR, Hold.ZERO_ORDER])
-def test_first_order_states_are_exact_at_uneven_stamps(hold: Hold) -> None:
-    time = uneven(120, 4.0)
-    voltage = np.random.default_rng(4).uniform(0.0, 5.0, len(time))
-    found = seen(rig("tanks"), trial(time, pump(voltage, hold)), LOWER)
-    matrix = -np.array([[0.1, 0.0], [-0.1, 0.08]]) / np.array([[2.0], [3.0]])
-    expected = exact(matrix, [[0.25], [0.0]], time, voltage[:, None], hold is Hold.ZERO_ORDER)
-    np.testing.assert_allclose(found[:, 0], expected[:, 1], atol=1e-9)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.4])
@@ -254,12 +243,6 @@ def test_a_speed_is_held_with_a_proportional_and_an_integral_gain() -> None:
     )
     given = 0.5 * (3.0 - true[:, 0]) + 2.0 * true[:, 1]
     np.testing.assert_allclose(found, np.stack((true[:, 0], given), axis=1), atol=1e-8)
-
-
-def test_an_angle_that_is_let_go_shows_its_speed() -> None:
-    what = trial(100, kind=TrialKind.RINGDOWN, begins=Start.SETTLED, release=Release(0.02))
-    found = seen(rig("wheel"), what, {"turn": Quantity.ANGULAR_VELOCITY})[:, 0]
-    np.testing.assert_allclose(found, -0.2 * np.sin(10.0 * what.time), atol=1e-12)
 
 
 def test_a_rig_at_rest_has_the_temperature_of_each_level_and_what_holds_it() -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import atan2, cos, hypot, pi, sin
 from typing import Any
 
 import numpy as np
@@ -43,56 +42,40 @@ def friction(force: float, *edges: float) -> PowerDamping:
     return PowerDamping("slide", force, 0.0, 0.0, 1.0, 1.0, windows=(Window("a trial", *edges),))
 
 
-def rubbed(begin: float, force: float) -> FloatArray:
-    """Return a ring-down from 0.05 m with dry friction from `begin` on, half swing by half swing."""
-    x = 0.05 * np.cos(OMEGA * TIME)
-    start, offset = begin, force / STIFFNESS
-    at, speed = 0.05 * cos(OMEGA * begin), -0.05 * OMEGA * sin(OMEGA * begin)
-    while start <= TIME[-1]:
-        inside = start <= TIME
-        if speed == 0.0 and abs(at) <= offset:
-            x[inside] = at
-            break
-        sign = np.sign(speed) if speed else -np.sign(at)
-        centre = -sign * offset
-        size, phase = hypot(at - centre, speed / OMEGA), atan2(-speed / OMEGA, at - centre)
-        x[inside] = centre + size * np.cos(OMEGA * (TIME[inside] - start) + phase)
-        left = ((pi if sign < 0.0 else 2.0 * pi) - phase) % (2.0 * pi) or pi  # to where it stands still
-        start, at, speed = start + left / OMEGA, centre + sign * size, 0.0
-    return x
+DRAG = PowerDamping("slide", 40.0, 2.0, 0.0, 1.0, 1.0)
 
 
-def pushed(law: Callable[[float, float, float], float], edges: tuple[float, float]) -> FloatArray:
-    """Return the motion under the force with `law(t, x, v)` between two edges, piece by piece."""
-    time = np.union1d(TIME, edges)
+def moved(law: Callable[[float, float, float], float], edges: Any, kind: TrialKind) -> FloatArray:
+    """Return the motion under the force, or let go, with `law(t, x, v)` between two edges, piece by piece."""
+    time, pushed = np.union1d(TIME, edges), float(kind is TrialKind.FORCED)
 
     def slope(t: float, y: FloatArray, k: int) -> list[float]:
         own = law(t, *y) if edges[0] <= time[k] < edges[1] else 0.0
-        return [y[1], (np.interp(t, TIME, FORCE) - STIFFNESS * y[0] - own) / MASS]
+        return [y[1], (pushed * np.interp(t, TIME, FORCE) - STIFFNESS * y[0] - own) / MASS]
 
-    return integrated(slope, time, np.zeros(2), parts=True, rtol=1e-9)[np.isin(time, TIME), 0]
-
-
-@pytest.mark.parametrize("begin", [1.2345, 2.0, 3.33])
-@pytest.mark.parametrize("stamps", ["even", "uneven"])
-def test_friction_from_a_moment_on_is_the_closed_form(begin: float, stamps: str) -> None:
-    kept = (np.arange(len(TIME)) % 9 != 7) | (stamps == "even")
-    found = response(trial(TrialKind.RINGDOWN, TIME[kept]), friction(0.9, begin))
-    np.testing.assert_allclose(found[:, 0], rubbed(begin, 0.9)[kept], atol=2e-6)
+    start = np.array([0.0 if pushed else 0.05, 0.0])
+    return integrated(slope, time, start, parts=True, rtol=1e-9)[np.isin(time, TIME), 0]
 
 
 @pytest.mark.parametrize(
-    ("item", "law"),
+    ("kind", "item", "law"),
     [
-        (PowerDamping("slide", 40.0, 2.0, 0.0, 1.0, 1.0), lambda t, x, v: 40.0 * v * abs(v)),
-        (patch.PowerStiffness("slide", 30.0, 3.0, 0, 0.05), lambda t, x, v: 30.0 * (x / 0.05) ** 3),
-        (PortLoad("slide", "3 * max(0, time - 2.5)"), lambda t, x, v: -3.0 * max(0.0, t - 2.5)),
+        (TrialKind.RINGDOWN, DRAG, lambda t, x, v: 40.0 * v * abs(v)),
+        (TrialKind.FORCED, DRAG, lambda t, x, v: 40.0 * v * abs(v)),
+        (TrialKind.FORCED, patch.PowerStiffness("slide", 30.0, 3.0, 0, 0.05), lambda t, x, v: 2.4e5 * x**3),
+        (
+            TrialKind.FORCED,
+            PortLoad("slide", "3 * max(0, time - 2.5)"),
+            lambda t, *_: -3.0 * max(0.0, t - 2.5),
+        ),
     ],
 )
-def test_a_law_between_two_moments_against_a_general_integrator(item: Primitive, law: Any) -> None:
-    edges = (1.507, 4.003)
-    found = response(trial(TrialKind.FORCED), replace(item, windows=(Window("a trial", *edges),)))[:, 0]
-    expected = pushed(law, edges)
+def test_a_law_between_two_moments_against_a_general_integrator(kind: TrialKind, item: Any, law: Any) -> None:
+    """At uneven stamps where it is let go."""
+    edges, kept = (1.507, 4.003), (np.arange(len(TIME)) % 9 != 7) | (kind is TrialKind.FORCED)
+    windowed = replace(item, windows=(Window("a trial", *edges),))
+    found = response(trial(kind, TIME[kept]), windowed)[:, 0]
+    expected = moved(law, edges, kind)[kept]
     np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
 
 

@@ -17,7 +17,7 @@ from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.catalogue.effect_file import loss_integral
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.interface import ACROSS, Conditions
+from discrepancy.models.interface import Conditions
 from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.models.system_model import SystemModel
 from fe.reduction.built_once import cache_folder
@@ -134,15 +134,6 @@ def test_hysteresis_remembers_the_path_also_while_the_structure_warms(wing: Wing
     # a temperature that does nothing must not change the path, though every row is solved by itself
     again = wing.seen(replace(STATIC, temperature=np.arange(5.0)), slip, patch.ModulusTemperature(1e-12))
     assert again == pytest.approx(values, rel=1e-6, abs=1e-10)
-
-
-def test_components_are_the_rows_of_transverse_and_shear_strain(wing: Wing) -> None:
-    u = wing.static(wing.tip)
-    for number, part in enumerate(ACROSS, start=1):
-        outputs = tuple((f"strain[{gauge}]{part}", Quantity.STRAIN) for gauge in (1, 9, 21))
-        found = wing.model.respond(STATIC, outputs, ModelPatch(), wing.conditions).values
-        rows = wing.arrays.strain_rows[number, [0, 8, 20]]
-        assert found == pytest.approx(np.outer(STATIC.force, rows @ u), rel=1e-9)
 
 
 # ---------------------------------------------------------------- in motion

@@ -12,10 +12,10 @@ from fe.runtime import patch
 from fe.runtime.arrays import PLACE
 from fe.runtime.errors import InvalidPatchError, InvalidStateError, OutsideModelError
 from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
-from fe.runtime.patched_wing import HOLDING, PatchedWing
+from fe.runtime.patched_wing import PatchedState, PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE
-from fe.runtime.transient import ModalIntegrator, TransientState
+from fe.runtime.transient import ModalIntegrator
 from fe.wing.operators import (
     AffineOperators,
     assemble,
@@ -32,6 +32,7 @@ from tests.wings import wing_integrator
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
+HOLDING = PatchedState.holding
 STATE, MASSES = (1.0073, (0.2, 0.1)), (0.1688, 0.1344)
 SOUND = (1.0, (0.0, 0.0))
 FACTOR = {"young_modulus_factor": STATE[0]}
@@ -410,9 +411,6 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(model, integrator):
 
 
 def test_bad_input_is_refused(model, integrator):
-    for values in ([], [1.0, 2.0, 3.0], [0.0, 0.0, np.nan, 0.0]):
-        with pytest.raises(InvalidStateError, match="transient state of 2 modes needs"):
-            TransientState.from_list(values, 2)
     for duration, load in ((0.0, 1.0), (-1.0, 1.0), (np.nan, 1.0), (np.inf, 1.0), (0.1, np.nan)):
         with pytest.raises(InvalidStateError, match="needs a positive duration and a finite load"):
             integrator.advance(integrator.at_rest((1.0, 0.0)), duration, (load, 0.0))
