@@ -93,6 +93,20 @@ TWO = {
 }
 
 
+def test_everything_that_is_not_said_is_named_at_once():
+    for name, content in TWO.items():
+        Path(name).write_bytes(content)
+    sentence = refused("discrepancy", "import", *TWO, "--kind", "swing.csv=ringdown")
+    for part in (
+        "13 answers are missing, and nothing was written",
+        "--decimal NAME=... for 'pull.csv' (. or ,: '1,234' in line 2 can be read as both)",
+        "--unit NAME=... for 'F', 'Weg' and 'q' (such as mm, kN or ms",
+        "--quantity NAME=... for 'U' (signal or voltage: V is a unit of each)",
+        "--release NAME=... for 'swing.csv' (how far the point was held",
+    ):
+        assert part in sentence
+
+
 def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
     for name in ("n1", "n2"):
         rest = "".join(f"{k / 100},{(k * 7) % 11 - 5},20\n" for k in range(40))

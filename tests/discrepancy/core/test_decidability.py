@@ -229,16 +229,3 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
     names = [item.trial.name for item in proposals(problem, swings=False)]
     assert names
     assert "longer record" not in names
-
-
-def test_without_a_record_the_rest_stands_for_the_noise():
-    """The information does not depend on the scale that stands in for an unknown noise."""
-    found = []
-    for noise in (kit.NOISE, None):
-        problem = kit.closed_problem(seed=13, effect=0.05, noise=noise)
-        fits = [kit.fitted(problem, *terms) for terms in ((kit.OFFSET,), ())]
-        found.append(
-            mutual_information(problem, Proposal(problem.campaign.trials[0], "", "", 1.0), fits, HALF)
-        )
-    assert 0.0 < found[0] < log(2.0)
-    assert found[1] == pytest.approx(found[0], abs=0.1)

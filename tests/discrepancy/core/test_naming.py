@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ from scipy.signal import lfilter
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.judgement.court import Court
 from discrepancy.judgement.in_part import explained_share
 from discrepancy.judgement.naming import Case, name
 from discrepancy.judgement.when import look_alike_remark, with_untested
 from discrepancy.missing_force.shares import OF_READINGS, Share
+from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
 from tests.refusals import Inputs
@@ -253,6 +256,32 @@ def test_shares_and_their_interval():
     assert not half.told_from(better)
     closed = explained_share(share_of(0.9 * noise, gap, noise))
     assert (closed.value, closed.left, closed.remainder) == (1.0, 0.0, 0.0)
+
+
+def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_of_the_gap():
+    """The best name, a law with a shape of its own and a longer set are no rivals, nor what is far off."""
+    friction, drag, cubic = (
+        Term(*one)
+        for one in zip(kit.chosen(FRICTION[0], "quadratic_damping", "cubic_stiffness"), "aab", strict=True)
+    )
+
+    def held(score, share, *terms):
+        closed = 10.0 + (1.0 - share) * np.linspace(90.0, 110.0, 40)
+        told = share_of(closed, 100.0, np.full(40, 10.0))
+        return SimpleNamespace(candidate=Candidate(terms), score=score, told=told)
+
+    best = held(0.0, 0.9, friction)
+    second, freed = held(-1.0, 0.9, cubic), held(-2.0, 0.9, replace(cubic, free_shape=True))
+    others = (
+        held(-1.0, 0.9, replace(friction, free_shape=True)), held(-1.0, 0.9, replace(drag, free_shape=True)),
+        held(-1.0, 0.9, drag, cubic), held(-1.0 - SEARCH.force_rival, 0.9, drag), held(-1.0, 0.5, drag),
+    )  # fmt: skip
+    court = object.__new__(Court)
+    court.score, court.told = (lambda item: item.score), (lambda item: item.told)
+    court.contenders = [best, second, freed, *others]
+    assert court.rivals(best) == [second]
+    court.contenders = [best, held(-1.0, 0.9, drag), second]
+    assert [item.candidate.terms for item in court.rivals(best)] == [(drag,), (cubic,)]
 
 
 # ---------------------------------------------------------------- what a name does not exclude

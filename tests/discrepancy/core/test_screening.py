@@ -205,17 +205,7 @@ def held_out_problem(seed, shift=0.0, **more):
     return kit.problem_of(replace(problem.campaign, trials=trials), problem.model)
 
 
-def test_intervals_cover_under_the_right_model():
-    """90 % intervals of held-out readings hold 90 % of them; of fitted ones leverage is the dense one."""
-    scores = []
-    for seed in range(60):
-        problem = held_out_problem(seed, gain_deviation=0.02)
-        items = residual_set(problem, kit.fitted(problem), sensitivities=False).trials
-        scores += [item.residual / item.predictive_deviation for item in items if item.trial.held_out]
-    z = np.concatenate([score.ravel() for score in scores])
-    # readings of a campaign are not independent: six times the binomial error
-    assert abs(np.mean(np.abs(z) < 1.6448536) - 0.9) < 6.0 * np.sqrt(0.09 / z.size)
-    assert abs(np.mean(z**2) - 1.0) < 0.08
+def test_leverages_of_fitted_readings_are_the_dense_ones():
     problem = held_out_problem(3)
     _, a, hessian = kit.Linear(problem).dense()
     covariance = a @ np.linalg.solve(hessian, a.T)

@@ -51,8 +51,6 @@ def test_odd_files_are_read_as_they_are_meant(tmp_path, name):
 def test_what_is_passed_over_is_told(tmp_path):
     sheet = sheet_of(tmp_path, bytes_of(ODD["title rows, units row, footer with statistics"]))
     assert sheet.remark == "lines 7 to 9, semicolons between cells; what stands from 10 on is left out"
-    sheet = sheet_of(tmp_path, b"t [s];w [mm];Notiz\n0;0,5;ok\n1;0,6;\n")
-    assert sheet.remark.endswith("; the column 'Notiz' holds no numbers and is left out")
     sheet = sheet_of(tmp_path, b"t;w;e\n0;1;OL\n1;2;OL\n2;3;OL\n3;4;4\n4;5;5\n")
     assert sheet.remark.endswith("; the column 'e' holds 2 numbers and 3 texts and is left out")
     sheet = sheet_of(tmp_path, b"t;w;e\n0;1;2\n1;2;3\n2;rows;in all\n;1,5;2,5\nMean;1,5;2,5\n")

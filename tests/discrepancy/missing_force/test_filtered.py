@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from benchmarks.event_moments import found_in as found_in_series
-from benchmarks.event_moments import noise, record
 from benchmarks.force_events import counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.when import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
-from discrepancy.missing_force.filtered import Filtered, Process, regression
+from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
 from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
@@ -193,6 +191,15 @@ def test_states_and_noise_by_closed_forms():
     assert decaying_part(noise, 0.02) is None
 
 
+def test_evidence_beside_unknowns_is_that_of_their_prior():
+    random, precision = np.random.default_rng(2), np.array([4.0, 0.01])
+    readings, columns = random.standard_normal(9), random.standard_normal((2, 9))
+    rows = np.vstack((readings, columns))
+    found = Regression(rows @ rows.T, 0.0).solve([0, 1], precision)
+    covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
+    assert found.evidence == pytest.approx(gaussian(covariance, readings))
+
+
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
 def test_the_most_probable_process_is_the_top_of_a_grid(end):
     """Also at the bounds of its time: what jumps from sample to sample, what stays as it is."""
@@ -285,23 +292,6 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
         assert window.channels == ("block",)
         assert window.size > 3.0
     assert when_sentence(told) in verdict.sentence
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("kind", "seed"), [("offset", 23), ("random motion", 23), ("line", 49), ("scatter", 57), ("quiet", 7)]
-)
-def test_moments_of_residuals_are_where_they_were_made(kind, seed):
-    """In an even and an uneven record, of events that last and that end; quiet coloured noise has none."""
-    generator = np.random.default_rng(seed)
-    for _ in range(5 if kind == "quiet" else 2):
-        if kind == "quiet":
-            assert not found_in_series(np.arange(400.0), noise(generator, 400, 0.5)).moments(0).size
-            continue
-        time, values, truth = record(generator, kind)
-        found = found_in_series(time, values).moments(0)
-        assert len(found) == len(truth)
-        np.testing.assert_allclose(found[:, 0], truth, atol=0.01 * time[-1])
 
 
 def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):

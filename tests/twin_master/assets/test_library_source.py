@@ -120,20 +120,15 @@ def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
     """Also one with a number that is none; and a scenario without an FMU cannot be sampled."""
     (tmp_path / "noise.nc").write_bytes(b"no NetCDF at all")
     xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-    cases = {
-        "missing": "there is no observation library",
-        "noise": "not a whole NetCDF",
-        "other": "no observation library of this version",
-    }
-    for name in ("observation", "control_speed", "wear"):
-        with xr.open_dataset(made, engine="h5netcdf") as opened:
-            dataset = opened.load()
-        values = dataset[name].values.copy()
-        values[(0,) * values.ndim] = np.nan
-        wrong = dataset.drop_vars(name).assign({name: (dataset[name].dims, values, dataset[name].attrs)})
-        wrong.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
-        cases[name] = "finite"
-    for name, words in cases.items():
+    with xr.open_dataset(made, engine="h5netcdf") as opened, xr.set_options(keep_attrs=True):
+        for name in ("observation", "control_speed", "wear"):
+            wrong = opened.drop_vars(name).assign({name: opened[name].variable.to_base_variable() * np.nan})
+            wrong.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
+    for name, words in (
+        ("missing", "there is no observation library"), ("noise", "not a whole NetCDF"),
+        ("other", "no observation library of this version"),
+        ("observation", "finite"), ("control_speed", "finite"), ("wear", "finite"),
+    ):  # fmt: skip
         with refused(MissionInputError, words):
             load_observation_library(tmp_path / f"{name}.nc")
     given = Overrides(strain_library=library_file)

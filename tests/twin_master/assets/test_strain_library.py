@@ -31,7 +31,7 @@ PATCH = json.dumps({"schema": SCHEMA, "effects": [EFFECT]})
 
 
 @pytest.mark.parametrize(("old", "new", "words"), Inputs(__file__).refused("mismatch"))
-def test_combinations_that_mean_nothing_are_refused_refused(old, new, words, tmp_path):
+def test_combinations_that_mean_nothing_are_refused(old, new, words, tmp_path):
     with refused(ScenarioError, ".*".join(map(re.escape, words))):
         load_scenario(written(tmp_path, TEXT, (old, new)))
 

@@ -165,15 +165,10 @@ def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(run
 
 
 def test_the_present_is_chosen_before_the_first_change_of_control(run):
-    def now(control: np.ndarray) -> int:
-        return default_now(altered(run, observed__control_index=control))
-
-    turns = np.arange(50)
     assert default_now(run) == 28
-    assert now(np.zeros(50)) == 33
-    for change in (1, 2, 5):  # of which nothing would be seen before it
-        assert now(np.where(turns < change, 1, 0)) == 33
-    assert now(np.where(turns < 6, 1, 0)) == 3
+    for change, now in ((0, 33), (1, 33), (2, 33), (5, 33), (6, 3)):  # before the first nothing would be seen
+        control = np.where(np.arange(50) < change, 1, 0)
+        assert default_now(altered(run, observed__control_index=control)) == now
 
 
 @pytest.mark.usefixtures("no_drawing")
