@@ -7,7 +7,7 @@ moved into place in one step. A kill, a full disk or a refused permission leaves
 import errno
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -154,6 +154,21 @@ def atomic_write_text(path: str | os.PathLike[str], text: str) -> Path:
         As `atomic_file`.
     """
     return atomic_write_bytes(path, text.encode("utf-8"))
+
+
+def members_of(folder: Path, suffixes: Collection[str] = ()) -> dict[str, bytes]:
+    """Return the files below a folder, or those with one of the suffixes, by their places in it, in order."""
+    found = (
+        path for path in folder.rglob("*") if path.is_file() and (not suffixes or path.suffix in suffixes)
+    )
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(found)}
+
+
+def write_members(folder: Path, members: Mapping[str, bytes]) -> None:
+    """Write files to their places in a folder, those that are not there yet; raises as `atomic_file`."""
+    for name, content in members.items():
+        if not (folder / name).exists():
+            atomic_write_bytes(folder / name, content)
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> int:

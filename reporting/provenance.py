@@ -15,6 +15,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
+from reporting.files import members_of
 from reporting.json_file import plain
 
 STACK = (
@@ -100,9 +101,8 @@ def source_hash(package: str) -> str:
 
 def hash_tree(root: Path, *, suffixes: Iterable[str]) -> str:
     """Return the SHA-256 of the files below `root` with one of the suffixes; line ends do not count."""
-    wanted = frozenset(suffixes)
-    files = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.suffix in wanted}
-    return hash_members({name: path.read_bytes().replace(b"\r\n", b"\n") for name, path in files.items()})
+    members = members_of(root, frozenset(suffixes))
+    return hash_members({name: content.replace(b"\r\n", b"\n") for name, content in members.items()})
 
 
 def hash_members(members: Mapping[str, bytes]) -> str:

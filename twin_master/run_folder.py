@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_bytes, atomic_write_text, remove_leftovers
+from reporting.files import atomic_write_text, remove_leftovers, write_members
 from reporting.folders import lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress
@@ -86,8 +86,7 @@ def create_run_folder(
     with ExitStack() as holding:
         with whole_folder(folder, lock_run_folder) as fresh:
             holding.callback(os.close, lock_run_folder(fresh))
-            for name, content in (files or {}).items():
-                atomic_write_bytes(fresh / name, content)
+            write_members(fresh, files or {})
             atomic_write_text(fresh / CONFIG_NAME, to_json(config))
         yield
 

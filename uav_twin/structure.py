@@ -30,7 +30,6 @@ def wing(*, design: Path | None = None, vtu: Path | None = None, as_json: bool =
     shapes = dict(zip(modes.followed, ("first flapwise bending", "second flapwise bending"), strict=True))
     if vtu is not None:
         fields = parts.wing_fields(drawn)
-        vtu.parent.mkdir(parents=True, exist_ok=True)
         vector = fields.vector(state.values, state.stiffness_loss, load_factor=3.0)
         written = [vtu, vtu.with_name(f"{vtu.stem}-modes{vtu.suffix}")]
         parts.write_wing_vtu(written[0], fields, vector)

@@ -17,7 +17,6 @@ from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.page import Page, ReportFigure
 from reporting.progress import stage
-from reporting.words import plus_minus
 
 FIGURES, REPORT_NAME = "figures", "report.html"
 WING_FIELDS, MODE_FIELDS = "wing.vtu", "modes.vtu"
@@ -85,8 +84,8 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     page.add_section("Result")
     highlights = []
     for prior in result.priors[:6]:
-        value = plus_minus(result.mean(prior.name), result.standard_deviation(prior.name))
-        highlights.append((f"{value} {prior.figure.shown_unit}".strip(), prior.figure.title))
+        value = prior.figure.shown(result.mean(prior.name), result.standard_deviation(prior.name))
+        highlights.append((value, prior.figure.title))
     page.add_highlights(highlights)
     for sentence in result.findings:
         page.add_notice(sentence)

@@ -17,7 +17,7 @@ from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.arrays import Float
-from reporting.words import brief
+from reporting.words import brief, plus_minus
 
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
 """How the samples were made: by quadrature of one parameter and the others given it, from
@@ -50,6 +50,10 @@ class CalibratedFigure:
     def axis_title(self) -> str:
         """Name and unit as they stand at an axis."""
         return self.name.replace("_", " ") + (f" ({self.shown_unit})" if self.shown_unit else "")
+
+    def shown(self, mean: float, deviation: float) -> str:
+        """Return a mean ± standard deviation with the unit."""
+        return f"{plus_minus(mean, deviation)} {self.shown_unit}".rstrip()
 
 
 @dataclass(frozen=True)

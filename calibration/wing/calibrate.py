@@ -65,11 +65,8 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
         far = name.startswith("frequency") and abs(relative) > NOTICEABLE_FREQUENCY
         if not far and abs(result.score(reading)) <= NOTICEABLE:
             continue
-        both = (
-            plus_minus(reading.value, reading.deviation),
-            plus_minus(result.mean(name), result.standard_deviation(name)),
-        )
-        measured, model = (f"{text} {figure.shown_unit}".rstrip() for text in both)
+        measured = figure.shown(reading.value, reading.deviation)
+        model = figure.shown(result.mean(name), result.standard_deviation(name))
         off = _percent(relative), abs(result.score(reading))
         told = {"title": capital(figure.title), "measured": measured, "model": model, "off": off}
         found.append(said("disagreements.figure", **told))

@@ -29,7 +29,7 @@ from fe.runtime.arrays import archive_bytes
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
 from fmu_asset.errors import FmuBuildError, FmuError, said
 from fmu_asset.slaves.variables import FmuVariable
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, members_of
 from reporting.provenance import hash_members
 from reporting.text_file import read_bytes
 from reporting.units import BASE_UNITS
@@ -173,12 +173,10 @@ def room_members(room: str, folder: str) -> dict[str, bytes]:
     folder : str
         Where it goes.
     """
-    top = Path(str(files(room)))
+    members = members_of(Path(str(files(room))), [".py"])
     return {
-        f"{folder}/{path.relative_to(top).as_posix()}": path.read_bytes().replace(
-            b"from fe.runtime", b"from ..fe"
-        )
-        for path in sorted(top.rglob("*.py"))
+        f"{folder}/{name}": content.replace(b"from fe.runtime", b"from ..fe")
+        for name, content in members.items()
     }
 
 

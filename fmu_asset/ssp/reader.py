@@ -76,7 +76,6 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
     for name, component in tree.components.items():
         # Under its name in the archive, once for all components that are of it.
         file = Path(folder) / component.fmu
-        file.parent.mkdir(parents=True, exist_ok=True)
         atomic_write_bytes(file, package.read(str(component.fmu)))
         own = {node.variable: value for node, value in tree.settings.items() if node.component == name}
         components.append(replace(component, fmu=file, settings=own))

@@ -19,7 +19,7 @@ import numpy as np
 
 from fmu_asset.errors import FmuCallError
 from reporting.arrays import Float
-from reporting.files import atomic_write_bytes
+from reporting.files import write_members
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from reporting.text_file import read_bytes
@@ -236,7 +236,7 @@ class AssetSource:
         MissionInputError
             A file cannot be read.
         """
-        keep_files(folder, self.files())
+        write_members(folder, self.files())
         self._folder = folder
         hashes = {name: hash_file(folder / copy) for name, copy in HASHED.items() if copy in self.places}
         return hashes | self._make(progress)
@@ -374,10 +374,3 @@ def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:
         One cannot be read.
     """
     return {copy: read_bytes(path, MissionInputError) for copy, path in files.items()}
-
-
-def keep_files(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """Write the copies that are not in the run folder yet."""
-    for name, content in contents.items():
-        if not (folder / name).exists():
-            atomic_write_bytes(folder / name, content)

@@ -10,11 +10,11 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reporting.files import atomic_write_text, written
+from reporting.files import atomic_write_text, members_of, write_members, written
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
-from twin_master.assets.asset_source import AssetSource, keep_files
+from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError, said
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
@@ -274,18 +274,14 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
 def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
     """Return what `fly_shard` wants of a scenario, what belongs to it made in a folder."""
     located = scenario.portable().moved(folder)
-    keep_files(folder, source_of(scenario, real=real).files())
+    write_members(folder, source_of(scenario, real=real).files())
     source = source_of(located, real=real)
     source.prepare(folder, SilentProgress())
     if not (folder / KNOWLEDGE_NAME).is_file():
         keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
     wing = getattr(source, "wing", None) if flies_model(scenario) and not real else None
-    files = {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-    return pickle.dumps((scenario.portable().to_dict(), files, wing), pickle.HIGHEST_PROTOCOL)
+    packed = scenario.portable().to_dict(), members_of(folder), wing
+    return pickle.dumps(packed, pickle.HIGHEST_PROTOCOL)
 
 
 def group_folder(folder: Path, group: Group, place: int) -> Path:

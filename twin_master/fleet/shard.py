@@ -25,7 +25,7 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.files import atomic_write_bytes
+from reporting.files import write_members
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
@@ -117,8 +117,7 @@ class Kit:
         scenario, files, self.wing = pickle.loads(packed)
         self._folder = folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        for name, content in files.items():
-            atomic_write_bytes(folder / name, content)
+        write_members(folder, files)
         self.scenario = Scenario.model_validate(scenario).moved(folder)
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
 

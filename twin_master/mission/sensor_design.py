@@ -22,8 +22,9 @@ from fe.structure.location import gauge_rows, spread_rosettes
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from reporting.arrays import Float, Index
+from reporting.files import write_members
 from reporting.toml_file import checked, read_toml
-from twin_master.assets.asset_source import keep_files, read_files
+from twin_master.assets.asset_source import read_files
 from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
 from twin_master.errors import MissionInputError, said
 from twin_master.mission.preparation import Knowledge
@@ -227,7 +228,7 @@ def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenar
         raise MissionInputError("--candidates needs a structure from a mesh as what is believed.")
     if candidates.isdecimal() and not int(candidates):
         raise MissionInputError("--candidates needs at least one place.")
-    keep_files(folder, read_files(belief.all_files()))
+    write_members(folder, read_files(belief.all_files()))
     file = folder / MODEL_COPY
     source = Path(belief.all_files()[MODEL_COPY]).parent / own.mesh  # this one stays
     mesh = read_mesh(source, own.unit, own.length_unit)

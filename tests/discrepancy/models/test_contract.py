@@ -237,18 +237,3 @@ def test_a_wrong_file_is_refused_in_one_sentence(
     file.write_text(INPUTS.text(f"{name}.toml", *changes, (old, new)))
     with refused(ModelError, sentence if name == "rig" else f"model.toml.*({sentence})"):
         (FmuModel if name == "rig" else LumpedModel).load(file)
-
-
-def test_a_missing_or_broken_file_is_refused(tmp_path: Path) -> None:
-    broken = tmp_path / "broken.toml"
-    broken.write_text("format = ")
-    for load, file, sentence in (
-        (LumpedModel.load, "four_mass_chain", "shipped are single_mass_rig, three_mass_chain"),
-        (FmuModel.load, fmu_rig(tmp_path, "absent.fmu"), r"absent\.fmu"),
-        (WingModel.of_calibration, "absent.nc", "cannot be used"),
-        (WingModel.of_design, "absent.toml", "cannot be read"),
-        *((model.load, tmp_path / "none.toml", "cannot be read") for model in (LumpedModel, FmuModel)),
-        *((model.load, broken, "not valid TOML") for model in (LumpedModel, FmuModel)),
-    ):
-        with pytest.raises(ModelError, match=sentence):
-            load(file)

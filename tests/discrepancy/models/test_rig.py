@@ -1,6 +1,7 @@
-"""Rigs of all kinds, with controllers, own laws and flows, against closed forms and general integrators."""
+"""Rigs of all kinds against closed forms and general integrators; effects in windows; clocks of loggers."""
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -8,14 +9,37 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, TrialKind
-from discrepancy.errors import ModelError
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    Hold,
+    Quantity,
+    RecordedInput,
+    Start,
+    Trial,
+    TrialKind,
+)
+from discrepancy.errors import CatalogueError, ModelError
+from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.sensing import observe
 from discrepancy.models.system_model import FORCES
-from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
+from fe.runtime import patch
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import (
+    LoggerClock,
+    ModulusTemperature,
+    Overflow,
+    PortLoad,
+    PowerDamping,
+    PowerStiffness,
+    Primitive,
+    Window,
+)
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import model_of
+from tests.discrepancy.rigs import model_of, one_mass
 from tests.fe.runtime.stepping import exact
 from tests.refusals import Inputs
 
@@ -140,11 +164,8 @@ def test_a_driven_damper_shows_its_forces_and_those_of_laws() -> None:
     moving = np.abs(spline(time, 1)) > 0.02
     expected = 3.0 * np.sign(spline(time, 1)) + 5.0 * (motion / 0.02) ** 3
     np.testing.assert_allclose(rest[moving], expected[moving], atol=1e-6)
-
-
-def test_friction_is_nothing_where_a_drive_begins_at_rest() -> None:
-    """The spline's slope there is not quite zero, and dry friction takes its sign."""
-    time, model = 0.025 * np.arange(100.0), rig("damper")
+    # where a drive begins at rest its spline's slope is not quite zero, but friction, of its sign, is
+    time = 0.025 * np.arange(100.0)
     for motion, begin in ((-0.02 * np.cos(9.0 * time), 0.0), (0.02 * np.sin(9.0 * time), 3.0)):
         what = trial(time, actuator(motion - motion[0]))
         rest = (seen(model, what, CELL, FRICTION) - seen(model, what, CELL))[:, 0]
@@ -255,9 +276,6 @@ def test_a_rig_at_rest_has_the_temperature_of_each_level_and_what_holds_it() -> 
     np.testing.assert_allclose(found, np.stack((turn, -50.0 * turn), axis=1), rtol=1e-12)
 
 
-# ---------------------------------------------------------------- scales
-
-
 def test_scales_come_from_what_acts_and_moves() -> None:
     time = uneven(60, 0.01)
     port = rig("falling_body").scales(campaign(trial(time))).ports["air"]
@@ -294,3 +312,137 @@ def test_wrong_records_are_named(name: str, begins: str, item: list[str], senten
     output = model.description.output[0]
     with pytest.raises(ModelError, match=sentence):
         seen(model, trial(time, *inputs, begins=Start(begins)), {output.name: output.quantity})
+
+
+# ---------------------------------------------------------------- effects in windows of a record
+
+
+MASS, STIFFNESS = 2.0, 200.0
+MODEL = one_mass(stiffness=STIFFNESS, damping={"alpha": 0.0, "beta": 0.0})
+TIME = np.linspace(0.0, 6.0, 301)
+FORCE = 4.0 * np.sin(3.0 * TIME) + 2.0 * np.sin(7.7 * TIME)
+OUTPUTS = (("x", Quantity.DISPLACEMENT), ("x", Quantity.ACCELERATION))
+
+
+def of_mass(kind: TrialKind, time: FloatArray = TIME) -> Trial:
+    said: dict[str, Any] = {"release": Release(0.05, mode_count=1)}
+    if kind is not TrialKind.RINGDOWN:
+        said = {"force": np.interp(time, TIME, FORCE), "begins": Start.STILL}
+    return asked(kind, time, channels=("x",), load_place="push", **said)
+
+
+def response(given: Trial, *items: Primitive, refinement: int = 8) -> FloatArray:
+    return seen(MODEL, given, OUTPUTS, *items, refinement=refinement)
+
+
+DRAG = PowerDamping("slide", 40.0, 2.0, 0.0, 1.0, 1.0)
+
+
+def moved(law: Callable[[float, float, float], float], edges: Any, kind: TrialKind) -> FloatArray:
+    """Return the motion under the force, or let go, with `law(t, x, v)` between two edges, piece by piece."""
+    time, pushed = np.union1d(TIME, edges), float(kind is TrialKind.FORCED)
+
+    def slope(t: float, y: FloatArray, k: int) -> list[float]:
+        own = law(t, *y) if edges[0] <= time[k] < edges[1] else 0.0
+        return [y[1], (pushed * np.interp(t, TIME, FORCE) - STIFFNESS * y[0] - own) / MASS]
+
+    start = np.array([0.0 if pushed else 0.05, 0.0])
+    return integrated(slope, time, start, parts=True, rtol=1e-9)[np.isin(time, TIME), 0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "item", "law"),
+    [
+        (TrialKind.RINGDOWN, DRAG, lambda t, x, v: 40.0 * v * abs(v)),
+        (TrialKind.FORCED, DRAG, lambda t, x, v: 40.0 * v * abs(v)),
+        (TrialKind.FORCED, patch.PowerStiffness("slide", 30.0, 3.0, 0, 0.05), lambda t, x, v: 2.4e5 * x**3),
+        (
+            TrialKind.FORCED,
+            PortLoad("slide", "3 * max(0, time - 2.5)"),
+            lambda t, *_: -3.0 * max(0.0, t - 2.5),
+        ),
+    ],
+)
+def test_a_law_between_two_moments_against_a_general_integrator(kind: TrialKind, item: Any, law: Any) -> None:
+    """At uneven stamps where it is let go."""
+    edges, kept = (1.507, 4.003), (np.arange(len(TIME)) % 9 != 7) | (kind is TrialKind.FORCED)
+    windowed = replace(item, windows=(Window("a trial", *edges),))
+    found = response(of_mass(kind, TIME[kept]), windowed)[:, 0]
+    expected = moved(law, edges, kind)[kept]
+    np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", [TrialKind.FORCED, TrialKind.RINGDOWN])
+def test_without_edges_within_the_record_nothing_changes(kind: TrialKind) -> None:
+    given, law = replace(of_mass(kind), begins=Start.SETTLED), patch.BoucWen("slide", 60.0, 0.01, 1.5)
+    own, other, open_ = Window("a trial"), Window("another", 1.0, 2.0), Window("another", 1.0)
+    for windows, same in (((own,), (law,)), ((other,), ()), ((open_, own), (law,))):
+        np.testing.assert_array_equal(response(given, replace(law, windows=windows)), response(given, *same))
+
+
+def test_sensors_are_wrong_within_their_windows_only() -> None:
+    given = of_mass(TrialKind.FORCED)
+    measured = campaign(given, x=Channel("x", Quantity.DISPLACEMENT, "x", None))
+
+    def read(*items: Primitive) -> FloatArray:
+        return observe(MODEL, measured, given, patch.ModelPatch(items), Conditions(np.zeros(0))).values[:, 0]
+
+    right, inside = read(), (TIME >= 2.0) & (TIME < 3.5)
+    for wrong in (
+        patch.SensorGain("x", 0.1),
+        patch.Line("x", 3.0, 0.01, 0.02),
+        patch.ChannelOffset("x", "0.01 * time"),
+    ):
+        found = read(replace(wrong, windows=(Window("a trial", 2.0, 3.5), Window("other"))))
+        np.testing.assert_array_equal(found, np.where(inside, read(wrong), right))
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: patch.PointMass(0.1, 0.2, windows=(Window("run", 1.0),)), "'point_mass' cannot act in"),
+        (lambda: replace(DRAG, windows=(Window("a trial", 2.0, 1.0),)), "must begin before it ends"),
+        (lambda: PortLoad("slide", "3 * tme"), "unknown name 'tme'"),
+        (lambda: response(of_mass(TrialKind.FORCED), PortLoad("door", "time")), "the port 'door', which"),
+        (lambda: response(of_mass(TrialKind.RINGDOWN), PortLoad("slide", "time")),
+         "ring-down, which no force with a course in time"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_in_a_window_says_so(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises((InvalidPatchError, ModelError), match=sentence):
+        make()
+
+
+# ---------------------------------------------------------------- clocks of loggers
+
+SHAKEN = model_of(INPUTS.text("shaken_mass.toml"))
+STAMPS = np.arange(0.0, 4.0, 0.01)
+SWEEP = RecordedInput("shaker", Quantity.FORCE, np.sin(9 * STAMPS**1.3))
+SEEN = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
+SWEPT = asked(TrialKind.DRIVEN, STAMPS, channels=tuple(SEEN), inputs=(SWEEP,), begins=Start.STILL)
+LOGGED = replace(campaign(SWEPT, **SEEN), loggers={"rack": ("shaker", "laser"), "film": ("camera",)})
+RATE = 4e-3
+
+
+def shown(
+    *changes: Primitive, given: Campaign = LOGGED, at: Any = (1.0, 1.0), what: Trial = SWEPT
+) -> FloatArray:
+    return observe(SHAKEN, given, what, patch.ModelPatch(changes), Conditions(np.array(at))).values
+
+
+def test_each_logger_has_its_own_clock_and_one_alone_is_a_stiffer_rig_under_a_larger_load() -> None:
+    one, square = shown(LoggerClock("*", RATE), given=replace(LOGGED, loggers={})), (1.0 + RATE) ** 2
+    alias = shown(patch.LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
+    np.testing.assert_allclose(one, alias, atol=1e-9 * np.abs(alias).max())
+    clocks = LoggerClock("film", RATE), LoggerClock("rack", RATE), patch.Clock(RATE, 0.0)
+    film, rack, motion = map(shown, clocks)
+    assert np.abs(one - motion).max() > 0.05 * np.abs(alias).max()
+    np.testing.assert_array_equal(film[:, 0], shown()[:, 0])
+    np.testing.assert_array_equal(film[:, 1], motion[:, 1])
+    np.testing.assert_allclose(rack[:, 0], one[:, 0], atol=1e-12)
+    # the camera sees the stretched motion at its own, right times
+    stretched = replace(SWEPT, time=(1.0 + RATE) * STAMPS)
+    true = shown(patch.Clock(1.0 / (1.0 + RATE) - 1.0, 0.0), what=stretched)
+    np.testing.assert_allclose(rack[:, 1], true[:, 1], atol=1e-12)
+    with pytest.raises(CatalogueError, match="no logger 'tape'; it has 'rack', 'film'"):
+        shown(LoggerClock("tape", RATE))

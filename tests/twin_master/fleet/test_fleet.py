@@ -99,9 +99,14 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
     assert fly_fleet(fleet, cut).shards_flown == 0
 
 
-def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
+def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
+    library_file, tmp_path, monkeypatch
+):
     fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
-    fly_fleet(fleet, folder)
+    monkeypatch.setattr("twin_master.fleet.shard.CONNECTING", 0.2)
+    with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        fly_fleet(fleet, folder, Engine(cluster="tcp://127.0.0.1:9"))
+    assert fly_fleet(fleet, folder).shards_flown == 1
     with pytest.raises(RunFolderError, match="another fleet"):
         fly_fleet(other, folder)
     record = json.loads((folder / "config.json").read_text())
@@ -119,6 +124,14 @@ def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
     with pytest.raises(RunFolderError, match="not touched"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(other, folder, replace_old=True).twins == 3
+    for lacking, sentence in (
+        ("distributed", r"needs distributed: pip install 'uav-twin\[fleet\]'\.$"),
+        ("zarr", "needs zarr: pip install"),
+    ):
+        monkeypatch.setitem(sys.modules, lacking, None)
+        with pytest.raises(FleetError, match=sentence):
+            fly_fleet(fleet, tmp_path / "none", Engine(2 if lacking == "distributed" else 0))
+    assert not (tmp_path / "none").exists()
 
 
 INPUTS = Inputs(__file__)
@@ -159,7 +172,7 @@ def test_a_wrong_fleet_file_is_refused(fleet_file, old, new, sentence):
         changed(fleet_file, (old, new))
 
 
-def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
+def test_all_assets_that_cannot_fly_are_in_one_list_and_a_truth_beyond_the_model_is_refused(fleet_file):
     for name in ("a", "b"):
         (fleet_file.parent / f"{name}.fmu").write_bytes(b"no FMU")
     fleet = changed(fleet_file, ("count = 3", 'fmus = "*.fmu"'), ("young_modulus_factor", "colour"))
@@ -168,10 +181,6 @@ def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
     lines = str(caught.value).splitlines()
     assert lines[0].startswith("3 of the assets cannot fly")
     assert [line.split(":")[0] for line in lines[1:]] == ["north a", "north b", "south"]
-    assert not (fleet_file.parent / "out").exists()
-
-
-def test_a_truth_beyond_the_model_is_refused(fleet_file):
     soft = r"south: the true young_modulus_factor of 2 of 2 assets is outside"
     with pytest.raises(FleetError, match=soft):
         fly_fleet(changed(fleet_file, ("mean = 1.0,", "mean = 1.3,")), fleet_file.parent / "out")
@@ -239,18 +248,3 @@ def test_all_processors_fly_unless_the_user_says_how_many():
     cores = len(os.sched_getaffinity(0))
     assert [engine_of(workers, None).workers for workers in (None, 0, 3)] == [cores, 0, 3]
     assert engine_of(None, "tcp://127.0.0.1:9") == Engine(cluster="tcp://127.0.0.1:9")
-
-
-def test_without_the_extra_or_a_scheduler_nothing_is_begun(library_file, tmp_path, monkeypatch):
-    fleet, folder = growing(library_file, count=2), tmp_path / "fleet"
-    monkeypatch.setattr("twin_master.fleet.shard.CONNECTING", 0.2)
-    with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        fly_fleet(fleet, folder, Engine(cluster="tcp://127.0.0.1:9"))
-    assert fly_fleet(fleet, folder).shards_flown == 1
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(FleetError, match=r"needs distributed: pip install 'uav-twin\[fleet\]'\.$"):
-        fly_fleet(fleet, tmp_path / "other", Engine(2))
-    monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(FleetError, match=r"needs zarr: pip install"):
-        fly_fleet(fleet, tmp_path / "other")
-    assert not (tmp_path / "other").exists()
