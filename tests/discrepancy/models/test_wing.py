@@ -246,8 +246,8 @@ class Pair(NamedTuple):
     def share(self, what: Trial, *items: Any, **given: Any) -> float:
         """Return the largest difference as a share of each output.
 
-        Of ring-downs of the wing with equal amplitude, when modes beyond the sixth have died: it is held where
-        its modes show the release point, the wing model where the whole shape does.
+        Of ring-downs of the wing with equal amplitude, when modes beyond the sixth have died: it is held
+        where its modes show the release point, the wing model where the whole shape does.
         """
         exact, mine = self.both(what, *items, **given)
         if what.is_dynamic and isinstance(self.own, WingModel):
