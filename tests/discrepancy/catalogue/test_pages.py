@@ -2,8 +2,8 @@
 
 import struct
 
-from benchmarks.effect_pages import FOLDER, pages, paragraphs
-from benchmarks.effect_pictures import PICTURES, draw, picture_setting
+from benchmarks.effect_pages import FOLDER, pages
+from benchmarks.effect_pictures import draw, picture_setting
 from discrepancy.catalogue.library import library
 from tests.discrepancy.rigs import chosen
 
@@ -16,21 +16,6 @@ def test_the_pages_are_those_of_the_catalogue():
     assert {path.name for path in FOLDER.glob("*.md")} == set(made)
     for name, text in made.items():
         assert (FOLDER / name).read_text(encoding="utf-8") == text, name
-
-
-def test_every_effect_has_paragraphs():
-    texts = paragraphs()
-    assert set(texts) == IDENTIFIERS | {"overview"}
-    assert set(PICTURES) <= IDENTIFIERS
-    for effect in library():
-        text = texts[effect.identifier]
-        assert set(text) == {"what", "unit", "references", "tell"}
-        assert set(text["tell"]) == set(effect.confusable)
-        assert text["references"]
-        # The record cites in short what the page cites in full.
-        for short in effect.reference.split("; "):
-            author, year = short.split()[0].rstrip(","), next(w for w in short.split() if w[:4].isdigit())[:4]
-            assert any(author in full and f"({year})" in full for full in text["references"]), short
 
 
 def test_every_effect_has_a_small_picture():

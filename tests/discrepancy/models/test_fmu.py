@@ -18,13 +18,11 @@ from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import investigate
 from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from tests.discrepancy.asking import FloatArray, campaign, integrated
 from tests.discrepancy.asking import seen as shown
 from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import chosen, fmu_rig, laws, measured
+from tests.discrepancy.rigs import fmu_rig, laws
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
@@ -206,22 +204,6 @@ def test_a_release_can_be_held_by_a_force(rig: FmuModel, make) -> None:
     model = make((released, 'hold = "slide.force", output = "slide.position"'))
     held, free = (seen(which, RINGDOWN) for which in (model, rig))
     assert np.max(np.abs(held - free)) < 1e-7 * np.max(np.abs(free[:, 0]))
-
-
-@pytest.mark.parametrize(
-    ("hidden", "value", "places"),
-    [
-        pytest.param("coulomb_friction", 0.008, ["slide"], marks=pytest.mark.long),
-        ("gauge_gain", 0.08, ["displacement"]),
-        ("", 0.0, []),
-    ],
-)
-def test_what_is_hidden_is_named_and_nothing_where_nothing_is(rig, hidden: str, value: float, places) -> None:
-    """In trials of the lumped model; each further internal force of the catalogue costs a second or two."""
-    few = chosen("coulomb_friction", "cubic_stiffness", "gauge_gain", "load_cell")
-    found = investigate(measured(hidden, value)[0], rig, few, thorough=False).verdict
-    assert found.kind is (VerdictKind.NAMED if hidden else VerdictKind.NOTHING_MISSING)
-    assert [(item.identifier, item.place) for item in found.effects] == [(hidden, place) for place in places]
 
 
 # ---------------------------------------------------------------- refusals

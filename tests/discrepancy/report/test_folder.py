@@ -7,7 +7,6 @@ from contextlib import suppress
 
 import pytest
 
-from discrepancy.catalogue.library import library
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_patch
@@ -17,12 +16,11 @@ from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
-from discrepancy.workflow import investigate
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_svg
 from reporting.folders import lock_folder
 from reporting.words import listing
-from tests.discrepancy.rigs import ORIGIN, measured
+from tests.discrepancy.rigs import ORIGIN
 
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
@@ -63,9 +61,23 @@ def test_an_old_verdict_is_not_lost(drag, tmp_path):
         assert (folder / "verdict.json").read_text(encoding="utf-8") == "first"
         assert (folder / "notes.txt").read_text(encoding="utf-8") == "mine"
         assert [path.name for path in tmp_path.iterdir()] == ["v"]
+    # replaced on demand only, and nothing else ever
+    other = tmp_path / "thesis"
+    other.mkdir()
+    with pytest.raises(FileNotWrittenError, match="--replace"):
+        write_verdict_folder(folder, ReportInput(drag, ORIGIN), report=False)
+    write_verdict_folder(folder, ReportInput(drag, ORIGIN), replace_it=True, report=False)
+    assert not (folder / "notes.txt").exists()
+    assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
+    (other / "chapter.tex").write_text("x", encoding="utf-8")
+    for place, words in ((other, "not touched"), (other / "chapter.tex", "no folder")):
+        with pytest.raises(FileNotWrittenError, match=words):
+            check_verdict_folder(place, replace_it=True)
 
 
-def test_the_folder_of_a_named_effect(drag, able, written):
+def test_the_folder_of_a_named_effect(drag, able, tmp_path):
+    written = tmp_path / "verdict"
+    write_verdict_folder(written, ReportInput(drag, ORIGIN, able))
     assert drag.verdict.kind is VerdictKind.NAMED
     page = next(written.glob("*.html")).read_text(encoding="utf-8")
     assert "quadratic aerodynamic damping" in page
@@ -94,25 +106,3 @@ def test_the_folder_of_a_named_effect(drag, able, written):
     assert f"Held out: {held_out};" in figures["residual_table"].caption
     again = render_report(content, {name: to_svg(item.figure) for name, item in figures.items()}, figures)
     assert again == page
-
-
-def test_a_null_has_no_patch_and_is_replaced_on_demand_only(tmp_path):
-    content = ReportInput(investigate(*measured(kind="static"), library()), ORIGIN)
-    assert content.investigation.verdict.kind is VerdictKind.NOTHING_MISSING
-    folder = tmp_path / "v"
-    page = write_verdict_folder(folder, content).read_text(encoding="utf-8")
-    assert not (folder / "patch.json").exists()
-    assert "with the effect" not in page
-    assert "nothing is missing" in page
-    (folder / "stray.txt").write_text("x", encoding="utf-8")
-    with pytest.raises(FileNotWrittenError, match="--replace"):
-        write_verdict_folder(folder, content)
-    write_verdict_folder(folder, content, replace_it=True)
-    assert not (folder / "stray.txt").exists()
-    other = tmp_path / "thesis"
-    other.mkdir()
-    assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
-    (other / "chapter.tex").write_text("x", encoding="utf-8")
-    for place, words in ((other, "not touched"), (other / "chapter.tex", "no folder")):
-        with pytest.raises(FileNotWrittenError, match=words):
-            check_verdict_folder(place, replace_it=True)

@@ -13,7 +13,7 @@ from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime import errors
 from fe.structure.affine import static_responses
 from fe.structure.design import Gauge, Material
-from fe.structure.location import gauge_rows
+from fe.structure.location import attach, gauge_rows, on_surface
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import memory_estimate, read_mesh
 from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
@@ -87,6 +87,23 @@ def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted):
     power = np.array(PRODUCTS[distorted.kind.file_type])
     field = (points**power).prod(axis=1)
     assert field @ (mass @ field) == pytest.approx((1.0 / (2.0 * power + 1.0)).prod())
+
+
+def test_a_point_inside_is_found_and_one_outside_on_the_surface(distorted):
+    size, random = np.array([1.0, 2.0, 0.5]), np.random.default_rng(1)
+    for number, point in enumerate(random.random((12, 3)) * size):
+        cell, local = attach(distorted, point, "here")
+        assert np.abs(local - 0.5).max() < 0.5 + 1e-9
+        places = [(cell, local, point, 1e-12)]
+        aside = point.copy()
+        aside[[number % 3, number // 3 % 3]] = -0.004  # beside a face or an edge
+        found = on_surface(distorted, aside, "here")
+        nearest = np.clip(aside, 0.0, size)
+        assert found.distance == pytest.approx(np.linalg.norm(aside - nearest))
+        places += [(*on_face, nearest, 1e-2) for on_face in zip(found.cell, found.local, strict=True)]
+        for cell, local, wanted, tolerance in places:
+            values, _ = distorted.kind.shape_functions(local[None])
+            np.testing.assert_allclose(values[0] @ distorted.nodes[cell], wanted, atol=tolerance)
 
 
 # ---------------------------------------------------------------- structures

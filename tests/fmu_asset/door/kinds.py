@@ -28,7 +28,7 @@ Floats = npt.NDArray[np.float64]
 Inputs = Mapping[str, Mapping[str, Any]]
 Shown = tuple[Any, Mapping[str, Any]]
 """Observations, a row for each step, and further outputs by name."""
-STEPS = 24
+STEPS = 18
 
 
 @dataclass(frozen=True)
