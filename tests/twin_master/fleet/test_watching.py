@@ -100,6 +100,16 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     assert journals(again) == alone
     state = json.loads((again / "watched.json").read_text())["assets"]
     assert [state[f"north/wing-{number}"]["last"]["turn"] for number in range(3)] == [TURNS - 1] * 3
+    (again / "watched.json").unlink()  # as if a kill had come: nobody knows whether the last ones were told
+    told = list[tuple[str, bool]]()
+    fleet = FleetWatch(
+        load_fleet(fleet_file),
+        again,
+        lambda one, decision: told.append((one.name, decision["told_again"])),
+        print,
+    )
+    fleet.run()
+    assert sorted(told) == [(f"north/wing-{number}", True) for number in range(3)]
     with pytest.raises(RunFolderError, match="another fleet"):
         FleetWatch(load_fleet(fleet_file, seed=8), again, print, print)
     done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out", "--turns", 3)
