@@ -363,9 +363,9 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     with pytest.raises(MissionInputError, match="names no recording: give the observations"):
         uav_twin.watch(scenario, folder=tmp_path / "none")
     assert not (tmp_path / "none").exists()
-    slip, none = tmp_path / "slip.csv", {"report": False, "turns": 2}
+    slip, out = tmp_path / "slip.csv", tmp_path / "slip"
     slip.write_text(edited(recorded.read_text(), ("strain_24", "strian_24")))
-    passed = uav_twin.watch(scenario, slip, tmp_path / "slip", allow_unknown=True, **none)
+    passed = uav_twin.watch(scenario, slip, out, allow_unknown=True, turns=2, report=False)
     assert [line["lost_sensors"] for line in journalled(base, passed)] == [1, 1]
     with pytest.raises(RunFolderError, match="holds a run already"):
         uav_twin.watch(scenario, recorded, folder)
