@@ -8,11 +8,14 @@ from math import pi
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH
 from benchmarks.effect_pictures import FLOWS
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.catalogue.effect_file import loss_integral
+from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.catalogue.needs import mains_lines
 from discrepancy.errors import CatalogueError
@@ -253,3 +256,14 @@ def test_lines_that_a_sampling_rate_can_show(setting, rate, lines):
 
 
 # ---------------------------------------------------------------- what a campaign cannot carry
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-2.0, 2.0))
+def test_steps_of_sizes_are_straight_in_the_value(u, step):
+    """What grows with a value is followed exactly; no step passes zero; other priors are straight already."""
+    prior = Prior("log_normal", 0.01, 1.0)
+    slope = (prior.value(u + 1e-6) - prior.value(u - 1e-6)) / 2e-6
+    target = prior.value(u) + slope * step
+    reached = prior.value(prior.stepped(u, step))
+    assert reached == pytest.approx(max(target, LEAST_SHRINKAGE * prior.value(u)), rel=1e-6)
+    assert Prior("normal", -1.0, 1.0).stepped(u, step) == u + step

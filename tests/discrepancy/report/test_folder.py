@@ -75,7 +75,9 @@ def test_an_old_verdict_is_not_lost(drag, tmp_path):
             check_verdict_folder(place, replace_it=True)
 
 
-def test_the_folder_of_a_named_effect(drag, able, written):
+def test_the_folder_of_a_named_effect(drag, able, tmp_path):
+    written = tmp_path / "verdict"
+    write_verdict_folder(written, ReportInput(drag, ORIGIN, able))
     assert drag.verdict.kind is VerdictKind.NAMED
     page = next(written.glob("*.html")).read_text(encoding="utf-8")
     assert "quadratic aerodynamic damping" in page

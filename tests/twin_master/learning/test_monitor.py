@@ -141,8 +141,8 @@ def test_shares_of_hypotheses_switch_as_their_chain_says():
 def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch):
     """Where the noise is known and gains are not learnt, against the sum over every course of events."""
     monkeypatch.setattr("twin_master.learning.monitor._REACH", (0.0,) * 4)
-    turns, seen = 5, drawn(np.random.default_rng(8), 5)
-    seen[2, 1] = seen[3] = np.nan  # a gauge, and a whole turn
+    turns, seen = 4, drawn(np.random.default_rng(8), 4)
+    seen[2, 1] = seen[1] = np.nan  # a gauge, and a whole turn
     known = Noticing(noise_degrees=1e9, onset_turns=3.0)
     found = run(watchful(given=known), seen)[-1].suspicion
     model, sensors = small()

@@ -1,7 +1,10 @@
-"""A wing that is a strain library, and a twin that believes another model than the one that flies."""
+"""What flies is not what is believed: a strain library, hidden effects; and a twin that knows them."""
 
 import json
 import re
+import zipfile
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +13,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fe.runtime.patch import ModelPatch, SensorGain
+from fe.runtime.patch import (
+    BoucWen,
+    LoadPlace,
+    LocalStiffnessLoss,
+    ModelPatch,
+    PointMass,
+    Primitive,
+    SensorDrift,
+    SensorGain,
+    Washout,
+)
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from scenarios import binding_files
+from tests import command_line
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import edited, loaded_from, table_of, text_of, written
+from tests.twin_master.runs import edited, figures_of, loaded_from, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
+from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
-from uav_twin import load_scenario
+from twin_master.workflow import check_scenario
+from uav_twin import fly as new_run
+from uav_twin import load_scenario, open_run, resume
 
 TEXT = text_of("model_mismatch")
-EFFECT = {"id": "gain", "primitives": ModelPatch((SensorGain("strain[9]", 0.1),)).to_list()}
-PATCH = json.dumps({"schema": SCHEMA, "effects": [EFFECT]})
 
 
 @pytest.mark.parametrize(("old", "new", "words"), Inputs(__file__).refused("mismatch"))
@@ -192,7 +207,127 @@ def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(wing, tmp_
             full = {"strain": static.strain, "displacement": static.displacement}
             np.testing.assert_allclose(row, full.get(role, modes.frequency[:3]), rtol=1e-9)
         assert source.write_field(tmp_path / "wing.vtu", health, control)
-    table["belief"]["patch"] = str(written(tmp_path, PATCH, name="patch.json"))
+    table["belief"]["patch"] = str(write_patch(tmp_path, SensorGain("g5", 0.1)))
     patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
     with pytest.raises(MissionInputError, match="predicts strains, and `frequency`"):
         asset_source(patched).check()
+
+
+# ------------------------------------------------- effects: hidden in the asset, known to the twin
+
+SHORT = text_of("level_turns", ("steps = 50", "steps = 7"), ("draws = 100", "draws = 6"))
+DRIFT: tuple[Primitive, ...] = (SensorDrift("g5", 3e-5, 1.0), SensorGain("strain[9]", 0.1))
+STRUCTURE: tuple[Primitive, ...] = (
+    LocalStiffnessLoss(0.3, 0.9, 0.3),
+    Washout(0.05, 2.0),
+    SensorGain("g5", -0.05),
+)
+FILE = 'patch = "p.json"\n'
+
+
+def write_patch(folder: Path, *primitives: Primitive) -> Path:
+    effects = [{"id": "hidden", "primitives": ModelPatch(primitives).to_list()}]
+    record = {"schema": SCHEMA, "effects": effects, "channels": {"g5": "strain[5]"}}
+    return written(folder, json.dumps(record), name="p.json")
+
+
+def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str = "") -> Path:
+    """The mission with lines in the tables of asset and belief and with further parameters."""
+    more = f", {parameters}" if parameters else ""
+    return written(
+        folder,
+        SHORT,
+        ('binding = "uav_wing"\n', f'binding = "uav_wing"\n{lines}'),
+        ("[belief]\n", f"[belief]\n{belief}"),
+        ("factor = 1.0073 }", f"factor = 1.0073{more} }}"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("primitive", "words"),
+    [(LocalStiffnessLoss(0.3, end, 0.3), "m from the root, and the wing is 1.828 m long") for end in (5, -1)]
+    + [(PointMass(1, 2.2), "a point_mass at 2.2 m"), (LoadPlace(-2, 0), "a load_place at -0.222 m")]
+    + [(SensorDrift("strain[1]", 1e-5, 1.0), "on time"), (BoucWen("tip", 1.0, 1e-3, 1.0), "loads before")]
+    + [(SensorDrift("strain[1]", 1e-5, 1.0, 0.0), "")],
+)
+def test_places_beside_the_wing_are_refused_and_what_changes_in_a_mission_is_no_model(
+    primitive, words, tmp_path
+):
+    write_patch(tmp_path, primitive)
+    for lines, belief in (("", FILE), *[(FILE, "")] * ("m" in words.split())):
+        loaded = load_scenario(scenario_of(tmp_path, lines, belief=belief))
+        with refused(MissionInputError, words) if words else nullcontext():
+            check_scenario(loaded)
+
+
+def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):
+    write_patch(tmp_path, *DRIFT)
+    for lines, parameters, belief, words in (
+        (FILE, '"effect.hiden.active" = 0', "", "effect.hiden.active"),
+        ('patch = "q.json"\n', "", "", "q.json cannot be read"),
+        ("", "", FILE, "depends on time"),
+    ):
+        scenario = scenario_of(tmp_path, lines, parameters, belief)
+        assert words in command_line.refused("run", scenario, "--out", tmp_path / "run")
+        assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def mission(tmp_path: Path, no_report: None) -> Callable[..., Path]:
+    def fly(name: str, lines: str = "", parameters: str = "", belief: str = "") -> Path:
+        loaded = load_scenario(scenario_of(tmp_path, lines, parameters, belief))
+        return new_run(loaded, tmp_path / name, Overrides(in_process=True)).folder
+
+    return fly
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_a_mission_with_a_hidden_drift(mission, tmp_path):
+    write_patch(tmp_path, *DRIFT)
+    folder = mission("hidden", FILE)
+    folders = mission("plain"), folder, mission("off", FILE, '"effect.hidden.active" = 0')
+    plain, hidden, off = (open_run(place)["observed"]["strain"].values for place in folders)
+    np.testing.assert_array_equal(off, plain)
+    # the control of later turns may differ, since the twin is misled; that of the first ones does not
+    np.testing.assert_allclose(hidden[:2, 4] - plain[:2, 4], [3e-5, 6e-5], rtol=1e-6)
+    assert np.all(hidden[0, [0, 1, 20]] == plain[0, [0, 1, 20]])
+    assert figures_of(folder)["model_misfit_rms"] > 1.0  # percent
+    summary, config = (
+        json.loads((folder / f"{name}.json").read_text("utf-8")) for name in ("summary", "config")
+    )
+    assert summary["asset_and_model_differ"] is True
+    assert (folder / "asset" / "patch.json").read_bytes() == (tmp_path / "p.json").read_bytes()
+    assert config["scenario"]["asset"]["patch"] == "asset/patch.json"
+    assert "patch" in config["inputs"]
+    before = (folder / "run.nc").read_bytes()
+    resume(folder)
+    assert (folder / "run.nc").read_bytes() == before
+
+
+@pytest.mark.long
+@pytest.mark.xdist_group("wing")
+def test_a_twin_that_knows_the_effect_has_no_misfit(mission, tmp_path):
+    write_patch(tmp_path, *STRUCTURE)
+    ways = {"ignorant": (FILE, ""), "knowing": (FILE, FILE), "mistaken": ("", FILE)}
+    misfit = {
+        name: figures_of(mission(name, lines, belief=belief))["model_misfit_rms"]
+        for name, (lines, belief) in ways.items()
+    }
+    # percent; what is left where the twin knows the effect is the mean of the draws of e against the true e
+    assert misfit["knowing"] < 0.1
+    assert min(misfit["ignorant"], misfit["mistaken"]) > 20.0 * misfit["knowing"]
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_the_asset_with_its_effects_can_be_exported(tmp_path):
+    write_patch(tmp_path, *DRIFT)
+    loaded = load_scenario(scenario_of(tmp_path, FILE, '"effect.hidden.gain" = 0.2'))
+    ssp = tmp_path / "wing.ssp"
+    system = export_scenario(loaded, ssp, seed=1, replace_file=False)
+    with zipfile.ZipFile(system) as archive:
+        names = [name for name in archive.namelist() if name.endswith((".ssd", ".ssv"))]
+        text = "".join(archive.read(name).decode() for name in names)
+    assert "effect.hidden.gain" in text
+    assert "0.2" in text
