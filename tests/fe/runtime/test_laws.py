@@ -135,6 +135,7 @@ TYPICAL: dict[str, tuple[Primitive, float, float]] = {
     # law, least observed order, largest error of the default steps in shares of the release
     "coulomb": (PowerDamping("tip", 0.02 * K1 * A, 0, 0, 1, 1), 1.7, 5e-5),
     "quadratic": (PowerDamping("tip", 0.05 * K1 * A, 2, 0, W[0] * A, 1), 1.9, 5e-5),
+    "viscous": (PowerDamping("tip", 0.05 * K1 * A, 1, 0, W[0] * A, 1), 1.9, 5e-5),
     "structural": (PowerDamping("tip", 0.03 * K1 * A, 0, 1, 1, A), 1.5, 5e-5),
     "cubic": (PowerStiffness("tip", 0.05 * K1 * A, 3, 0, A), 1.9, 3e-5),
     "crack": (PowerStiffness("tip", -0.05 * K1 * A, 1, -1, A), 1.5, 5e-5),
