@@ -32,12 +32,20 @@ from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python,
 from tests.fmu_asset.ours import STRUCTURES
 
 REFUSED, DECLARED = tables(__file__), tables(__file__, "declared")
+BIN = Path(sys.executable).parent
 PUMP = asset_scripts()["gear_pump"]
 run = partial(subprocess.run, capture_output=True, text=True)
 FURTHER = (*COMPANION_NAMES, *asset_scripts())
-SOUND = ["python", "source", "fmi3", "exchange", "exchange3", "sensing", *FURTHER]
-SOUND += ["compiled", "beam", "compiled_beam", "source3_beam"]
+TOLD = ["python", "source", "fmi3", "exchange", "exchange3", "sensing", *FURTHER]
+"""Of different model descriptions, which is all that the other tool reads."""
+SOUND = [*TOLD, "compiled", "beam", "compiled_beam", "source3_beam"]
 EQUAL = ["python", "compiled", "source3_beam", "beam", "sensing", "patched", *FURTHER]
+
+
+def installed(program: str) -> str:
+    """Return the path of a program, or skip."""
+    path = shutil.which(program) or shutil.which(program, path=str(BIN))
+    return path or pytest.skip(f"{program} is not installed")
 
 
 # ---------------------------------------------------------------------- what holds of all
@@ -62,6 +70,18 @@ def test_a_packed_fmu_is_sound(ours, name) -> None:
 @pytest.mark.long
 def test_more_instances_in_one_process_than_python_had_room_for(fmu) -> None:
     assert check_fmu(fmu, cycles=1100).passed
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_another_tool_has_no_complaint(ours, name, tmp_path) -> None:
+    """The FMU manipulation toolbox."""
+    environment = {"HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}  # where it keeps its log
+    done = run([installed("fmutool"), "-input", ours(name), "-check"], env=environment)
+    said = f"{done.stdout}{done.stderr}"
+    assert done.returncode == 0
+    assert f"seems to be compliant with FMI-{3 if '3' in name else 2}.0" in said
+    assert "No semantic error" in said
+    assert not re.search("ERROR|WARNING", said)
 
 
 @pytest.mark.parametrize("name", EQUAL)
@@ -242,9 +262,24 @@ def test_a_damaged_data_file_is_refused_with_a_sentence(ours, binding, tmp_path,
         FmiAsset(archive_of(tmp_path / "damaged.fmu", contents), binding, isolated=isolated).step()
 
 
+@pytest.mark.long
+def test_fmpy_compiles_the_sources(ours, binding, tmp_path) -> None:
+    """As a user of another platform does: the sources alone, through fmpy's own CMake project."""
+    installed("cmake")
+    kept = {n: c for n, c in members(ours("compiled")).items() if not n.startswith("binaries/")}
+    path = archive_of(tmp_path / "wing.fmu", kept)
+    words = [BIN / "fmpy", "compile", path, "--all-warnings", "--warning-as-error"]
+    run(words, check=True, env={**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"})
+    assert check_fmu(path).passed
+    with FmiAsset(path, binding) as theirs, FmiAsset(ours("compiled"), binding) as mine:
+        for z1 in (0.0, 0.5):
+            seen = [asset.step({"load_factor": 3.0}, {"z1": z1}) for asset in (theirs, mine)]
+            np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)
+
+
 def test_cmake_builds_the_sources(model, compiler, tmp_path) -> None:
     """As on another platform: the project among the sources puts the binary in its place."""
-    cmake, wing = shutil.which("cmake") or pytest.skip("cmake is not installed"), tmp_path / "wing"
+    cmake, wing = installed("cmake"), tmp_path / "wing"
     shutil.unpack_archive(build_fmu(model, tmp_path / "wing.fmu", kind="source", fmi=3).path, wing, "zip")
     place = ["-S", wing / "sources", "-B", tmp_path / "build", "-DCMAKE_C_FLAGS=-O0 -Werror"]
     for words in ([*place, "-DCMAKE_BUILD_TYPE=Debug"], ["--build", tmp_path / "build"]):
