@@ -202,11 +202,22 @@ def test_what_is_not_confined_is_said_once(foreign_fmu, caplog, monkeypatch) -> 
     assert len(said) == 2
 
 
-def test_components_of_a_system_are_confined_too(attempting, key) -> None:
+def sampled(fmu: Path) -> SamplingGrid:
+    """Return a grid of two points."""
+    return SamplingGrid(
+        fmu=str(fmu), binding=str(BINDINGS_FOLDER / "hostile2_damaged.toml"), role="y", parameter="",
+        draws=(0.0,), settling_steps=5, states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
+    )  # fmt: skip
+
+
+def test_components_and_samplers_are_confined_too(attempting, key, tmp_path) -> None:
+    """A system of FMUs, and a library."""
     fmu = attempting("unlink(TARGET)", key).description.path
     binding = bound(1.0, {"y": ("thief.y", "m")}, control={"u": ("thief.u", "m/s")})
     words = rf"it cannot have {key}: Permission denied"
     refused(CoupledAsset(system([Component("thief", fmu)], []), binding), words)
+    with pytest.raises(errors.FmuCallError, match=words):
+        sample_library(sampled(fmu), tmp_path / "library.nc", workers=1)
     assert key.exists()
 
 
@@ -214,11 +225,7 @@ def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(attempt
     """The processes of a sampling send each other pickles, and the FMU is in none of them."""
     made = tmp_path / "made"
     order = f"cos\nmkdir\n(V{made}\ntR."  # who unpickles it makes the folder
-    grid = SamplingGrid(
-        fmu=str(attempting("write_message(TARGET)", order).description.path),
-        binding=str(BINDINGS_FOLDER / "hostile2_damaged.toml"), role="y", parameter="", draws=(0.0,),
-        settling_steps=5, states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
-    )  # fmt: skip
+    grid = sampled(attempting("write_message(TARGET)", order).description.path)
     with pytest.raises(errors.FmuWorkerError, match="closed its pipe, or wrote something else into it"):
         sample_library(grid, tmp_path / "library.nc", workers=1)
     assert not made.exists()
