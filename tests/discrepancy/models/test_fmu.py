@@ -18,7 +18,8 @@ from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
-from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.patch import LoadGain, LoadPlace, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fmu_asset.packing.contents import build_script_fmu
 from tests.discrepancy.asking import FloatArray, campaign, integrated
 from tests.discrepancy.asking import seen as shown
 from tests.discrepancy.asking import trial as asked
@@ -97,6 +98,43 @@ def test_scales_are_at_the_parameters_of_a_campaign(rig: FmuModel) -> None:
     given = Campaign("", {}, (LOADS,), None, {"stiffness_factor": (1.04, 0.01)}, "")
     assert rig.scales(given).tip_stiffness == pytest.approx(1.04 * STIFFNESS, rel=1e-7)
     assert rig.scales(campaign()).angular_frequency == pytest.approx(FREQUENCY, rel=1e-7)
+
+
+CONSOLE = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+UNITS = {"F": "N", "M": "N.m", "T": "N.m"}
+
+class Console(Fmi2Slave):
+    unit_table = {"N": {"kg": 1, "m": 1, "s": -2}, "N.m": {"kg": 1, "m": 2, "s": -2}}
+    variable_table = {name: ("input", unit, None, None, 0.0, name) for name, unit in UNITS.items()}
+    variable_table["strain"] = ("output", None, None, None, None, "strain")
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        for name, row in self.variable_table.items():
+            setattr(self, name, 0.0)
+            self.register_variable(Real(name, causality=Fmi2Causality[row[0]]))
+
+    def do_step(self, time, step):
+        self.strain = 1e-6 * (3.0 * self.F + 5.0 * self.M + 7.0 * self.T)
+        return True
+"""
+
+
+def test_a_force_elsewhere_is_the_force_with_its_moments(tmp_path: Path) -> None:
+    (tmp_path / "console.py").write_text(CONSOLE, encoding="utf-8")
+    build_script_fmu(tmp_path / "console.py", tmp_path / "console.fmu")
+    (tmp_path / "console.toml").write_text(
+        'format = 1\nkind = "fmu"\nname = "Console"\nfmu = "console.fmu"\n'
+        'inputs = { force = { mass = "F" }, bending_moment = "M", torque = "T" }\n'
+        'output = [{ name = "strain", quantity = "strain" }]\n',
+        encoding="utf-8",
+    )
+    with closing(FmuModel.load(tmp_path / "console.toml")) as model:
+        moved = LoadPlace(along_span=0.5, along_chord=-0.2)
+        found = shown(model, LOADS, (("strain", Quantity.STRAIN),), moved, parameters=np.zeros(0))
+    np.testing.assert_allclose(found[:, 0], 1e-6 * (3.0 + 5.0 * 0.5 - 7.0 * 0.2) * LOADS.force, rtol=1e-12)
 
 
 MOVED = {
