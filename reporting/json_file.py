@@ -1,6 +1,6 @@
 """The one reader of JSON: whatever is wrong with a file becomes one sentence of the caller's exception.
 
-Last records (dataclasses of numbers, words, arrays and other records) as plain data of JSON.
+Also records (dataclasses of numbers, words, arrays and other records) as plain data of JSON.
 """
 
 import json
