@@ -14,7 +14,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
-from discrepancy.checks.quality import check_data, clipped_run
+from discrepancy.checks.quality import _freedom, check_data, clipped_run
 from discrepancy.sources.examples import ExamplePlan, example_campaign
 from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 from tests.discrepancy.core import kit
@@ -372,3 +372,10 @@ def test_outliers_are_found_and_left_out_unless_they_are_too_many(campaign):
     (fault,) = check_data(spoilt)
     assert (fault.kind, fault.channel, fault.trial) == (FaultKind.OUTLIERS, "g0", "release 2")
     assert all(trial.used.all() for trial in mark_outliers(spoilt).trials)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.8])
+def test_a_series_that_is_correlated_has_bartletts_freedom(kept):
+    """n (1 - r^2) / (1 + r^2) of a first-order autoregression; chance takes some of it."""
+    series = lfilter([1.0], [1.0, -kept], np.random.default_rng(3).standard_normal(4000))
+    assert 0.55 < _freedom(series) / (4000.0 * (1.0 - kept**2) / (1.0 + kept**2)) < 1.05
