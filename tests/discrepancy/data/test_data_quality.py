@@ -309,6 +309,9 @@ def test_slow_records_of_few_digits_are_not_clipped():
     for slow in lfilter([0.2], [1.0, -0.98], rng.normal(size=(100, 600))):
         values = np.round(0.5 * slow + 0.75 * np.sin(0.1 * time) * np.exp(-time / 200.0))
         assert clipped_run(values, values.max()) == 0
+    for size in (5.2, 10.4, 20.7):
+        values = np.round(size * np.sin(0.3 * time))  # flat where it turns, as a parabola would be
+        assert clipped_run(values, values.max()) == 0
 
 
 def test_noise_records_against_their_label_and_repeats(campaign):
