@@ -1,6 +1,6 @@
 """Numbers, sizes in SI units and sentences of the report and of the summary on the terminal.
 
-Last what a campaign can decide, in rows for both.
+Also what a campaign can decide, in rows for both.
 """
 
 import re

@@ -3,7 +3,7 @@
 A build works in one thread, because sums over several threads depend on their number: a design gives the same
 bytes on a machine whatever its cores do.
 
-Last fields on the whole wing from the reduced model, and VTU files of them for ParaView. No equation of the
+Also fields on the whole wing from the reduced model, and VTU files of them for ParaView. No equation of the
 full model is solved there: the reduced solution is spread over the mesh with the static basis, which takes
 milliseconds.
 """

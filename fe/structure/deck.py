@@ -1,6 +1,6 @@
 """What a mesh file holds, nodes, elements and sets, as the readers of all formats collect it.
 
-Last the coordinate systems of decks: points that are given by radii and angles, or along other axes.
+Also the coordinate systems of decks: points that are given by radii and angles, or along other axes.
 """
 
 import re

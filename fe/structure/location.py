@@ -1,6 +1,6 @@
 """Where a point lies in a mesh: in which cell, or on which face of the surface, at which local place.
 
-Last what follows from places: nodal loads (nodes, 3) [N] of forces and pressures, and gauges as rows on the
+Also what follows from places: nodal loads (nodes, 3) [N] of forces and pressures, and gauges as rows on the
 nodal displacements.
 """
 

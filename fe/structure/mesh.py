@@ -1,6 +1,6 @@
 """The mesh of a structure, and the body it becomes: cells, what they are made of, what holds them.
 
-Nodes, cells of one kind and named sets are as the file has them, in metres. Last what its supports hold,
+Nodes, cells of one kind and named sets are as the file has them, in metres. Also what its supports hold,
 what springs they set, what is rigid, and whether it is free to move.
 """
 

@@ -5,7 +5,7 @@ a file tells its format: MatrixMarket; archives of NumPy and SciPy (`.npz`, `.np
 of `row column value` (CalculiX' `.sti` and `.mas`, Abaqus' COORDINATE) or of `node component node component
 value` (Abaqus' MATRIX INPUT). Those that name nodes bring their own unknowns.
 
-Last how much memory a structure of the mesh takes, before it is taken.
+Also how much memory a structure of the mesh takes, before it is taken.
 """
 
 import contextlib

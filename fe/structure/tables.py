@@ -1,6 +1,6 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices.
 
-Last how well its reduced model is to hold.
+Also how well its reduced model is to hold.
 """
 
 from collections.abc import Iterator

@@ -4,7 +4,7 @@ K(e, z) = e K_skin + (1 - z1) K_1 + ... + K_0 and M(m) = M_0 + m_servo M_s + m_p
 skin without the damage regions: in the published model the factor e does not scale them.
 The root is a rigid rib on three springs; its held motions are eliminated, so that all matrices act on the
 free unknowns: those of the nodes outside the root section, then root heave [m], flap [rad] and yaw [rad].
-Gauge strains are weights of nodal displacements: Kapteyn et al. 2021, eq. (15). Last statics and modes of the
+Gauge strains are weights of nodal displacements: Kapteyn et al. 2021, eq. (15). Also statics and modes of the
 full wing, eqs. (13), (15) and (16).
 """
 

@@ -1,7 +1,7 @@
 """The parts of a wing design: the sections of its TOML file, in SI units, each checked on its own.
 
 The shape of the section is of the symmetric four-digit family of NACA Report 460 (Jacobs, Ward and Pinkerton,
-1933). Last the lift along the span: the shape of the lift of a symmetrically loaded wing as a function that
+1933). Also the lift along the span: the shape of the lift of a symmetrically loaded wing as a function that
 integrates to one over the half-wing; the amount is the design's.
 
 References
