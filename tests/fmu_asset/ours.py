@@ -26,6 +26,7 @@ from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
+from tests.conftest import BEAM
 from tests.fmu_asset.making import tables
 from tests.kept import FE, ROOT, compiled_wing, exported, kept
 
@@ -38,7 +39,6 @@ DESIGNS = {
     "wing": load_design().changed(mesh=COARSE),
     "regions": THREE.changed(mesh=COARSE, defects=[*THREE.defects[:2], LAST]),
 }
-REGIONS = DESIGNS["regions"].regions
 STRUCTURES = tables(__file__, "ours")
 NAMES = (*STRUCTURES, "spring_mass", *COMPANION_NAMES, *asset_scripts())
 
@@ -96,8 +96,12 @@ class OurFmus:
     def model(self, name: str) -> ReducedModel:
         """Return the reduced model of a structure's FMU."""
         which = STRUCTURES[name]["model"]
-        model: ReducedModel = wing_model(which) if which in DESIGNS else self._fixture(f"{which}_model")
-        return model
+        if which in DESIGNS:
+            return wing_model(which)
+        if which == "plate":
+            plate: ReducedModel = self._fixture("plate_pair")[1]
+            return plate
+        return kept("beam", lambda: self._fixture("beam_reduction").model, FE, BEAM)
 
     def options(self, name: str) -> dict[str, Any]:
         """Return the options of `build_fmu` for a structure's FMU."""
