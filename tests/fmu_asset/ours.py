@@ -33,11 +33,12 @@ from tests.kept import FE, ROOT, compiled_wing, exported, kept
 HERE = Path(__file__).parent
 SPRING_MASS = HERE / "spring_mass.py"
 COARSE, NAMED = {"refinement": 0.25}, {"name": "tip_panel"}
+FEW_CELLS = {**COARSE, "edge_size": None, "span_size": 0.2, "chord_size": 0.2}
 THREE = load_design(ROOT / "fe" / "designs" / "uav_wing_three_regions.toml")
 LAST = THREE.defects[2].model_copy(update=NAMED)
 DESIGNS = {
     "wing": load_design().changed(mesh=COARSE),
-    "regions": THREE.changed(mesh=COARSE, defects=[*THREE.defects[:2], LAST]),
+    "regions": THREE.changed(mesh=FEW_CELLS, defects=[*THREE.defects[:2], LAST]),
 }
 STRUCTURES = tables(__file__, "ours")
 NAMES = (*STRUCTURES, "spring_mass", *COMPANION_NAMES, *asset_scripts())
@@ -98,9 +99,6 @@ class OurFmus:
         which = STRUCTURES[name]["model"]
         if which in DESIGNS:
             return wing_model(which)
-        if which == "plate":
-            plate: ReducedModel = self._fixture("plate_pair")[1]
-            return plate
         return kept("beam", lambda: self._fixture("beam_reduction").model, FE, BEAM)
 
     def options(self, name: str) -> dict[str, Any]:
