@@ -8,7 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
+from discrepancy.models.acting import Course, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Sampled
 from discrepancy.models.fmu_system import Case
@@ -23,7 +23,7 @@ from discrepancy.models.interface import (
 )
 from discrepancy.models.model_file import DescribedModel
 from fe.runtime.motion import Laws, laws_of
-from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
+from fe.runtime.patch import SENSORS, LoadChange, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 from fmu_asset.door.runs import State
 
 
@@ -204,8 +204,8 @@ class FmuModel(DescribedModel):
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        linear = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
-        return self._moving(trial, conditions, linear, self.fmu.x, [0] * len(self.fmu.x), parts)
+        linear, x = self.patch.without(PortForce), self.fmu.x
+        return self._moving(trial, conditions, linear, x, [0] * len(self.fmu.x), parts)
 
     # ------------------------------------------------------------ trials in its names and units
 

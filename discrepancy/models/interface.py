@@ -364,6 +364,11 @@ class Model(ABC):
         """
         return self.patch.of(*SENSORS)
 
+    def stated(self, campaign: Campaign) -> list[tuple[float, float]]:
+        """Return mean and deviation of each parameter, those of a campaign where it says them."""
+        known = campaign.parameters
+        return [known.get(item.name, (item.mean, item.deviation)) for item in self.parameters]
+
     def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
         """Return the means (P,) of what is `declared`, those of a campaign where it says them."""
         known = {} if campaign is None else campaign.parameters
@@ -438,8 +443,7 @@ class Model(ABC):
     def apart(self) -> tuple[Self, ModelPatch]:
         """Return the model without laws at its ports, and these at the prior means."""
         laws = self.own_laws(self.prior_mean()) + self.patch.of(PortForce)
-        rest = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
-        return self._changed(patch=rest, linear=True, _kept=None), laws
+        return self._changed(patch=self.patch.without(PortForce), linear=True, _kept=None), laws
 
     def _changed(self, **attributes: object) -> Self:
         """Return the model with other attributes."""

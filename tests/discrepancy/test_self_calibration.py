@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from discrepancy.self_calibration import NOTHING, outcome_of, self_calibrate, wilson, write_self_calibration
-from discrepancy.sources.simulated_campaigns import Simulator
+from discrepancy.self_calibration import (
+    NOTHING,
+    Simulator,
+    outcome_of,
+    self_calibrate,
+    wilson,
+    write_self_calibration,
+)
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import FEW, ORIGIN, measured

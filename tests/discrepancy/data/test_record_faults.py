@@ -6,11 +6,10 @@ from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import pre_trigger_record
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
-from discrepancy.checks.fault import FaultKind
+from discrepancy.checks.fault import FaultKind, slip_between
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
 from discrepancy.checks.quality import check_data, held_spans, moves
-from discrepancy.checks.unit_slips import slip_between
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
