@@ -17,9 +17,9 @@ from discrepancy.location.map import features, residual_map
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
-from tests.discrepancy.asking import integrated
 from tests.discrepancy.bench import SHAPES, Bench, with_noise
 from tests.discrepancy.core.kit import fitted, problem_of
+from tests.discrepancy.rigs import integrated
 
 # ---------------------------------------------------------------- calibration of the whole
 
