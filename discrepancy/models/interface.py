@@ -296,10 +296,7 @@ class Model(ABC):
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws.
-
-        At samples that are so many times as dense as those of the trial.
-        """
+        """Return positions and speeds of the ports without laws, (N, P) at so many times as dense samples."""
         raise NotImplementedError
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
@@ -366,8 +363,7 @@ class Model(ABC):
 
     def stated(self, campaign: Campaign) -> list[tuple[float, float]]:
         """Return mean and deviation of each parameter, those of a campaign where it says them."""
-        known = campaign.parameters
-        return [known.get(item.name, (item.mean, item.deviation)) for item in self.parameters]
+        return [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in self.parameters]
 
     def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
         """Return the means (P,) of what is `declared`, those of a campaign where it says them."""
