@@ -1,6 +1,6 @@
 """What acts on a system in a trial, between the samples too and under a patch, and what its outputs show."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, isfinite, pi, sqrt
@@ -14,6 +14,7 @@ from discrepancy.campaign.records import FloatArray, Hold, Start, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Place
 from fe.runtime.expression import Expression
+from fe.runtime.patch import LoadGain, LoadPlace, Primitive
 
 DEFAULT_PLACE = "tip_load"
 """What a campaign says when it does not say where the force acts; a model with one input takes that one."""
@@ -215,6 +216,38 @@ def release_of(trial: Trial) -> Release:
     if trial.release is None:
         raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
     return trial.release
+
+
+class LoadChange(NamedTuple):
+    """What of recorded loads changes.
+
+    Attributes
+    ----------
+    gain, tare : float
+        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not zero.
+    along_span, along_chord : float
+        How far the acting force is moved [m].
+    """
+
+    gain: float = 0.0
+    tare: float = 0.0
+    along_span: float = 0.0
+    along_chord: float = 0.0
+
+    @classmethod
+    def of(cls, patch: Iterable[Primitive]) -> "LoadChange":
+        """Return the change by gains and places, one upon the other."""
+        gain, tare, span, chord = cls()
+        for item in patch:
+            if isinstance(item, LoadGain):
+                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare * (1.0 + item.gain) + item.tare
+            elif isinstance(item, LoadPlace):
+                span, chord = span + item.along_span, chord + item.along_chord
+        return cls(gain, tare, span, chord)
+
+    def changed(self, values: FloatArray, recorded: FloatArray) -> FloatArray:
+        """Return what acts (N,) of recorded values [N, or N m], the values themselves or with a constant."""
+        return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
 
 def divided(time: FloatArray, parts: int) -> FloatArray:

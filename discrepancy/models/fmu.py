@@ -8,7 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Course, divided, place_among, release_of
+from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Sampled
 from discrepancy.models.fmu_system import Case
@@ -23,7 +23,7 @@ from discrepancy.models.interface import (
 )
 from discrepancy.models.model_file import DescribedModel
 from fe.runtime.motion import Laws, laws_of
-from fe.runtime.patch import SENSORS, LoadChange, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
+from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 from fmu_asset.door.runs import State
 
 

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, Shown, place_among
+from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
 from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped_file import (
@@ -26,7 +26,7 @@ from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import SENSORS, LoadChange, ModelPatch, PortLoad, Primitive, course_of
+from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
 from fe.runtime.state import Losses
 
 LEAST_STIFFNESS = 0.05

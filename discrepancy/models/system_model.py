@@ -11,7 +11,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Acting, Course, Load, Shown, divided, release_of
+from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, divided, release_of
 from discrepancy.models.interface import (
     NO_PATCH,
     Conditions,
@@ -28,7 +28,7 @@ from discrepancy.models.motion import Motion, motion_of
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
-from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, LoadChange, ModelPatch, PortLoad
+from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 from fe.runtime.state import Losses
 
 FORCES = 5.0

@@ -9,7 +9,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from math import pi, sqrt
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -343,38 +343,6 @@ SENSORS = (
 _EVERY: tuple[type[Primitive], ...] = (*STRUCTURE, StiffnessDrift, *LAWS, *LOADS, PortLoad, *SENSORS)
 PRIMITIVES = {primitive.kind: primitive for primitive in _EVERY}
 """Every primitive by its kind."""
-
-
-class LoadChange(NamedTuple):
-    """What of recorded loads changes.
-
-    Attributes
-    ----------
-    gain, tare : float
-        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not zero.
-    along_span, along_chord : float
-        How far the acting force is moved [m].
-    """
-
-    gain: float = 0.0
-    tare: float = 0.0
-    along_span: float = 0.0
-    along_chord: float = 0.0
-
-    @classmethod
-    def of(cls, patch: Iterable[Primitive]) -> "LoadChange":
-        """Return the change by gains and places, one upon the other."""
-        gain, tare, span, chord = cls()
-        for item in patch:
-            if isinstance(item, LoadGain):
-                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare * (1.0 + item.gain) + item.tare
-            elif isinstance(item, LoadPlace):
-                span, chord = span + item.along_span, chord + item.along_chord
-        return cls(gain, tare, span, chord)
-
-    def changed(self, values: FloatArray, recorded: FloatArray) -> FloatArray:
-        """Return what acts (N,) of recorded values [N, or N m], the values themselves or with a constant."""
-        return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .motion import STATION_PORTS, laws_of
-from .patch import LOADS, LoadChange, ModelPatch, ModulusTemperature, PointMass, RootCompliance
+from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
 from .reduced import lowest_modes
 from .state import Losses
 from .wing_rows import EMPTY, LOAD_PLACE, WingRows, remaining_skin
@@ -195,7 +195,7 @@ class PatchedState:
 
     def __init__(self, wing: PatchedWing, stiffness: FloatArray, mass: FloatArray, patch: ModelPatch) -> None:
         self._arrays = arrays = wing.arrays
-        self._change = LoadChange.of(patch)
+        self._gains = [item for item in patch if isinstance(item, LoadGain)]
         self.stiffness, self.mass, self._factorised = stiffness, mass, wing.factorised
         self.laws = laws_of(wing.internal_forces(patch), wing.port_rows)
         self._held = wing.held
@@ -211,9 +211,11 @@ class PatchedState:
 
     def acting(self, vector: FloatArray) -> FloatArray:
         """Return the coefficients (4,) of the loads."""
-        load_factor, force = vector[-2:-1], vector[-1:]
-        changed = self._change.changed(force, force)
-        return np.concatenate((load_factor, load_factor**2, changed, (0.0,)))
+        load_factor, tip_force = vector[-2:].tolist()
+        force = tip_force
+        for item in self._gains:
+            force = (1.0 + item.gain) * force + (item.tare if tip_force != 0.0 else 0.0)
+        return np.array((load_factor, load_factor**2, force, 0.0))
 
     @cached_property
     def _solve(self) -> Callable[[FloatArray], FloatArray]:

@@ -317,7 +317,10 @@ class WingRows:
         else:
             y, chord = place
             row = self.displacement_row(y, chord)
-        _, _, along_span, along_chord = primitives.LoadChange.of(patch)
+        moves = [
+            (item.along_span, item.along_chord) for item in patch if isinstance(item, primitives.LoadPlace)
+        ]
+        along_span, along_chord = np.sum([(0.0, 0.0), *moves], axis=0).tolist()
         if along_span == 0.0 and along_chord == 0.0:
             return row
 
