@@ -367,10 +367,7 @@ class ModelPatch:
         return ModelPatch(self.primitives + other.primitives)
 
     def in_trial(self, trial: str) -> "ModelPatch":
-        """Return what acts in a trial: without the primitives whose windows are in other trials only.
-
-        A primitive that acts throughout the trial has no window in it.
-        """
+        """Return what acts in a trial, nothing of windows in other trials; what always acts has none in it."""
         if not self.has_windows:
             return self
         found = []
