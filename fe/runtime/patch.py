@@ -367,7 +367,7 @@ class ModelPatch:
         return ModelPatch(self.primitives + other.primitives)
 
     def in_trial(self, trial: str) -> "ModelPatch":
-        """Return what acts in a trial, nothing of windows in other trials; what always acts has none in it."""
+        """Return what acts in a trial: no windows of other trials, and none of what acts throughout."""
         if not self.has_windows:
             return self
         found = []
