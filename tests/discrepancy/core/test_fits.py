@@ -31,13 +31,9 @@ CENTRAL = 1e-3  # by effects no curvature is in them: of frequencies nuisances l
 BOTH = Candidate((kit.OFFSET, kit.DRIFT))
 
 
-def coloured_record(deviation=0.02, interval=0.01):
-    generator = np.random.default_rng(11)
-    samples, state = np.empty(3000), 0.0
-    for n in range(len(samples)):
-        state = 0.7 * state + generator.standard_normal()
-        samples[n] = deviation * np.sqrt(1.0 - 0.49) * state
-    return NoiseRecord(float(samples.std()), 2999.0, samples, interval, "pre-trigger")
+def coloured_record():
+    samples = 0.02 * np.sqrt(0.51) * kit.coloured(np.random.default_rng(11), (0.7,), 3000)
+    return NoiseRecord(float(samples.std()), 2999.0, samples, 0.01, "pre-trigger")
 
 
 # ---------------------------------------------------------------- derivatives

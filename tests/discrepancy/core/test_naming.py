@@ -6,15 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.judgement.conclusion import look_alike_remark, with_untested
 from discrepancy.judgement.court import Court
 from discrepancy.judgement.in_part import explained_share
 from discrepancy.judgement.naming import Case, name
-from discrepancy.judgement.when import look_alike_remark, with_untested
 from discrepancy.missing_force.shares import OF_READINGS, Share
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
@@ -51,8 +50,7 @@ BENCHES = {"small": SMALL, "rig": RIG, "tip": TIP, "laboratory": kit.BENCH}
 
 def coloured(generator, shape, share=0.7, before=200):
     """Return noise of deviation one and a correlation from sample to sample."""
-    white = generator.standard_normal((shape[0] + before, *shape[1:]))
-    return np.sqrt(1.0 - share**2) * lfilter([1.0], [1.0, -share], white, axis=0)[before:]
+    return np.sqrt(1.0 - share**2) * kit.coloured(generator, (share,), *shape, before=before)
 
 
 def outliers(generator, shape):

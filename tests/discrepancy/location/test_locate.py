@@ -11,16 +11,15 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import NoiseRecord, Quantity
 from discrepancy.errors import FitError
 from discrepancy.fits.predictive import residual_set
-from discrepancy.location.backbone import backbones
-from discrepancy.location.dependence import modal_motion
+from discrepancy.location.dependence import backbones, modal_motion
 from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
 from discrepancy.location.map import features, residual_map
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
-from tests.discrepancy.asking import integrated
 from tests.discrepancy.bench import SHAPES, Bench, with_noise
 from tests.discrepancy.core.kit import fitted, problem_of
+from tests.discrepancy.rigs import integrated
 
 # ---------------------------------------------------------------- calibration of the whole
 

@@ -20,10 +20,9 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch import LoadGain, LoadPlace, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fmu_asset.packing.contents import build_script_fmu
-from tests.discrepancy.asking import FloatArray, campaign, integrated
-from tests.discrepancy.asking import seen as shown
-from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import fmu_rig, laws
+from tests.discrepancy.rigs import FloatArray, campaign, fmu_rig, integrated, laws
+from tests.discrepancy.rigs import seen as shown
+from tests.discrepancy.rigs import trial as asked
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)

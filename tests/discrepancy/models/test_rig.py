@@ -37,9 +37,8 @@ from fe.runtime.patch import (
     Primitive,
     Window,
 )
-from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
-from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import model_of, one_mass
+from tests.discrepancy.rigs import FloatArray, campaign, integrated, model_of, one_mass, seen
+from tests.discrepancy.rigs import trial as asked
 from tests.fe.runtime.stepping import exact
 from tests.refusals import Inputs
 

@@ -42,8 +42,7 @@ from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures import rig_text
-from tests.discrepancy.asking import FloatArray, campaign, integrated, seen, trial
-from tests.discrepancy.rigs import INPUTS, chosen, setting_of
+from tests.discrepancy.rigs import INPUTS, FloatArray, campaign, chosen, integrated, seen, setting_of, trial
 from tests.fmu_asset.ours import wing_arrays, wing_model
 
 OUTPUTS = (
