@@ -202,7 +202,7 @@ class StaticCalibration:
     def before(self) -> ScalarPosterior:
         """The prior on a grid."""
         grid = np.linspace(-8.0, 8.0, 2001) * self.prior.standard_deviation + self.prior.mean
-        return ScalarPosterior(grid, self.prior.density(grid))
+        return ScalarPosterior(grid, np.exp(self.prior.log_density(grid)))
 
     @property
     def tip_stiffness_prior(self) -> ScalarPosterior:
