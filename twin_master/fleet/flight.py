@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from reporting.files import atomic_write_text, members_of, write_members, written
 from reporting.json_file import read_json
+from reporting.folders import held
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
@@ -27,7 +28,6 @@ from twin_master.run_folder import (
     check_versions,
     create_run_folder,
     folder_config,
-    held,
     lock_run_folder,
     to_json,
 )

@@ -22,7 +22,7 @@ from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, written
-from reporting.folders import lock_folder
+from reporting.folders import held, lock_folder
 from reporting.json_file import parse_json
 from reporting.progress import Stage, stage
 from reporting.provenance import hash_file
@@ -120,7 +120,7 @@ def sample_library(
     lock = lock_folder(folder)
     if lock is None:
         raise MissionInputError(said("library.locked", folder=folder))
-    try:
+    with held(lock):
         rows = _kept_rows(folder, (grid.size, sensors))
         todo = [(first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()]
         kept, begin = len(grid.blocks) - len(todo), time.perf_counter()
@@ -131,8 +131,6 @@ def sample_library(
         library = ObservationLibrary(sampled_dataset(grid, binding, record, np.array(rows)))
         write_observation_library(out, library)
         shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        os.close(lock)
     return SamplingOutcome(out, library, kept, len(grid.blocks), count, seconds)
 
 
