@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reporting.files import atomic_write_text, members_of, write_members, written
-from reporting.json_file import read_json
 from reporting.folders import held
+from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
