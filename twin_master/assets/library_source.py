@@ -17,9 +17,8 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, hash_file
 from reporting.progress import Progress
-from reporting.provenance import hash_file
 from twin_master.assets.asset_source import OBSERVATIONS_COPY, AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource

@@ -5,9 +5,8 @@ from pathlib import Path, PurePosixPath
 from typing import ClassVar, Literal
 
 from fmu_asset.door.binding import Binding
-from reporting.files import atomic_write_text
+from reporting.files import atomic_write_text, hash_file
 from reporting.progress import Progress
-from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
     BINDING_COPY,
     FLOWN_DESIGN_HASH,

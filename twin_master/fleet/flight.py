@@ -10,11 +10,17 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reporting.files import atomic_write_text, members_of, write_members, written
+from reporting.files import (
+    atomic_write_text,
+    collect_provenance,
+    hash_record,
+    members_of,
+    write_members,
+    written,
+)
 from reporting.folders import held
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError, said

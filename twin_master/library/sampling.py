@@ -21,11 +21,10 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
 from reporting.arrays import Float
-from reporting.files import atomic_write_bytes, atomic_write_text, written
+from reporting.files import atomic_write_bytes, atomic_write_text, hash_file, written
 from reporting.folders import held, lock_folder
 from reporting.json_file import parse_json
 from reporting.progress import Stage, stage
-from reporting.provenance import hash_file
 from twin_master.assets.library_source import (
     FORMAT,
     KIND,

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from reporting.arrays import Float
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, hash_record
 from reporting.progress import Progress
-from reporting.provenance import hash_record
 from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError, said
