@@ -55,8 +55,15 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, Roles]:
     """
     table = read_table(path, TableErrors(FmuInputError, FmuInputError))
     time = table.numbers(_TIME, "a simulation")
-    _check_time(path, time, binding)
-    names = _input_names(binding)
+    wanted = binding.binding.start_time + binding.interval * np.arange(len(time))
+    for step in np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval).tolist():
+        times = time[step], wanted[step]
+        raise FmuInputError(said("inputs.times", path=path, times=times, step=step, binding=binding))
+    keys = [(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
+    keys += [("port", f"{name}.{item}") for name, port in binding.port.items() for item in port.quantities]
+    named = Counter(name for _, name in keys)
+    # A column may be called by the name alone where it is of one role.
+    names = {key[1]: key for key in keys if named[key[1]] == 1} | {".".join(key): key for key in keys}
     columns: dict[tuple[str, str], dict[int, Floats]] = {}
     for column in table.columns:
         if column == _TIME:
@@ -106,23 +113,6 @@ def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history:
     observed = dict(zip(asset.binding.observation_variables, history.values.T, strict=True))
     observed[_TIME] = history.time
     atomic_write_text(path, table_text({_TIME: history.time, **observed, **(history.extra | observed)}))
-
-
-def _check_time(path: Path, time: Floats, binding: Binding) -> None:
-    wanted = binding.binding.start_time + binding.interval * np.arange(len(time))
-    wrong = np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval)
-    if wrong.size:
-        step = int(wrong[0])
-        times = time[step], wanted[step]
-        raise FmuInputError(said("inputs.times", path=path, times=times, step=step, binding=binding))
-
-
-def _input_names(binding: Binding) -> dict[str, tuple[str, str]]:
-    """Return role and name by what a column may be called."""
-    keys = [(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
-    keys += [("port", f"{name}.{item}") for name, port in binding.port.items() for item in port.quantities]
-    times = Counter(name for _, name in keys)
-    return {key[1]: key for key in keys if times[key[1]] == 1} | {".".join(key): key for key in keys}
 
 
 def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:

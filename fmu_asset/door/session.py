@@ -319,7 +319,12 @@ class FmiAsset(OpenedFmu):
         try:
             if replayed:
                 for index in range(saved.index):
-                    self._replay(saved.body[index * width : (index + 1) * width])
+                    inputs = saved.body[index * width : (index + 1) * width]
+                    self._request[0], self._request[1] = self.time, self._step_size
+                    self._request.cast("B")[16:] = inputs
+                    instance.step()
+                    self.step_index += 1
+                    self._record.append(inputs)
             else:
                 instance.restore(saved.body)
                 self.step_index = saved.index
@@ -363,13 +368,6 @@ class FmiAsset(OpenedFmu):
             or (saved.method == "replay" and len(saved.body) != width * saved.index)
         ):
             raise FmuStateError(said("state.damaged"))
-
-    def _replay(self, inputs: bytes) -> None:
-        self._request[0], self._request[1] = self.time, self._step_size
-        self._request.cast("B")[16:] = inputs
-        self._instance.step()
-        self.step_index += 1
-        self._record.append(inputs)
 
     def _outputs_now(self) -> bytes:
         """Return the outputs of this moment as the FMU gives them."""

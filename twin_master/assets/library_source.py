@@ -167,10 +167,6 @@ class ObservationLibrary:
         share = np.array([np.interp(draws, nodes, own) for own in np.eye(len(nodes))])
         return np.tensordot(share.T, self.values[order], axes=1)
 
-    def holds_draws(self, draws: Float) -> bool:
-        """Return whether every value of the parameter was sampled, so that nothing is interpolated."""
-        return bool(np.isin(draws, self.draws).all())
-
 
 def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
     """Write a library in one step; equal libraries give equal bytes.
@@ -309,7 +305,7 @@ class LibrarySource(AssetSource):
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter, from the calibration of the scenario."""
         draws = self._model.draws(seed)
-        if not self.library.parameter or self.library.holds_draws(draws.values):
+        if not self.library.parameter or np.isin(draws.values, self.library.draws).all():
             return draws
         return replace(
             draws, source=f"{draws.source}; the observation library is interpolated between its own"

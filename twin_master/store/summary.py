@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
-from reporting.words import parameter_title
+from reporting.words import counted, parameter_title
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
@@ -271,7 +271,7 @@ def control_changes(
         for step in steps[:_CHANGES_SAID]
     ]
     more = len(steps) - len(changes)
-    return ", ".join(changes) + (f", and {more} more change{'s' if more > 1 else ''}" if more else "")
+    return ", ".join(changes) + (f", and {counted(more, 'more change')}" if more else "")
 
 
 def of_fallback(fallback: Fallback, scenario: Scenario) -> Told:
