@@ -98,7 +98,7 @@ def replace_folder(fresh: Path, folder: Path) -> None:
     OSError
         The place is not writable; the old folder is there as it was.
     """
-    old = Path(tempfile.mkdtemp(prefix=_prefix(folder, _OLD), dir=folder.parent))
+    old = Path(tempfile.mkdtemp(prefix=_prefix(folder, _replaced_by(fresh)), dir=folder.parent))
     aside = old / folder.name
     try:
         folder.rename(aside)
@@ -108,7 +108,7 @@ def replace_folder(fresh: Path, folder: Path) -> None:
             aside.rename(folder)
         old.rmdir()
         raise
-    replaced = old.with_name(old.name.replace(f".{_OLD}-", f".{_REPLACED}-"))
+    replaced = Path(tempfile.mkdtemp(prefix=_prefix(folder, _REPLACED), dir=folder.parent))
     old.rename(replaced)
     shutil.rmtree(replaced, ignore_errors=True)
 
@@ -126,12 +126,16 @@ def restore_folder(folder: Path) -> bool:
     restored = False
     for old in _asides(folder, _OLD):
         aside = old / folder.name
-        # A folder that is held is being replaced at this moment; one whose place is taken is left alone.
-        if folder.exists() or not aside.is_dir() or (descriptor := lock_folder(aside)) is None:
+        # A folder that is held is being replaced at this moment; one whose place is taken is left alone, but
+        # where what took it is known.
+        if not aside.is_dir() or (descriptor := lock_folder(aside)) is None:
             continue
         with held(descriptor), written(folder):
-            aside.rename(folder)
-            restored = True
+            if not folder.exists():
+                aside.rename(folder)
+                restored = True
+            elif old.name.startswith(_prefix(folder, _replaced_by(folder))):
+                shutil.rmtree(old, ignore_errors=True)
         with suppress(OSError):
             old.rmdir()
     for left in (*_asides(folder, _NEW), *_asides(folder, _REPLACED)):
@@ -139,6 +143,10 @@ def restore_folder(folder: Path) -> bool:
             with held(descriptor):
                 shutil.rmtree(left, ignore_errors=True)
     return restored
+
+
+def _replaced_by(fresh: Path) -> str:
+    return f"{_OLD}-{fresh.stat().st_ino}"
 
 
 def _prefix(folder: Path, what: str) -> str:

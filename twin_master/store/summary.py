@@ -166,9 +166,9 @@ def summarise(
         told.append(("lost", {}, [100.0 * float(1.0 - received.mean())]))
         if blind := (flight.first_turn + np.flatnonzero(~received.any(axis=1))).tolist():
             told.append(("blind", step, [", ".join(map(str, blind))]))
-    if misfit is not None:
-        worst = np.nanmax(np.abs(misfit), axis=(0, 1))
-        sensor, rms = int(np.nanargmax(worst)), float(np.sqrt(np.nanmean(misfit**2)))
+    if misfit is not None and (known := np.isfinite(misfit)).any():
+        worst = np.max(np.abs(misfit), axis=(0, 1), where=known, initial=0.0)
+        sensor, rms = int(np.argmax(worst)), float(np.sqrt(np.mean(misfit[known] ** 2)))
         told.append(("misfit", {"sensor": sensor + 1}, [100.0 * rms, 100.0 * float(worst[sensor])]))
     bound = flight.monitors.get("strain_error_bound")
     if bound is not None and {*result.scenario.observation.sensor_units} == {"1"}:
