@@ -19,7 +19,8 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
-from reporting.units import Meaning, meaning_of
+from reporting import units
+from reporting.units import Meaning, exact_meaning, meaning_of
 from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed, tables
 from tests.refusals import refused
@@ -77,6 +78,12 @@ DEFINED = (
 def test_unit_texts_mean_what_is_defined(unit) -> None:
     factor = pytest.approx(unit["factor"] / unit.get("divisor", 1.0), rel=1e-12)
     assert meaning_of(unit["text"]) == Meaning(si(**unit["of"]), factor, unit.get("offset", 0.0))
+
+
+def test_units_that_pint_is_not_asked_for_mean_what_it_says():
+    for unit in units._PLAIN:
+        exponents, factor, offset = exact_meaning(unit)
+        assert meaning_of(unit) == Meaning(exponents, float(factor), float(offset)), unit
 
 
 def test_other_texts_mean_nothing() -> None:
