@@ -38,7 +38,7 @@ _PLAIN = {
     "kg": (1.0, {"kg": 1}), "g": (1e-3, {"kg": 1}), "s": (1.0, {"s": 1}), "Hz": (1.0, {"s": -1}),
     "1/s": (1.0, {"s": -1}), "N": (1.0, {"kg": 1, "m": 1, "s": -2}),
 }  # fmt: skip
-"""Factors and exponents of units that nearly every FMU has: pint takes as long to begin as a short mission."""
+"""Factors and exponents of units that nearly every FMU has: pint takes long to begin."""
 
 
 class Meaning(NamedTuple):
@@ -118,8 +118,8 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...],
 def meaning_of(unit: str) -> Meaning | None:
     """Return what a unit means, or None if it is not understood; see `exact_meaning`."""
     if unit in _PLAIN:
-        factor, powers = _PLAIN[unit]
-        return Meaning(tuple(powers.get(base, 0) for base in BASE_UNITS), factor)
+        size, powers = _PLAIN[unit]
+        return Meaning(tuple(powers.get(base, 0) for base in BASE_UNITS), size)
     try:
         exponents, factor, offset = exact_meaning(unit)
         return Meaning(exponents, float(factor), float(offset))
