@@ -14,7 +14,7 @@ import numpy as np
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.errors import BindingError, FmuInputError, said
-from fmu_asset.instances.plan import Floats
+from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table, table_text
 
@@ -23,7 +23,7 @@ from .draft import bindable, observable
 from .layout import ObservationHistory
 from .session import FmiAsset
 
-Roles = dict[str, dict[str, Floats]]
+Roles = dict[str, dict[str, Float]]
 """Inputs of N steps by role and name, (N,) or (N, n) for an array: what `FmiAsset.simulate` takes."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]", re.DOTALL)
@@ -64,7 +64,7 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, Roles]:
     named = Counter(name for _, name in keys)
     # A column may be called by the name alone where it is of one role.
     names = {key[1]: key for key in keys if named[key[1]] == 1} | {".".join(key): key for key in keys}
-    columns: dict[tuple[str, str], dict[int, Floats]] = {}
+    columns: dict[tuple[str, str], dict[int, Float]] = {}
     for column in table.columns:
         if column == _TIME:
             continue

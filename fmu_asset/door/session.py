@@ -5,7 +5,8 @@ from typing import Self
 import numpy as np
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, said
-from fmu_asset.instances.plan import Floats, Instance
+from fmu_asset.instances.plan import Instance
+from reporting.arrays import Float
 from reporting.progress import Progress, Stage, reporter
 
 from .exchange import Histories, Values, plain_values
@@ -204,7 +205,7 @@ class FmiAsset(OpenedFmu):
         sentence = "" if ended is None else ended.sentence
         return self._exchange.outputs.history(moments[1:], replies, sentence)
 
-    def _run(self, rows: Floats, replies: Floats, stage: Stage) -> FmuEndedError | None:
+    def _run(self, rows: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
         """Make a block of steps; whatever happens, the asset is where the last complete one has left it.
 
         Return how the FMU has ended its simulation, if it has.
