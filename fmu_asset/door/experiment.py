@@ -190,13 +190,12 @@ def default_experiment(
     Raises
     ------
     BindingError
-        If the FMU has no number to observe, or no parameter or input of a name.
+        If the FMU has no number to observe, or no parameter or input of a name, or the step is not positive.
     FmuInputError
         If the end does not come after the start, or the steps are too many.
     """
     end = description.stop_time if stop_time is None else stop_time
-    size = step_size or description.fixed_step or description.step_size
-    steps, size = _steps_to(description.start_time or 0.0, end, size)
+    steps, size = _steps_to(description.start_time or 0.0, end, description.step_of(step_size))
     binding = whole_binding(description, step_size=size)
     structural = [v.name for v in description.variables if v.causality == "structuralParameter"]
     values = values or {}
@@ -236,7 +235,7 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
     return Binding(
         binding=Header(
             name=description.model_name or "fmu",
-            step_size=step_size or description.fixed_step or description.step_size or 1.0,
+            step_size=description.step_of(step_size) or 1.0,
             start_time=description.start_time or 0.0,
             interface=description.interface,
         ),

@@ -226,7 +226,7 @@ def _difference(kept: bytes, record: dict[str, Any]) -> str:
 def _kept_rows(folder: Path, shape: tuple[int, int]) -> Float:
     """Return the observations (N, G) on disk, NaN where there is none yet; whoever fills them keeps them."""
     path, sound = folder / ROWS_NAME, False
-    with suppress(OSError, ValueError):  # there are none, or they are damaged
+    with suppress(OSError, EOFError, ValueError):  # there are none, or they are damaged
         sound = np.load(path, mmap_mode="r").shape == shape  # a short file would grow
     if not sound:
         content = io.BytesIO()

@@ -14,6 +14,7 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
+from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import Conversion, contradictions, conversion, same_dimension
@@ -140,9 +141,10 @@ def test_the_wing_is_drafted_almost_as_it_is_bound(fmu, binding) -> None:
     assert wing.port["tip"].quantities["displacement"].variables == ("tip_displacement",)
     assert "frequency[6]" in wing.record.variables
     assert wing.parameter["damping_alpha"].unit == "1/s"
-    for size in (0.0, -1.0, float("nan")):
-        with pytest.raises(BindingError, match="must be a positive number of seconds"):
-            draft_binding(read_fmu(fmu), step_size=size)
+    for size in (0.0, -1.0, float("nan"), float("inf")):
+        for made in (draft_binding, default_experiment):
+            with pytest.raises(BindingError, match="must be a positive number of seconds"):
+                made(read_fmu(fmu), step_size=size)
 
 
 def test_roles_units_and_step_size_come_from_the_description(foreign_fmu) -> None:
