@@ -16,14 +16,13 @@ import os
 import platform
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
 from reporting.errors import DiskFullError, FileNotWrittenError
-from reporting.json_file import plain
 
 TEMPORARY_SUFFIX = ".partial"
 """Ending of the temporary names, so that a leftover of a killed process is recognisable."""
@@ -231,8 +230,7 @@ class Provenance:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain dictionaries, ready for JSON."""
-        found: dict[str, Any] = plain(self)
-        return found
+        return asdict(self)
 
 
 def collect_provenance(
