@@ -21,17 +21,16 @@ from tests.twin_master.runs import (
     check_resumed,
     journal,
     of_wing,
-    table_of,
     text_of,
     written,
 )
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
-from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
+from twin_master.errors import FleetError, MissionInputError, TwinMasterError
 from twin_master.fleet.plan import ensemble
 from twin_master.mission.turns import Plant, Truth
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, load_scenario, open_run, resume
 
@@ -114,18 +113,15 @@ def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, di
 ANY = TwinMasterError, FmuError, SspError
 
 
-@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("coupled"))
-def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, old, new, sentence):
-    with refused(ANY, sentence):
-        new_run(changed(folder, "wrong", (old, new)), tmp_path / "run")
-    assert not [*tmp_path.iterdir()]
-
-
-@BOTH
-@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("exchanger"))
-def test_what_does_not_fit_one_fmu_or_several_is_said(folder, tmp_path, old, new, sentence, name):
+@pytest.mark.parametrize(
+    ("name", "old", "new", "sentence"),
+    [("coupled_fouling", *row) for row in INPUTS.refused("coupled") + INPUTS.refused("exchanger")]
+    + [("fouling", *row) for row in INPUTS.refused("exchanger")],
+)
+def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, name, old, new, sentence):
     with refused(ANY, sentence):
         new_run(changed(folder, "wrong", (old, new), of=name), tmp_path / "run")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_files_that_cannot_be_flown_are_refused_before_a_folder_is_made(folder, tmp_path):
@@ -145,14 +141,6 @@ def test_files_that_cannot_be_flown_are_refused_before_a_folder_is_made(folder, 
     with pytest.raises(MissionInputError, match="name a model for the twin in the table `belief`"):
         new_run(load_scenario(path), tmp_path / "run")
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize(("changes", "sentence"), INPUTS.refused("truth"))
-def test_the_schema_of_the_truth(changes, sentence):
-    table = table_of("three_fmus")
-    truth = {key: value for key, value in (table["truth"] | changes).items() if value != ""}
-    with refused(ScenarioError, sentence):
-        parse_scenario(table | {"truth": truth}, "x")
 
 
 # ---------------------------------------------------------------------- with the shipped wing

@@ -16,7 +16,7 @@ import pytest
 
 from tests.command_line import command, said
 from tests.twin_master.runs import journal, text_of, written
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
+from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, wait_until, write_csv
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving

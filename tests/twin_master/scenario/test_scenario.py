@@ -1,5 +1,6 @@
 """The schema of scenario files: what is read, the sentence for whatever is wrong, kinds, and format 1."""
 
+import itertools
 import re
 from typing import Any, ClassVar, Literal
 
@@ -20,7 +21,8 @@ from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_sc
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import AssetSection
 
-TEXT = text_of("level_turns")
+INPUTS = Inputs(__file__)
+EDITED = ("level_turns", "level_turns_learning", "inspected_wing", "model_mismatch")
 
 
 def test_everything_inside_is_si():
@@ -33,9 +35,11 @@ def test_everything_inside_is_si():
     assert load_scenario("failing_gauges").scenario.truth.sensor_faults[-1].rate == 6e-6
 
 
-@pytest.mark.parametrize(("old", "new", "sentence"), Inputs(__file__).refused("scenarios"))
-def test_whatever_is_wrong_is_named_in_one_sentence(old, new, sentence, tmp_path):
-    path = written(tmp_path, TEXT, (old, new))
+@pytest.mark.parametrize(
+    ("name", "old", "new", "sentence"), [(name, *row) for name in EDITED for row in INPUTS.refused(name)]
+)
+def test_whatever_is_wrong_is_named_in_one_sentence(name, old, new, sentence, tmp_path):
+    path = written(tmp_path, text_of(name, (old, new)))
     with refused(ScenarioError, f"^{re.escape(str(path))}: .*{sentence}"):
         load_scenario(path)
 
@@ -57,22 +61,25 @@ def tables(*changed: list[float]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("name", "changes", "words"),
     [
-        ({"mission": {"seed": 10**40}}, r"mission\.seed.*at most 9223372036854775807.*files"),
-        ({"mission": {"seed": 10**5000}}, r"mission\.seed.*thousands of digits"),
-        ({"observation": {"standard_deviation_microstrain": 10**400}},
-         r"observation\.standard_deviation.*finite"),
-        ({"rewards": {"health_weight": 10**5000}}, r"rewards\.health_weight.*thousands of digits"),
-        ({"observation": {"standard_deviation": 1e-4}}, "given with and without its unit"),
-        (tables([0.0, 0.0, 0.0, 0.1, 0.8]), r"2g\.z1.*sum to 1"),
-        (tables([0.0, 1.0]), "5 rows of 5"),
+        *[("level_turns", *row) for row in (
+            ({"mission": {"seed": 10**40}}, r"mission\.seed.*at most 9223372036854775807.*files"),
+            ({"mission": {"seed": 10**5000}}, r"mission\.seed.*thousands of digits"),
+            ({"observation": {"standard_deviation_microstrain": 10**400}},
+             r"observation\.standard_deviation.*finite"),
+            ({"rewards": {"health_weight": 10**5000}}, r"rewards\.health_weight.*thousands of digits"),
+            ({"observation": {"standard_deviation": 1e-4}}, "given with and without its unit"),
+            (tables([0.0, 0.0, 0.0, 0.1, 0.8]), r"2g\.z1.*sum to 1"),
+            (tables([0.0, 1.0]), "5 rows of 5"),
+        )],
+        *INPUTS.refused("tables"),
     ],
-    ids=range(7),
+    ids=itertools.count(),
 )  # fmt: skip
-def test_numbers_that_no_file_or_float_holds_come_twice_or_are_no_table_are_refused(changes, words):
+def test_keys_that_do_not_fit_and_numbers_that_no_file_or_float_holds_are_refused(name, changes, words):
     with refused(ScenarioError, words):
-        parse_scenario(merged(table_of("level_turns"), changes), "mine.toml")
+        parse_scenario(merged(table_of(name), changes), "mine.toml")
 
 
 @settings(max_examples=60, deadline=None)  # the first one loads every source
@@ -98,7 +105,7 @@ def test_no_table_whatsoever_raises_anything_but_a_sentence(table):
 
 # ---------------------------- the kinds, a kind of one's own, and files of format 1
 
-FORMAT_1 = Inputs(__file__).table("format_1.toml")
+FORMAT_1 = INPUTS.table("format_1.toml")
 
 
 def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:

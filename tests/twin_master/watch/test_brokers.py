@@ -16,7 +16,7 @@ from reporting.progress import SilentProgress
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
+from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of

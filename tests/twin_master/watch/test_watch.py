@@ -20,7 +20,7 @@ import uav_twin
 from reporting.progress import SilentProgress
 from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
-from tests.twin_master.watch.watches import (
+from tests.twin_master.watch.conftest import (
     begun,
     decided,
     killed_at,
