@@ -19,7 +19,6 @@ from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
     changed_scenario,
     check_resumed,
-    journal,
     of_wing,
     text_of,
     written,
@@ -45,7 +44,7 @@ def folder(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """The heat exchanger as one FMU, and as a system of one component."""
     place = Path(shutil.copytree(heat_exchanger, tmp_path_factory.mktemp("coupled") / "system"))
     binding = (place / "binding.toml").read_text(encoding="utf-8")
-    inner = ("wall_temperature", "misbehaviour", "conductance", "heat")
+    inner = ("wall_temperature", "conductance", "heat")
     names = [(f'variable = "{name}"', f'variable = "exchanger.{name}"') for name in inner]
     names += [('variable = "mass_flow"', 'variable = "flow"')]
     names += [('["middle", "outlet"]', '["exchanger.middle", "outlet"]')]
@@ -66,30 +65,8 @@ def direct(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     }
 
 
-def changed(
-    folder: Path, name: str, *changes: tuple[str, str], of: str = "coupled_fouling"
-) -> LoadedScenario:
-    text = (folder / f"{of}.toml").read_text(encoding="utf-8")
-    return load_scenario(written(folder, text, *changes, name=f"{name}.toml"))
-
-
 def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
-
-
-def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder, tmp_path):
-    # The twin's table has two levels, so that only the flown asset misbehaves.
-    load = "wall_temperature = 80.0"
-    loaded = changed(
-        folder, "nan", (f"{load} }}", f"{load}, misbehaviour = 1.0 }}"),
-        ("levels = [0.0, 1e-4, 2e-4, 3e-4]", "levels = [0.0, 1e-4]"),
-        ("prior = [1, 0, 0, 0]", "prior = [1, 0]"), of="fouling",
-    )  # fmt: skip
-    with pytest.raises(FmuError, match=r"not finite.*outlet"):
-        new_run(loaded, tmp_path / "run")
-    assert len(journal(tmp_path / "run")) == 16
-    with pytest.raises(FmuError, match=r"not finite.*outlet"):
-        resume(tmp_path / "run")
 
 
 @BOTH
@@ -119,8 +96,9 @@ ANY = TwinMasterError, FmuError, SspError
     + [("fouling", *row) for row in INPUTS.refused("exchanger")],
 )
 def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, name, old, new, sentence):
+    text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     with refused(ANY, sentence):
-        new_run(changed(folder, "wrong", (old, new), of=name), tmp_path / "run")
+        new_run(load_scenario(written(folder, text, (old, new), name="wrong.toml")), tmp_path / "run")
     assert not [*tmp_path.iterdir()]
 
 

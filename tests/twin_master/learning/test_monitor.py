@@ -231,7 +231,7 @@ def twins() -> dict[str, Twin]:
 EXTREME = st.floats(allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308, np.nan])
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(rows=st.lists(st.tuples(EXTREME, EXTREME), min_size=1, max_size=6), late=st.integers(0, 6))
 def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, late):
     ordinary = drawn(np.random.default_rng(2), 4, 2)
@@ -278,13 +278,16 @@ def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
         watchful()
 
 
+FEW = {"calibration": {"draws": 20}}
+
+
 def at_levels(name: str, between: bool) -> Knowledge:
-    return prepare_twin(changed_scenario(name, {"observation": {"between_levels": between}}))
+    return prepare_twin(changed_scenario(name, FEW | {"observation": {"between_levels": between}}))
 
 
 @pytest.fixture(scope="module")
 def wing() -> Knowledge:
-    return prepare_twin("paper_level_turns")
+    return prepare_twin(changed_scenario("paper_level_turns", FEW))
 
 
 @pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 10)])

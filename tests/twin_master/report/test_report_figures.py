@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
-from tests.twin_master.report.conftest import altered, line, panel, rescripted, stored
+from tests.twin_master.report.conftest import altered, line, panel, rescripted
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
 from twin_master.report.mission import (
@@ -22,6 +22,7 @@ from twin_master.report.mission import (
 from twin_master.report.model import calibration_figure, measured, predictive_check
 from twin_master.report.reading import short_number
 from twin_master.report.structure import planform_figure, planform_of
+from twin_master.scenario.schema import Scenario
 
 
 def test_the_mission_figure_draws_the_stored_arrays(run):
@@ -75,7 +76,7 @@ def test_sensors_worth_a_panel_are_the_highest_the_first_and_one_for_each_region
     assert choose_sensors(run) == [16, 0, 4, 9]
 
 
-def test_states_and_sensors_have_units_and_names_of_their_own(run, tmp_path):
+def test_states_and_sensors_have_units_and_names_of_their_own(run, hold, tmp_path):
     observation = {
         "role": "operation", "unit": ["bar", *["L/min"] * 23], "standard_deviation": [2e-4] * 24,
         "titles": ["pressure", *[f"flow {number}" for number in range(2, 25)]],
@@ -85,8 +86,8 @@ def test_states_and_sensors_have_units_and_names_of_their_own(run, tmp_path):
     tree = altered(run).tree
     for name in ("observed", "truth"):
         tree[name] = xr.DataTree(tree[name].to_dataset().rename({"strain": "operation"}))
-    place = stored(replace(other, tree=tree), tmp_path / "run")
-    figures = {figure.name: figure for figure in report.report_figures(place, 20)}
+    hold(replace(other, tree=tree, scenario=Scenario.model_validate(other.config["scenario"])))
+    figures = {figure.name: figure for figure in report.report_figures(tmp_path, 20)}
     now = figures["mission_now"].figure
     axes = panel(now, "Stiffness loss of region 1")
     assert axes.get_ylabel() == "z₁ (m2.K/W)"
@@ -213,15 +214,14 @@ def test_the_wing_is_coloured_by_belief_and_its_gauges_by_reading_and_residual(r
         assert_allclose(lost.get_offsets(), planform.gauges[[4]])
 
 
-def test_nothing_is_drawn_outside_the_figure(run, tmp_path):
+def test_nothing_is_drawn_outside_the_figure(run, hold, tmp_path):
     """Also with titles that would be broken mathematics."""
     titles = [f"gauge ${number}^" for number in range(1, 25)]
-    odd = rescripted(run, state={"title": r"loss of $\frac{1$"}, observation={"titles": titles})
-    place = stored(odd, tmp_path / "run")
-    (place / DESIGN_COPY).parent.mkdir()
-    shutil.copy(SHIPPED_DESIGN, place / DESIGN_COPY)
+    hold(rescripted(run, state={"title": r"loss of $\frac{1$"}, observation={"titles": titles}))
+    (tmp_path / DESIGN_COPY).parent.mkdir()
+    shutil.copy(SHIPPED_DESIGN, tmp_path / DESIGN_COPY)
     names = []
-    for drawn in report.report_figures(place, 18):
+    for drawn in report.report_figures(tmp_path, 18):
         names.append(drawn.name)
         tight = drawn.figure.get_tightbbox()
         width, height = drawn.figure.get_size_inches()

@@ -25,16 +25,6 @@ INPUTS = Inputs(__file__)
 EDITED = ("level_turns", "level_turns_learning", "inspected_wing", "model_mismatch")
 
 
-def test_everything_inside_is_si():
-    scenario = load_scenario("level_turns").scenario
-    assert scenario.state[0].levels == (0.0, 0.2, 0.4, 0.6, 0.8)
-    assert scenario.observation.standard_deviation == 125e-6
-    assert scenario.truth.noise.standard_deviation == 150e-6
-    assert scenario.rewards.health_limit == 2500e-6
-    assert scenario.truth.gains[0].gain == 0.02
-    assert load_scenario("failing_gauges").scenario.truth.sensor_faults[-1].rate == 6e-6
-
-
 @pytest.mark.parametrize(
     ("name", "old", "new", "sentence"), [(name, *row) for name in EDITED for row in INPUTS.refused(name)]
 )
@@ -114,15 +104,11 @@ def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:
     return parse_scenario(table, "old.toml")
 
 
-@pytest.mark.parametrize("name", FORMAT_1["same"])
+@pytest.mark.parametrize("name", [*FORMAT_1["same"], "three_fmus"])
 def test_a_file_of_format_1_means_what_it_meant(name):
-    assert of_format_1(name, FORMAT_1["same"][name]) == parse_scenario(table_of(name), name)
-
-
-def test_all_of_several_fmus_is_read_from_format_1():
-    new = table_of("three_fmus")
-    old = new["asset"] | {"design": "uav_wing", "observation_model": None, "patch": None, "isolated": True}
-    assert of_format_1("three_fmus", old) == parse_scenario(table_of("three_fmus"), "three_fmus")
+    several = {"design": "uav_wing", "observation_model": None, "patch": None, "isolated": True}
+    old = FORMAT_1["same"].get(name, table_of(name)["asset"] | several)
+    assert of_format_1(name, old) == parse_scenario(table_of(name), name)
 
 
 @pytest.mark.parametrize(("asset", "flown", "believed"), FORMAT_1["kinds"]["rows"])

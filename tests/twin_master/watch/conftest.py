@@ -21,7 +21,7 @@ from paho.mqtt import client as paho
 from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
-from tests.twin_master.runs import flight_of
+from tests.twin_master.runs import flight_of, text_of
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import BelievedModel
 from twin_master.mission.turns import History
@@ -197,8 +197,8 @@ class Mosquitto:
 
 @pytest.fixture(scope="session")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
-    """`paper_level_turns` of a real wing: without what flies and what really happens."""
-    text = load_scenario("paper_level_turns").path.read_text(encoding="utf-8")
+    """`paper_level_turns` of a real wing: without what flies and what really happens; with fewer draws."""
+    text = text_of("paper_level_turns", ("draws = 100", "draws = 20"))
     tables = re.compile(r"^\[+(asset|truth|reference)\b.*?(?=^\[|\Z)", re.MULTILINE | re.DOTALL)
     path = tmp_path_factory.mktemp("scenario") / "my_wing.toml"
     path.write_text(f"{tables.sub('', text)}\n[watch]\nlag = 12\n", encoding="utf-8")
