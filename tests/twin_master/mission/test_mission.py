@@ -83,7 +83,7 @@ WITHOUT = "import sys; sys.modules['numba'] = None; from uav_twin import cli; cl
 
 def test_a_mission_without_numba_is_the_same(library_file, tmp_path):
     """The same loops as plain Python, and one sentence about it."""
-    short = written(tmp_path, text_of("level_turns", ("steps = 50", "steps = 8")))
+    short = written(tmp_path, text_of("level_turns", ("steps = 50", "steps = 4")))
     words = "run", str(short), "--strain-library", str(library_file), "--no-report", "--out"
     said(*words, tmp_path / "fast")
     line = [sys.executable, "-c", WITHOUT, *words, str(tmp_path / "plain")]
