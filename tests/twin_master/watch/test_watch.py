@@ -270,6 +270,7 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
 
     assert kinds(1) == [(-1, ["quiet"])]  # nobody has decided anything yet
     assert "control" not in told[0]
+    assert "see whether logger and broker are there" in told[0]["notices"][0]["sentence"]
     os.write(write, texts[0].encode())
     assert kinds(3)[1:] == [(0, ["heard"]), (0, ["quiet"])]
     assert told[2] == told[1] | {"notices": told[2]["notices"], "told_again": True}
