@@ -39,7 +39,7 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 from twin_master.workflow import check_scenario
 from uav_twin import fly as new_run
-from uav_twin import load_scenario, open_run, resume
+from uav_twin import load_scenario, open_run
 
 TEXT = text_of("model_mismatch")
 
@@ -258,7 +258,6 @@ def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):
     for lines, parameters, belief, words in (
         (FILE, '"effect.hiden.active" = 0', "", "effect.hiden.active"),
         ('patch = "q.json"\n', "", "", "q.json cannot be read"),
-        ("", "", FILE, "depends on time"),
     ):
         scenario = scenario_of(tmp_path, lines, parameters, belief)
         assert words in command_line.refused("run", scenario, "--out", tmp_path / "run")
@@ -293,9 +292,6 @@ def test_a_mission_with_a_hidden_drift(mission, tmp_path):
     assert (folder / "asset" / "patch.json").read_bytes() == (tmp_path / "p.json").read_bytes()
     assert config["scenario"]["asset"]["patch"] == "asset/patch.json"
     assert "patch" in config["inputs"]
-    before = (folder / "run.nc").read_bytes()
-    resume(folder)
-    assert (folder / "run.nc").read_bytes() == before
 
 
 @pytest.mark.long

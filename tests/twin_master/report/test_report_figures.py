@@ -59,9 +59,7 @@ def test_the_mission_figure_draws_the_stored_arrays(run):
         assert_allclose(heights, run["predicted/control_probability"][18, :, control])
         assert [bar.get_y() for bar in bars] == [control] * 10
         assert axes.get_yticklabels()[control].get_text() == name
-
-
-def test_bands_are_the_stored_intervals(run):
+    # Bands are the stored intervals.
     figure = mission_figure(run, 49, [16])
     band = panel(figure, "Gauge 17").collections[0].get_paths()[0].vertices
     heights = band[band[:, 0] == 20][:, 1]
@@ -69,10 +67,7 @@ def test_bands_are_the_stored_intervals(run):
     assert_allclose([heights.min(), heights.max()], [1e6 * end for end in ends])
     loss = panel(figure, "region 2").collections[0].get_paths()[0].vertices
     assert 0.0 <= loss[:, 1].min() <= loss[:, 1].max() <= 80.0
-
-
-def test_sensors_worth_a_panel_are_the_highest_the_first_and_one_for_each_region(run):
-    # built into the library: 17 is strained most, 5 answers to region 1 and 10 to region 2
+    # Worth a panel; built into the library: 17 is strained most, 5 answers to region 1 and 10 to region 2.
     assert choose_sensors(run) == [16, 0, 4, 9]
 
 
@@ -112,7 +107,7 @@ def test_numbers_beside_an_axis_are_short():
     ]  # fmt: skip
 
 
-def test_belief_maps_show_the_joint_belief(run):
+def test_maps_show_the_joint_belief_the_policy_and_its_margin(run):
     figure, turns = belief_figure(run), belief_turns(run)
     assert (turns[0], turns[-1], len(turns)) == (0, 49, 8)
     for axes, turn in zip(figure.axes[:8], turns, strict=True):
@@ -121,6 +116,11 @@ def test_belief_maps_show_the_joint_belief(run):
         assert f"turn {turn}" in axes.get_title(loc="left")
     named = [(bool(axes.get_xlabel()), bool(axes.get_ylabel())) for axes in figure.axes[:8]]
     assert named == [(lowest, first) for lowest in (False, True) for first in (True, *(False,) * 3)]
+    figure = policy_figure(run)
+    value = run["policy/action_value"]
+    chosen, margin = (axes.collections[0].get_array().reshape(5, 5) for axes in figure.axes[:2])
+    assert_array_equal(chosen, run["policy/control_index"].reshape(5, 5).T)
+    assert_array_equal(margin, (value[:, 1] - value[:, 0]).reshape(5, 5).T)
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -140,14 +140,6 @@ def test_states_of_another_number_of_factors_show_their_marginals(run, count):
     first = belief_figure(other).axes[0].collections[0].get_array().reshape(2, 50)
     mean = (probability @ coordinates)[:, 0]
     assert_allclose(first, np.stack([1 - 2 * mean, 2 * mean]), atol=1e-12)
-
-
-def test_policy_maps_show_policy_and_margin(run):
-    figure = policy_figure(run)
-    value = run["policy/action_value"]
-    chosen, margin = (axes.collections[0].get_array().reshape(5, 5) for axes in figure.axes[:2])
-    assert_array_equal(chosen, run["policy/control_index"].reshape(5, 5).T)
-    assert_array_equal(margin, (value[:, 1] - value[:, 0]).reshape(5, 5).T)
 
 
 @pytest.mark.parametrize(
