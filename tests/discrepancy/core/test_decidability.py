@@ -22,8 +22,14 @@ from discrepancy.judgement.next_experiment import (
 )
 from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
 from discrepancy.report.text import group_lines
-from discrepancy.self_calibration import NOTHING, outcome_of, self_calibrate, wilson, write_self_calibration
-from discrepancy.sources.simulated_campaigns import Simulator
+from discrepancy.self_calibration import (
+    NOTHING,
+    Simulator,
+    outcome_of,
+    self_calibrate,
+    wilson,
+    write_self_calibration,
+)
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import FEW, ORIGIN, measured, model_of

@@ -10,10 +10,10 @@ import pytest
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.judgement.conclusion import look_alike_remark, with_untested
 from discrepancy.judgement.court import Court
 from discrepancy.judgement.in_part import explained_share
 from discrepancy.judgement.naming import Case, name
-from discrepancy.judgement.when import look_alike_remark, with_untested
 from discrepancy.missing_force.shares import OF_READINGS, Share
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind

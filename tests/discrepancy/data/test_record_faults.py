@@ -16,11 +16,10 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.checks.fault import FaultKind
+from discrepancy.checks.fault import FaultKind, slip_between
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
 from discrepancy.checks.quality import check_data, held_spans, moves
-from discrepancy.checks.unit_slips import slip_between
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 

@@ -8,8 +8,7 @@ from scipy.stats import binom
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
-from discrepancy.location.backbone import backbones
-from discrepancy.location.dependence import modal_motion
+from discrepancy.location.dependence import backbones, modal_motion
 from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
 from discrepancy.location.map import features, residual_map
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
