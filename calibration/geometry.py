@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.errors import said
+from calibration.errors import ExperimentDataError, ExperimentFileError, said
 from calibration.result.record import ParameterPrior, Reading
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
@@ -15,7 +15,6 @@ from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
 from reporting.files import hash_record
 
-from .errors import ExperimentDataError, ExperimentFileError
 from .lab_folder import lab_table
 
 TOLERANCE = 2.54e-3

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from calibration.dynamics.records import RingDownRecord
-from calibration.errors import said
+from calibration.errors import ExperimentDataError, said
 from calibration.joint.wing_table import weighed
 from calibration.result.record import Reading
 from calibration.static.experiments import (
@@ -26,7 +26,6 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState, Geometry
 from reporting.arrays import Float
 
-from .errors import ExperimentDataError
 from .geometry import READING_UNCERTAINTY, Lengths, MeasuredLength, published_lengths
 
 SENSITIVITY = 50.0

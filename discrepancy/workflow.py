@@ -26,11 +26,16 @@ from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import solver_share
 from discrepancy.fits.predictive import held_out_fit, residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.conclusion import calibrated_parameters
+from discrepancy.judgement.conclusion import (
+    NO_GAP,
+    calibrated_parameters,
+    dated,
+    look_alike_remark,
+    with_untested,
+)
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.judgement.when import NO_GAP, dated, look_alike_remark, with_untested
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce, seen_force

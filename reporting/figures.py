@@ -18,9 +18,10 @@ from typing import Any, Final
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullLocator
 from numpy.typing import ArrayLike
 
 from reporting.errors import InvalidFigureError
@@ -139,6 +140,21 @@ def panels(
     room = {"top": 1.0 - top / height, "bottom": bottom / height, "left": 0.085, "right": 0.985}
     cells = figure.add_gridspec(rows, columns, **{**room, **grid})
     return figure, [[figure.add_subplot(cells[row, n]) for n in range(columns)] for row in range(rows)]
+
+
+def first_of(grid: list[list[Axes]], count: int) -> list[Axes]:
+    """Return the first panels, row by row; the others are taken away."""
+    every = [axes for row in grid for axes in row]
+    for spare in every[count:]:
+        spare.remove()
+    return every[:count]
+
+
+def plain_powers(axis: Axis, parts: tuple[float, ...]) -> None:
+    """Label a logarithmic axis with plain numbers at parts of its decades."""
+    axis.set_major_locator(LogLocator(10.0, parts))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) -> None:

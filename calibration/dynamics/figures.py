@@ -3,17 +3,18 @@
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
-from reporting.figures import OBSERVED, PAST, PREDICTION, PRESENT, panel_label, panels, publication_style
+from reporting import figures as style
 
 from .trials import Fits, ModalFigure, RingDownFit, amplitude_dependence, average, spectrum
 
 
-@publication_style()
+@style.publication_style()
 def ring_down_figure(trials: Fits) -> Figure:
     """Draw the first trial with its two modes, all spectra, and the first mode over its amplitude."""
-    figure, ((record, spectra), lower) = panels(2, 2, 4.8, 0.29, 0.43, left=0.075, wspace=0.26, hspace=0.48)
+    figure, ((record, spectra), lower) = style.panels(
+        2, 2, 4.8, 0.29, 0.43, left=0.075, wspace=0.26, hspace=0.48
+    )
     _draw_record(record, trials[0])
     _draw_spectra(spectra, trials)
     points = [point for fit in trials for point in amplitude_dependence(fit)]
@@ -24,42 +25,40 @@ def ring_down_figure(trials: Fits) -> Figure:
     )
     for axes, name, scale, ylabel, label, title in shown:
         axes.semilogx(
-            amplitude, [scale * getattr(point, name) for point in points], "o", color=OBSERVED, ms=2.4
+            amplitude, [scale * getattr(point, name) for point in points], "o", color=style.OBSERVED, ms=2.4
         )
-        axes.axhline(scale * average(trials, name, 0).mean, color=PAST, lw=1.0, label="whole record")
+        axes.axhline(scale * average(trials, name, 0).mean, color=style.PAST, lw=1.0, label="whole record")
         axes.set(xlabel="amplitude of the first mode (mV)", ylabel=ylabel)
-        axes.xaxis.set_major_formatter(ScalarFormatter())
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_minor_locator(NullLocator())
+        style.plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
         axes.legend(loc="best")
-        panel_label(axes, label, title)
+        style.panel_label(axes, label, title)
     return figure
 
 
 def _draw_record(axes: Axes, fit: RingDownFit) -> None:
     time = fit.record.time
-    axes.plot(time, fit.record.signal * 1e3, ".", color=OBSERVED, ms=2.2, label="measured")
-    axes.plot(time, fit.fitted * 1e3, color=PAST, lw=0.9, label="two modes")
-    for mode, colour, style in zip(fit.modes, (PRESENT, PREDICTION), ("--", ":"), strict=True):
+    axes.plot(time, fit.record.signal * 1e3, ".", color=style.OBSERVED, ms=2.2, label="measured")
+    axes.plot(time, fit.fitted * 1e3, color=style.PAST, lw=0.9, label="two modes")
+    for mode, colour, dashes in zip(fit.modes, (style.PRESENT, style.PREDICTION), ("--", ":"), strict=True):
         envelope = mode.amplitude * np.exp(mode.pole.real * (time - time[0])) * 1e3
         label = f"envelope, {mode.frequency:.2f} Hz"
-        axes.plot(time, envelope, color=colour, lw=0.9, ls=style, label=label)
+        axes.plot(time, envelope, color=colour, lw=0.9, ls=dashes, label=label)
     axes.set(xlim=(0.0, min(2.0, float(time[-1]))), xlabel="time (s)", ylabel="strain signal (mV)")
     axes.legend(loc="upper right", fontsize=6.8)
-    panel_label(axes, "a", "First trial")
+    style.panel_label(axes, "a", "First trial")
 
 
 def _draw_spectra(axes: Axes, trials: Fits) -> None:
     spectra = [spectrum(fit.record) for fit in trials]
     for number, (frequency, amplitude) in enumerate(spectra):
         label = f"{len(spectra)} trials" if number == 0 else None
-        axes.semilogy(frequency, amplitude * 1e3, color=OBSERVED, lw=0.5, alpha=0.6, label=label)
-    for mode, name, style in ((0, "first", "--"), (1, "second", ":")):
+        axes.semilogy(frequency, amplitude * 1e3, color=style.OBSERVED, lw=0.5, alpha=0.6, label=label)
+    for mode, name, dashes in ((0, "first", "--"), (1, "second", ":")):
         axes.axvline(
-            average(trials, "frequency", mode).mean, color=PAST, lw=0.8, ls=style, label=f"{name} mode"
+            average(trials, "frequency", mode).mean, color=style.PAST, lw=0.8, ls=dashes, label=f"{name} mode"
         )
     top = 1e3 * max(float(amplitude.max()) for _, amplitude in spectra)
     axes.set(xlim=(0.0, float(spectra[-1][0][-1])), ylim=(2e-4 * top, 2.0 * top))
     axes.set(xlabel="frequency (Hz)", ylabel="amplitude (mV)")
     axes.legend(loc="upper right", fontsize=6.8)
-    panel_label(axes, "b", "Spectra")
+    style.panel_label(axes, "b", "Spectra")

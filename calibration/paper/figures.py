@@ -11,16 +11,7 @@ from calibration.paper.load_test import ParticlePosterior, StaticCalibration
 from calibration.result.record import Calibration
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import ScalarPosterior
-from reporting.figures import (
-    BAND_OPACITY,
-    OBSERVED,
-    PAST,
-    PRESENT,
-    REFERENCE,
-    new_figure,
-    panel_label,
-    publication_style,
-)
+from reporting import figures as style
 from reporting.files import atomic_write_text
 from reporting.page import Words
 from reporting.table_file import table_text
@@ -133,33 +124,35 @@ _MARKERS = ("o", "s", "^", "D", "v", "P")
 _RUN_LINES = ("-", "--", "-.", ":")
 
 
-@publication_style()
+@style.publication_style()
 def calibration_figure(result: StaticCalibration) -> Figure:
     """Draw the three panels of Fig. 5: measurements and bands, densities of e, densities of the stiffness."""
-    figure = new_figure(height=4.4)
+    figure = style.new_figure(height=4.4)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0), wspace=0.22, hspace=0.48)
     figure.subplots_adjust(left=0.062, right=0.985, bottom=0.095, top=0.94)
     _draw_loads(figure.add_subplot(grid[:, 0]), result)
     factor, stiffness = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
     for pair, run in enumerate(np.searchsorted(result.data.run_indices, result.data.run).tolist()):
         factor.plot(
-            result.particle.likelihood_grid, result.particle.likelihood[pair], color=OBSERVED, lw=0.7,
+            result.particle.likelihood_grid, result.particle.likelihood[pair], color=style.OBSERVED, lw=0.7,
             ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
         )  # fmt: skip
     _draw_densities(factor, result.before, result.exact, result.particle)
     factor.axvline(
-        PAPER["young_modulus_factor"].mean, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper"
+        PAPER["young_modulus_factor"].mean, color=style.REFERENCE, lw=0.7, ls=":", label="mean in the paper"
     )
     factor.set_xlabel("Young's modulus factor $e$", parse_math=True)
     factor.set_ylabel("probability density")
-    panel_label(factor, "b", "Prior, likelihoods, posterior")
+    style.panel_label(factor, "b", "Prior, likelihoods, posterior")
     after = result.tip_stiffness_exact
     _draw_densities(stiffness, result.tip_stiffness_prior, after, result.particle.stiffness, 1e-3)
     stiffness.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
     stiffness.set_ylabel("probability density (mm/N)")
     told = f"{after.mean * 1e-3:.4f} ± {after.standard_deviation * 1e-3:.4f} N/mm"
-    stiffness.text(0.99, 0.60, told, transform=stiffness.transAxes, color=PAST, ha="right", fontsize=6.8)
-    panel_label(stiffness, "c", "Quantity of interest")
+    stiffness.text(
+        0.99, 0.60, told, transform=stiffness.transAxes, color=style.PAST, ha="right", fontsize=6.8
+    )
+    style.panel_label(stiffness, "c", "Quantity of interest")
     for axes in (factor, stiffness):
         axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
     return figure
@@ -170,8 +163,8 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     reach = 1.12 * float(data.displacement.max())
     displacement = np.array([0.0, reach])
     for posterior, colour, name, line in (
-        (result.tip_stiffness_prior, REFERENCE, "prior", {"lw": 1.0, "ls": "--"}),
-        (result.tip_stiffness_exact, PAST, "posterior", {"lw": 1.2}),
+        (result.tip_stiffness_prior, style.REFERENCE, "prior", {"lw": 1.0, "ls": "--"}),
+        (result.tip_stiffness_exact, style.PAST, "posterior", {"lw": 1.2}),
     ):
         lower, upper = (end * displacement for end in posterior.interval(0.95))
         label = f"{name}, 95 % band"
@@ -183,15 +176,15 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
             data.displacement[of_run] * 1e3, data.load[of_run],
             xerr=HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3,
             yerr=HALF_WIDTH_95 * data.load_standard_deviation,
-            fmt=_MARKERS[number % len(_MARKERS)], color=OBSERVED, mfc="white" if number % 2 else OBSERVED,
-            ms=3.6, mew=0.9, elinewidth=0.8, capsize=1.8, label=f"measured, run {index + 1}",
-            zorder=3 + number,
+            fmt=_MARKERS[number % len(_MARKERS)], color=style.OBSERVED, ms=3.6, mew=0.9, elinewidth=0.8,
+            mfc="white" if number % 2 else style.OBSERVED, capsize=1.8, zorder=3 + number,
+            label=f"measured, run {index + 1}",
         )  # fmt: skip
     axes.set(xlim=(0.0, reach * 1e3), ylim=(0.0, 1.12 * float(data.load.max())))
     axes.set_xlabel("tip displacement $x$ (mm)", parse_math=True)
     axes.set_ylabel("tip load $f$ (N)", parse_math=True)
     axes.legend(loc="upper left", handlelength=1.5)
-    panel_label(axes, "a", "Load and displacement")
+    style.panel_label(axes, "a", "Load and displacement")
 
 
 def _draw_densities(
@@ -202,13 +195,13 @@ def _draw_densities(
     inside = (exact.grid >= lower) & (exact.grid <= upper)
     axes.fill_between(
         exact.grid[inside] * scale, exact.density[inside] / scale,
-        color=PAST, alpha=BAND_OPACITY, lw=0.0, label="95 % interval",
+        color=style.PAST, alpha=style.BAND_OPACITY, lw=0.0, label="95 % interval",
     )  # fmt: skip
-    axes.plot(prior.grid * scale, prior.density / scale, color=REFERENCE, lw=1.8, label="prior")
-    axes.plot(exact.grid * scale, exact.density / scale, color=PAST, lw=1.6, label="posterior, exact")
+    axes.plot(prior.grid * scale, prior.density / scale, color=style.REFERENCE, lw=1.8, label="prior")
+    axes.plot(exact.grid * scale, exact.density / scale, color=style.PAST, lw=1.6, label="posterior, exact")
     edges = particle.mean + particle.standard_deviation * np.linspace(-4.0, 4.0, 33)
     density = np.diff(particle.cumulative(edges)) / np.diff(edges)
-    axes.stairs(density / scale, edges * scale, color=PRESENT, lw=0.9, label="posterior, particles")
+    axes.stairs(density / scale, edges * scale, color=style.PRESENT, lw=0.9, label="posterior, particles")
     reach = 3.6 * prior.standard_deviation
     ends = (prior.mean - reach) * scale, (prior.mean + reach) * scale
     axes.set(xlim=ends, ylim=(0.0, 1.12 * float(exact.density.max()) / scale))

@@ -13,19 +13,10 @@ from scipy.stats import gaussian_kde
 from calibration.result.record import Calibration, Reading
 from calibration.result.text import NOTICEABLE_CORRELATION
 from calibration.static.experiments import HALF_WIDTH_95
+from reporting import figures as style
 from reporting.arrays import Float
-from reporting.figures import (
-    BAND_OPACITY,
-    OBSERVED,
-    PAST,
-    PRESENT,
-    REFERENCE,
-    band,
-    panels,
-    publication_style,
-)
 
-_COLOURS = (PAST, PRESENT, REFERENCE)
+_COLOURS = (style.PAST, style.PRESENT, style.REFERENCE)
 _COLUMNS = 3
 _MOST_READINGS = 12
 _TITLE_WIDTH = 14  # letters of a line beside an axis
@@ -38,7 +29,7 @@ def drawn_parameters(result: Calibration) -> tuple[list[int], list[str]]:
     return list(drawn), [fill(figure.axis_title, _TITLE_WIDTH) for figure in drawn.values()]
 
 
-@publication_style()
+@style.publication_style()
 def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> Figure:
     """Draw samples pair by pair, with their correlations, and others beside.
 
@@ -54,7 +45,9 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
     size = len(titles)
     height = min(6.6, 1.1 + 1.1 * size)
     bottom = height * (0.075 if size > 3 else 0.16)
-    figure, grid = panels(size, size, height, 0.015 * height, bottom, left=0.105, wspace=0.10, hspace=0.10)
+    figure, grid = style.panels(
+        size, size, height, 0.015 * height, bottom, left=0.105, wspace=0.10, hspace=0.10
+    )
     coloured = list(zip(_COLOURS, sets, strict=False))
     limits = [_limits([values[:, index] for _, values in sets]) for index in range(size)]
     for (row, column), axes in np.ndenumerate(np.array(grid)):
@@ -64,7 +57,7 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
             axes.text(
                 0.5, 0.5, f"{value:+.2f}".replace("-", "−"), ha="center", va="center",
                 transform=axes.transAxes, fontsize=6.5 + 5.0 * abs(value),
-                color=PAST if abs(value) > NOTICEABLE_CORRELATION else OBSERVED,
+                color=style.PAST if abs(value) > NOTICEABLE_CORRELATION else style.OBSERVED,
             )  # fmt: skip
             continue
         axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
@@ -104,20 +97,17 @@ def _limits(sets: Sequence[Float]) -> tuple[float, float]:
     return float(low - margin), float(high + margin)
 
 
-@publication_style()
+@style.publication_style()
 def readings_figure(result: Calibration) -> Figure:
     """Draw figures before and after, with what was measured of them."""
     readings = result.readings[:_MOST_READINGS]
     rows = -(-len(readings) // _COLUMNS)
     height = 0.5 + 1.55 * rows
-    figure, grid = panels(
+    figure, grid = style.panels(
         rows, _COLUMNS, height, 0.1 * height, 0.28 / rows * height, left=0.02, wspace=0.14, hspace=0.75
     )
-    places = [axes for row in grid for axes in row]
-    for axes, reading in zip(places, readings, strict=False):
+    for axes, reading in zip(style.first_of(grid, len(readings)), readings, strict=True):
         _draw_reading(axes, result, reading)
-    for spare in places[len(readings) :]:
-        spare.remove()
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="upper left", ncols=3)
     return figure
 
@@ -130,19 +120,24 @@ def _draw_reading(axes: Axes, result: Calibration, reading: Reading) -> None:
     low, high = min(mean - 4.5 * spread, value - 1.6 * half), max(mean + 4.5 * spread, value + 1.6 * half)
     grid = np.linspace(max(low, 0.0) if mean > 0.0 else low, high, 301)
     axes.axvspan(
-        value - half, value + half, color=OBSERVED, alpha=BAND_OPACITY, lw=0.0, label="measured, 95 %"
+        value - half,
+        value + half,
+        color=style.OBSERVED,
+        alpha=style.BAND_OPACITY,
+        lw=0.0,
+        label="measured, 95 %",
     )
-    axes.axvline(value, color=OBSERVED, lw=0.9)
+    axes.axvline(value, color=style.OBSERVED, lw=0.9)
     before = gaussian_kde(prior)(grid)
     top = float(before.max())
     if posterior.std() > 1e-9 * abs(mean):
         after = gaussian_kde(posterior)(grid)
         top = float(after.max())
-        band(axes, grid, np.zeros_like(grid), after, PAST)
-        axes.plot(grid, after, color=PAST, lw=1.3, label="after the calibration")
+        style.band(axes, grid, np.zeros_like(grid), after, style.PAST)
+        axes.plot(grid, after, color=style.PAST, lw=1.3, label="after the calibration")
     else:
-        axes.axvline(mean, color=PAST, lw=1.3, label="after the calibration")
-    axes.plot(grid, before, color=REFERENCE, lw=1.2, ls="--", label="before")
+        axes.axvline(mean, color=style.PAST, lw=1.3, label="after the calibration")
+    axes.plot(grid, before, color=style.REFERENCE, lw=1.2, ls="--", label="before")
     title = next(figure.axis_title for figure in result.figures if figure.name == reading.name)
     axes.set(xlim=(grid[0], grid[-1]), ylim=(0.0, 1.12 * top), yticks=[], xlabel=title)
     axes.spines["left"].set_visible(False)

@@ -37,8 +37,8 @@ from calibration.wing.lab_data import LabData, published_data, read_lab_folder
 from fe.reduction.model_cache import WingFields, reduced_model, wing_fields, write_modes_vtu, write_wing_vtu
 from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
+from reporting import figures as style
 from reporting.arrays import Float
-from reporting.figures import LEVELS, panels, publication_style
 from reporting.files import collect_provenance
 from reporting.page import Page, Words
 from reporting.progress import Progress, reporter, stage
@@ -374,7 +374,7 @@ def _add_sections(page: Page, calibration: WingCalibration, fields: WingFields, 
     show("modes", modes_figure(fields, modes, titles))
 
 
-@publication_style()
+@style.publication_style()
 def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Figure:
     """Draw the mode shapes of the upper skin in oblique view, coloured by their displacement.
 
@@ -397,15 +397,18 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
     span = float(np.ptp(points[:, 1]))
     shapes = (fields.modal_displacement @ modes.shape)[upper]
     rows = (len(titles) + 1) // 2
-    figure, grid = panels(
+    figure, grid = style.panels(
         rows, 2, 1.5 * rows, 0.015 * rows, 0.0, wspace=0.06, hspace=0.04, left=0.01, right=0.99
     )
-    places = [axes for row in grid for axes in row]
+    places = style.first_of(grid, len(titles))
     for axes, shape, title in zip(places, np.moveaxis(shapes, -1, 0), titles, strict=False):
         length = np.linalg.norm(shape, axis=1)
         largest = float(length.max())
         moved = points + shape * (0.14 * span / largest)
-        for (x, y, z), value, colours in ((points.T, 0.1 * largest, "Greys"), (moved.T, length, LEVELS)):
+        for (x, y, z), value, colours in (
+            (points.T, 0.1 * largest, "Greys"),
+            (moved.T, length, style.LEVELS),
+        ):
             # oblique: span to the right, chord into the page
             seen = Triangulation(y - 0.45 * x, z - 0.40 * x, triangles)
             shade = np.broadcast_to(value, length.shape)
@@ -413,6 +416,4 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
         axes.set(xlim=(-0.09 * span, 1.10 * span), ylim=(-0.24 * span, 0.27 * span), aspect="equal")
         axes.set_axis_off()
         axes.text(0.0, 0.97, title, transform=axes.transAxes, va="top", fontsize=8.0, fontweight="bold")
-    for spare in places[len(titles) :]:
-        spare.remove()
     return figure

@@ -3,7 +3,7 @@
 `discrepancy.campaign.reading` reads one from a folder; strain is dimensionless here, displacement in metres.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
@@ -404,13 +404,16 @@ class Campaign:
 
     def event_times(self, trial: str) -> dict[str, float]:
         """Return the moments in a trial [s] by the names that expressions use."""
-        found: dict[str, float] = {}
-        for event in self.events:
-            if trial in event.trials:
-                found[event.name] = event.time
-                if event.until is not None:
-                    found[f"{event.name}_until"] = event.until
-        return found
+        there = [event for event in self.events if trial in event.trials]
+        ends = {f"{event.name}_until": event.until for event in there if event.until is not None}
+        return {event.name: event.time for event in there} | ends
+
+    def records(self, channel: str) -> Iterator[tuple[Trial, FloatArray, BoolArray]]:
+        """Yield each trial that has a channel, what it read there (N,), and which readings count."""
+        for trial in self.trials:
+            if channel in trial.channels:
+                column = trial.channels.index(channel)
+                yield trial, trial.values[:, column], trial.used[:, column]
 
     def outputs(self, trial: Trial) -> tuple[tuple[str, Quantity], ...]:
         """Return the outputs that the channels of a trial measure, and as what quantity."""

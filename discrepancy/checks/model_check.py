@@ -30,8 +30,7 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-from .fault import DataFault, FaultKind, fault
-from .unit_slips import unit_slips
+from .fault import DataFault, FaultKind, fault, unit_slips
 
 LEFT = 0.9
 """A parameter of whose prior deviation the records leave more than this share is not observable in them."""
@@ -117,7 +116,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
 
 def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
     """Return the conditions before anything is fitted: prior means, nominal release, exact clock."""
-    values = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in model.parameters]
+    values = [mean for mean, _ in model.stated(campaign)]
     rows = 0 if trial.release is None else trial.release.mode_count
     initial = np.zeros((rows, 2))
     if trial.release is not None and not trial.release.at_rest:
@@ -182,8 +181,7 @@ def _dead(campaign: Campaign, predictions: dict[str, FloatArray]) -> Iterator[Da
         for column, name in enumerate(trial.channels):
             if trial.is_dynamic or not is_still(trial, name):
                 continue
-            having = (item for item in campaign.trials if name in item.channels)
-            digit = digit_of(np.concatenate([i.values[:, i.channels.index(name)] for i in having]))
+            digit = digit_of(np.concatenate([values for _, values, _ in campaign.records(name)]))
             least = _ABOVE_NOISE * max(campaign.channels[name].noise_in(trial), digit)
             if digit and np.ptp(predictions[trial.name][:, column]) > least:
                 yield fault(FaultKind.DEAD, name, trial.name)

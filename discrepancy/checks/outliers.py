@@ -7,6 +7,7 @@ from functools import cache, lru_cache, partial
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import maximum_filter1d
+from scipy.signal import savgol_coeffs
 
 from discrepancy.campaign.noise import repeated
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
@@ -64,11 +65,7 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     weights = {trial.name: _weights_at(trial.time) for trial in campaign.trials if trial.is_dynamic}
     for name, channel in campaign.channels.items():
         by_repeats = _repeat_outliers(campaign, channel)
-        for trial in campaign.trials:
-            if name not in trial.channels:
-                continue
-            column = trial.channels.index(name)
-            values, used = trial.values[:, column], trial.used[:, column]
+        for trial, values, used in campaign.records(name):
             if trial.is_dynamic:
                 found = sample_outliers(values, used, weights[trial.name])
             elif trial.name in by_repeats:
@@ -226,12 +223,9 @@ class _Surroundings:
 @lru_cache(maxsize=32)
 def _weights(width: int, degree: int) -> FloatArray:
     """Return the weights of a sample and its neighbours in the rest of a local polynomial, (2 width + 1,)."""
-    places = np.arange(-width, width + 1) / width
-    neighbours = places != 0.0
-    basis = np.vander(places[neighbours], degree + 1, increasing=True)
-    weights = np.ones(2 * width + 1)
-    weights[neighbours] = -np.linalg.pinv(basis)[0]  # value of the polynomial at the middle
-    return weights
+    weights = -savgol_coeffs(2 * width + 1, degree)
+    weights[width] += 1.0
+    return np.asarray(weights / weights[width])  # as if the middle were not among what it goes through
 
 
 def _weights_at(time: FloatArray) -> Weights:

@@ -279,10 +279,11 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     faults: list[DataFault] = []
     for name, channel in campaign.channels.items():
         faults += _noise_faults(campaign, channel)
-        still = [trial for trial in campaign.trials if name in trial.channels and is_still(trial, name)]
-        alive = any(name in trial.channels and trial not in still for trial in campaign.trials)
+        records = [trial for trial, *_ in campaign.records(name)]
+        still = [trial for trial in records if is_still(trial, name)]
         # A load may do nothing at a place: of a channel that moves elsewhere the model knows.
-        faults += (fault(FaultKind.DEAD, name, i.name) for i in still if i.is_dynamic or not alive)
+        dead = (trial for trial in still if trial.is_dynamic or len(still) == len(records))
+        faults += (fault(FaultKind.DEAD, name, trial.name) for trial in dead)
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
             faults += _clipped(trial, name, trial.values[:, column], trial.used[:, column])
@@ -307,9 +308,9 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
         return
     stated = record.standard_deviation
     rough = (
-        roughness(trial.values[:, trial.channels.index(channel.name)]) / trial.noise_factor
-        for trial in campaign.trials
-        if trial.is_dynamic and channel.name in trial.channels and len(trial.time) >= 50
+        roughness(values) / trial.noise_factor
+        for trial, values, _ in campaign.records(channel.name)
+        if trial.is_dynamic and len(values) >= 50
     )
     scatter = min(rough, default=np.inf)
     # Only downwards: a fast mode may well be rougher than the noise, but nothing is smoother than its noise.

@@ -163,8 +163,7 @@ def global_unknowns(
     unit_responses : dict of str to float
         For signals of unknown scale: data over model, as a first estimate of 1 + gain.
     """
-    prior = [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in model.parameters]
-    rows = [(mean, deviation, 1.0) for mean, deviation in prior]  # centre, scale, precision
+    rows = [(*prior, 1.0) for prior in model.stated(campaign)]  # centre, scale, precision
     used = {name for trial in trials for name in trial.channels}
     names: list[str] = []
     fixed: dict[str, float] = {}
@@ -263,9 +262,4 @@ class TrialData:
 
 def stand_in(campaign: Campaign, name: str) -> float:
     """Return what stands in for a noise deviation of which nothing is known: a thousandth of the range."""
-    spans = [
-        float(np.ptp(trial.values[:, trial.channels.index(name)]))
-        for trial in campaign.trials
-        if name in trial.channels
-    ]
-    return 1e-3 * max([*spans, 1e-12])
+    return 1e-3 * max(1e-12, *(float(np.ptp(values)) for _, values, _ in campaign.records(name)))

@@ -13,8 +13,7 @@ from scipy import stats
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError, said
-from discrepancy.location.omnibus_tests import mean_square
-from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.location.residuals import FittedTrial, ResidualSet, mean_square
 from discrepancy.verdict import Gate, Proof, Scores
 
 PIT_BINS = 10
@@ -94,8 +93,7 @@ def chi_square_per_dof(residuals: ResidualSet) -> tuple[float, float]:
     Channels without a noise record do not count; nan if none has one. Degrees of freedom are the expected
     sum of squares: samples less what the fit absorbs, or plus what its uncertainty adds to held-out trials.
     """
-    names = list(dict.fromkeys(n for item in residuals.trials for n in item.trial.channels))
-    known = [name for name in names if residuals.degrees_of_freedom(name) > 0.0]
+    known = residuals.recorded
     if not known:
         return nan, nan
     square, freedom = mean_square(residuals, known)
@@ -268,8 +266,7 @@ def _remaining(residuals: ResidualSet, after: Scores) -> str:
     if not np.isfinite(after.chi_square_per_dof):
         return said("proof.not_known")
     where = "held-out" if residuals.trials[0].trial.held_out else "fitted"
-    names = dict.fromkeys(n for item in residuals.trials for n in item.trial.channels)
-    known = [name for name in names if residuals.degrees_of_freedom(name) > 0.0]
+    known = residuals.recorded
     square, freedom = mean_square(residuals, known)
     if variance_p_value(square, freedom, min(map(residuals.degrees_of_freedom, known))) < _REMAINS:
         shares = {name: mean_square(residuals, (name,))[0] for name in known}

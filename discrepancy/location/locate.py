@@ -17,8 +17,17 @@ from discrepancy.errors import FitError, said
 
 from .dependence import dependences, excess, mode_shares, predicted_frequencies
 from .map import Cell, residual_map
-from .omnibus_tests import OmnibusTest, coloured_noise, mean_square, noise_groups, serial_tests, variance_test
-from .residuals import FittedTrial, ResidualSet, without_colour
+from .residuals import (
+    FittedTrial,
+    OmnibusTest,
+    ResidualSet,
+    coloured_noise,
+    mean_square,
+    noise_groups,
+    serial_tests,
+    variance_test,
+    without_colour,
+)
 
 ALIKE = 0.9
 """Squared cosine from which two patterns over the channels count as the same."""
@@ -231,9 +240,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
 
 def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     remarks = []
-    named = {name for item in residuals.trials for name in item.trial.channels}
-    unknown = sorted(name for name in named if residuals.degrees_of_freedom(name) <= 0.0)
-    if unknown:
+    if unknown := sorted({*residuals.measured} - {*residuals.recorded}):
         remarks.append(said("location.no_noise_record", names=", ".join(unknown)))
     for names in noise_groups(residuals).values():
         square, freedom = mean_square(residuals, names)

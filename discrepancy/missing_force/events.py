@@ -201,7 +201,7 @@ class SwitchedRecord:
             other[start:] ^= True
             cover, mean, *sums = steps.before(self.which(other), start, state, ends[there])
             move = moves[there]
-            arrived = move @ cover @ np.swapaxes(move, -1, -2) + noises[there], move @ mean, *sums
+            arrived = move @ cover @ move.mT + noises[there], move @ mean, *sums
             found = joined(arrived, [item[there] for item in after])
             products[k, there], halves[k, there] = without(*found, self.local_precision)
         return self.search.evidence([(products, halves), *self.others])

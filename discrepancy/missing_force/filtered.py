@@ -163,11 +163,11 @@ class Filtered:
         moves = fine[step]
         back = [adds[1:, :, None]]
         for _ in range(parts):
-            back.append(np.swapaxes(moves, 1, 2) @ back[-1])
+            back.append(moves.mT @ back[-1])
         state, noise, found = means[:-1] + covers[:-1] @ back[-1], np.zeros_like(fine), []
         for add in back[:0:-1]:
             found.append(state + noise[step] @ add)
-            state, noise = moves @ state, fine @ noise @ np.swapaxes(fine, 1, 2) + more
+            state, noise = moves @ state, fine @ noise @ fine.mT + more
         states = np.concatenate((np.stack(found, axis=1).reshape(-1, len(mean)), means[-1:, :, 0]))
         sizes_of = np.array([one.size for _, one in self.processes])
         n, count = len(self._scale), len(self.processes)
@@ -234,7 +234,7 @@ def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> 
     root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
     along = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
     halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
-    return products[..., :count, :count] - np.swapaxes(along, -1, -2) @ along, halves
+    return products[..., :count, :count] - along.mT @ along, halves
 
 
 def regression(filtered: Sequence[Filtered], rows: Sequence[FloatArray]) -> Regression:

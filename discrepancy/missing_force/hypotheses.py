@@ -196,7 +196,7 @@ class Columns:
         if kind not in acts_on or not len(patch):
             return Part(np.zeros_like(trial.residual))
         sensors = patch.of(*SENSORS)
-        forces = ModelPatch(tuple(item for item in patch if isinstance(item, PortForce)))
+        forces = patch.of(PortForce)
         if len(forces):
             return self._forced(trial, motion, forces)
         if len(sensors) < len(patch) or len(sensors.of(LoggerClock)):

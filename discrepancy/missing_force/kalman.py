@@ -324,18 +324,13 @@ def _roots(covers: FloatArray) -> FloatArray:
     return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
 
-def _turned(items: FloatArray) -> FloatArray:
-    return np.swapaxes(items, -1, -2)
-
-
 def joined(before: Sequence[FloatArray], after: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return products (..., W, W) and half log determinants (...) of whole records from both their parts."""
     cover, mean, products, halves = before
     known, along, later_products, more = after
     root = _roots(cover)
-    inner = np.linalg.cholesky(np.eye(cover.shape[-1]) + _turned(root) @ known @ root)
-    seen = np.asarray(np.linalg.solve(inner, _turned(root) @ (along - known @ mean)))
-    cross = _turned(mean) @ along
-    whole = products + later_products - cross - _turned(cross) + _turned(mean) @ known @ mean
-    whole -= _turned(seen) @ seen
+    inner = np.linalg.cholesky(np.eye(cover.shape[-1]) + root.mT @ known @ root)
+    seen = np.asarray(np.linalg.solve(inner, root.mT @ (along - known @ mean)))
+    cross = mean.mT @ along
+    whole = products + later_products - cross - cross.mT + mean.mT @ known @ mean - seen.mT @ seen
     return whole, halves + more + np.log(np.diagonal(inner, axis1=-2, axis2=-1)).sum(-1)

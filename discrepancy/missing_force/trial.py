@@ -19,6 +19,7 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
+from discrepancy.models.acting import divided
 from discrepancy.models.interface import PortedSystem
 
 from .kalman import driven
@@ -135,22 +136,17 @@ class SeenTrial:
     @cached_property
     def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Transition (J, n, n) of a fine step, and what a push at its begin and end does (J, n, n)."""
-        n = len(self.system.generator)
-        found = []
-        for length in self.steps[0] / self.parts:
-            block = np.zeros((3 * n, 3 * n))
-            block[:n, :n], block[:n, n : 2 * n] = self.system.generator * length, np.eye(n) * length
-            block[n : 2 * n, 2 * n :] = np.eye(n)
-            whole = expm(block)
-            found.append((whole[:n, :n], whole[:n, n : 2 * n] - whole[:n, 2 * n :], whole[:n, 2 * n :]))
-        moves, begins, ends = (np.ascontiguousarray(items) for items in zip(*found, strict=True))
-        return moves, begins, ends
+        n, lengths = len(self.system.generator), self.steps[0][:, None, None] / self.parts
+        blocks = np.zeros((len(lengths), 3 * n, 3 * n))
+        blocks[:, :n, :n], blocks[:, :n, n : 2 * n] = self.system.generator * lengths, np.eye(n) * lengths
+        blocks[:, n : 2 * n, 2 * n :] = np.eye(n)
+        move, held, end = (np.ascontiguousarray(item) for item in np.split(expm(blocks)[:, :n], 3, axis=2))
+        return move, held - end, end
 
     @cached_property
     def fine_time(self) -> FloatArray:
         """Fine stamps (F,) [s]."""
-        count = len(self.time)
-        return np.interp(np.arange((count - 1) * self.parts + 1) / self.parts, np.arange(count), self.time)
+        return divided(self.time, self.parts)
 
     def port_motion(self, unknowns: FloatArray, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (F, P) of the ports.

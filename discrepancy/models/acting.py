@@ -247,8 +247,6 @@ class LoadChange(NamedTuple):
 
     def changed(self, values: FloatArray, recorded: FloatArray) -> FloatArray:
         """Return what acts (N,) of recorded values [N, or N m], the values themselves or with a constant."""
-        if not (self.gain or self.tare):
-            return values
         return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
 

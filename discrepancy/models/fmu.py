@@ -204,8 +204,8 @@ class FmuModel(DescribedModel):
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        linear = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
-        return self._moving(trial, conditions, linear, self.fmu.x, [0] * len(self.fmu.x), parts)
+        linear, x = self.patch.without(PortForce), self.fmu.x
+        return self._moving(trial, conditions, linear, x, [0] * len(self.fmu.x), parts)
 
     # ------------------------------------------------------------ trials in its names and units
 

@@ -296,10 +296,7 @@ class Model(ABC):
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws.
-
-        At samples that are so many times as dense as those of the trial.
-        """
+        """Return positions and speeds of the ports without laws, (N, P) at so many times as dense samples."""
         raise NotImplementedError
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
@@ -363,6 +360,10 @@ class Model(ABC):
         sensors show of a response depends on all of them together.
         """
         return self.patch.of(*SENSORS)
+
+    def stated(self, campaign: Campaign) -> list[tuple[float, float]]:
+        """Return mean and deviation of each parameter, those of a campaign where it says them."""
+        return [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in self.parameters]
 
     def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
         """Return the means (P,) of what is `declared`, those of a campaign where it says them."""
@@ -438,8 +439,7 @@ class Model(ABC):
     def apart(self) -> tuple[Self, ModelPatch]:
         """Return the model without laws at its ports, and these at the prior means."""
         laws = self.own_laws(self.prior_mean()) + self.patch.of(PortForce)
-        rest = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
-        return self._changed(patch=rest, linear=True, _kept=None), laws
+        return self._changed(patch=self.patch.without(PortForce), linear=True, _kept=None), laws
 
     def _changed(self, **attributes: object) -> Self:
         """Return the model with other attributes."""

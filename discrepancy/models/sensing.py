@@ -47,7 +47,7 @@ def observe(
         return model.respond(trial, outputs, patch, conditions)
     rate, zero = clock_of(patch)
     clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
-    bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
+    bare = patch.without(*SENSORS)
     # inputs at their true times, each channel sampled by its own clock
     inputs, by_channel = _logger_rates(campaign, trial, patch)
     stamped = replace(trial, time=(1.0 + inputs) * trial.time) if inputs else trial

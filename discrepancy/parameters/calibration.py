@@ -110,8 +110,8 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
     """
     label = choice.label or choice.model.name
     found = []
-    for item in choice.model.parameters:
-        mean, deviation = campaign.parameters.get(item.name, (item.mean, item.deviation))
+    moments = choice.model.stated(campaign)
+    for item, (mean, deviation) in zip(choice.model.parameters, moments, strict=True):
         if not item.low <= mean <= item.high:
             raise CampaignDataError(said("parameters.outside", item=item, mean=mean, model=label))
         if deviation > 0.0:

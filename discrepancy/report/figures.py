@@ -21,22 +21,18 @@ from discrepancy.self_calibration import SelfCalibration
 from discrepancy.verdict import Scores
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
-from reporting.figures import (
-    BAND_OPACITY,
-    OBSERVED,
-    PAST,
-    PREDICTION,
-    REFERENCE,
-    band,
-    color_bar,
-    panel_label,
-    publication_style,
-)
+from reporting import figures as style
 from reporting.page import ReportFigure
 
-from .kit import heat_map, panels, plain_powers
 from .motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
-from .residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
+from .residual_figures import (
+    heat_figure,
+    heat_map,
+    load_figure,
+    panels,
+    planform_figure,
+    time_line_figure,
+)
 from .text import WORDS, added_label, force_sentence, motion_of, scored
 
 _LARGEST_DISTANCE = 1e4
@@ -46,17 +42,16 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
     if not scores:
         return None
-    figure, (row,) = panels(1, 2, 1.9)
-    for spare in row[len(scores) :]:
-        spare.remove()
+    figure, grid = panels(1, 2, 1.9)
+    cells = zip(style.first_of(grid, len(scores)), scores.items(), strict=True)
     top = max(max(item.pit) for item in scores.values())
-    for number, (axes, (title, item)) in enumerate(zip(row, scores.items(), strict=False)):
+    for number, (axes, (title, item)) in enumerate(cells):
         count = len(item.pit)
         axes.bar(
             (np.arange(count) + 0.5) / count, item.pit, 0.94 / count,
-            color=PREDICTION if number == 0 and len(scores) > 1 else PAST, alpha=0.75,
+            color=style.PREDICTION if number == 0 and len(scores) > 1 else style.PAST, alpha=0.75,
         )  # fmt: skip
-        axes.axhline(1.0 / count, color=OBSERVED, lw=0.9, ls="--")
+        axes.axhline(1.0 / count, color=style.OBSERVED, lw=0.9, ls="--")
         axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.1 * max(top, 0.16)), xlabel="probability integral transform")
         axes.set_ylabel("share of samples" if number == 0 else "")
@@ -92,12 +87,12 @@ def separability_figure(found: Separability) -> Figure | None:
     figure, axes, image = _map_of_names(table, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
     for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
         if row != column:
-            axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
+            axes.plot(column, row, "x", color=style.PREDICTION, ms=4.0, mew=1.1)
     cell = 1.0 / len(names)
     beside = axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0))
-    bar = color_bar(figure, image, "squared distance d²", cax=beside)
-    plain_powers(bar.yaxis, (1.0,))
-    bar.axhline(CONFUSED, color=PREDICTION, lw=1.2)
+    bar = style.color_bar(figure, image, "squared distance d²", cax=beside)
+    style.plain_powers(bar.yaxis, (1.0,))
+    bar.axhline(CONFUSED, color=style.PREDICTION, lw=1.2)
     bar.axhline(DETECTED, color="white", lw=1.2)
     return figure
 
@@ -137,17 +132,17 @@ def missing_force_figure(missing: MissingForce) -> Figure:
             axes.set_xlabel(label)
         time, values = strongest.time[stretch], getattr(strongest, name)[stretch]
         reach = 2.0 * strongest.deviation[stretch]
-        band(row[2], time, values - reach, values + reach, OBSERVED)
-        row[2].plot(time, values, color=OBSERVED, lw=0.9)
+        style.band(row[2], time, values - reach, values + reach, style.OBSERVED)
+        row[2].plot(time, values, color=style.OBSERVED, lw=0.9)
         if law and strongest.law is not None:
-            row[2].plot(time, strongest.law[stretch], "--", color=PREDICTION, lw=0.9)
+            row[2].plot(time, strongest.law[stretch], "--", color=style.PREDICTION, lw=0.9)
         row[2].set_xlabel(f"time in {strongest.trial}, s")
         row[0].set_ylabel(f"{what}, {missing.told.unit}")
         for column, axes in enumerate(row):
-            axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
+            axes.axhline(0.0, color=style.REFERENCE, lw=0.6, zorder=0)
             axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
             axes.tick_params(labelleft=True)
-            panel_label(axes, "abcdef"[3 * number + column], title)
+            style.panel_label(axes, "abcdef"[3 * number + column], title)
     drawn = rows[0][0].get_legend_handles_labels()
     figure.legend(*drawn, loc="outside upper right", ncols=2, markerscale=3.0)
     return figure
@@ -161,10 +156,12 @@ def _draw_over(axes: Axes, missing: MissingForce, motion: str, name: str, law: s
         return np.concatenate([values[every] for values in parts if values is not None])
 
     along, values, deviation = map(joined, (motion, name, "deviation"))
-    axes.vlines(along, values - deviation, values + deviation, color=OBSERVED, lw=0.4, alpha=BAND_OPACITY)
-    axes.plot(along, values, ".", color=OBSERVED, ms=2.6, alpha=0.6, label="seen, ± 1 deviation")
+    axes.vlines(
+        along, values - deviation, values + deviation, color=style.OBSERVED, lw=0.4, alpha=style.BAND_OPACITY
+    )
+    axes.plot(along, values, ".", color=style.OBSERVED, ms=2.6, alpha=0.6, label="seen, ± 1 deviation")
     if law:
-        axes.plot(along, joined(law), ".", color=PREDICTION, ms=1.2, alpha=0.7, label=missing.law)
+        axes.plot(along, joined(law), ".", color=style.PREDICTION, ms=1.2, alpha=0.7, label=missing.law)
 
 
 Pack = Callable[[Path, Path], str]
@@ -206,7 +203,7 @@ class ReportInput:
     pack: Pack | None = None
 
 
-@publication_style()
+@style.publication_style()
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     """Draw every figure that these data allow, by name; their words are in `words.toml`.
 

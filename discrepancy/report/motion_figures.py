@@ -11,13 +11,11 @@ from scipy.signal import welch
 from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
-from discrepancy.location.backbone import Backbone, backbones
-from discrepancy.location.dependence import predicted_frequencies
+from discrepancy.location.dependence import Backbone, backbones, predicted_frequencies
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from reporting.figures import OBSERVED, REFERENCE, TRUTH
+from reporting import figures as style
 
-from .kit import draw_noise, models, panels, plain_powers
-from .residual_figures import size
+from .residual_figures import draw_noise, models, panels, size
 
 _ROWS = [item.name for item in fields(Backbone)[1:]]
 
@@ -62,7 +60,7 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     figure, ((axes,), *below) = panels(count, 1, 1.45 * count + 0.35, **shape)
     axes.margins(x=0.01)
     values = factor * item.trial.values[used, column]
-    axes.plot(time[used], values, ".", ms=1.8, color=OBSERVED, label="measured")
+    axes.plot(time[used], values, ".", ms=1.8, color=style.OBSERVED, label="measured")
     for one in shown:
         predicted = factor * one.residuals.trials[worst.trial].prediction[:, column]
         axes.plot(time, predicted, one.dashes, lw=0.9, color=one.colour, label=one.label)
@@ -93,15 +91,15 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
         count = min(len(noise.samples), 128)
         at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
         power = power[1:] * 0.5 / noise.interval
-        axes.plot(at[1:], power, color=OBSERVED, lw=0.8, alpha=0.6, label="noise record")
-    axes.axhline(1.0, color=TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
+        axes.plot(at[1:], power, color=style.OBSERVED, lw=0.8, alpha=0.6, label="noise record")
+    axes.axhline(1.0, color=style.TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
     for at, power, item in drawn:
         axes.plot(at, power, item.dashes, color=item.colour, lw=1.1, label=item.label)
     for number, frequency in enumerate(mode_frequencies(before)[:4], start=1):
-        axes.axvline(frequency, color=REFERENCE, lw=0.6, ls=":")
+        axes.axvline(frequency, color=style.REFERENCE, lw=0.6, ls=":")
         axes.annotate(
             f"mode {number}", (frequency, 1.0), (2.0, -2.0), xycoords=("data", "axes fraction"),
-            textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=OBSERVED,
+            textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=style.OBSERVED,
         )  # fmt: skip
     axes.set(yscale="log", xlim=(0.0, float(drawn[0][0][-1])), xlabel="frequency, Hz")
     axes.set(ylabel="power / white noise", title=f"residuals of {worst.channel}, all dynamic trials")
@@ -165,12 +163,12 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
                     line.set(color=shown.colour, ls=shown.dashes, lw=1.1, alpha=0.8, label=shown.label)
             values, error = scale * getattr(points, name), scale * getattr(points, f"{name}_error")
             axes.errorbar(
-                factor * points.amplitude, values, error, fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6,
-                lw=0.0, alpha=0.85, label="measured, ± 1 standard error", zorder=3,
+                factor * points.amplitude, values, error, fmt="o", ms=2.6, color=style.OBSERVED, lw=0.0,
+                elinewidth=0.6, alpha=0.85, label="measured, ± 1 standard error", zorder=3,
             )  # fmt: skip
             title, across = f"{'abcd'[2 * row + place]}  mode {mode}", f"amplitude of {channel}, {unit}"
             axes.set(xscale="log", title=title, xlabel=across, ylabel=label)
-            plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
+            style.plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
             # what was measured and its surroundings, whatever a wrong model does
             low, high = np.nanquantile(values, (0.02, 0.98))
             wide = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))

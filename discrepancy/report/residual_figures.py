@@ -1,34 +1,118 @@
 """Where and when the gap is: residuals on the wing, by channel and trial, over the load, and in time."""
 
-import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.verdict import GapWindow
+from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import WingDesign
-from reporting.figures import LEVELS, OBSERVED, REFERENCE
+from reporting import figures as style
 
-from .kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar
+AFTER = "with the effect"
+EMPTY = "#f0f1f2"
+"""Colour of cells of a map that hold nothing."""
+
+
+class Shown(NamedTuple):
+    """Residuals of a model, and how it is drawn."""
+
+    residuals: ResidualSet
+    colour: str
+    dashes: str
+    marker: str
+    label: str
+    title: str
+
+
+def models(before: ResidualSet, after: ResidualSet | None) -> list[Shown]:
+    """Return the model as it was and, where there is one, with the effect."""
+    if after is None:
+        return [Shown(before, style.PREDICTION, "--", "o", "model", "model as it is")]
+    return [
+        Shown(before, style.PREDICTION, "--", "o", "model as it was", "a  model as it was"),
+        Shown(after, style.PAST, "-", "D", AFTER, f"b  {AFTER}"),
+    ]
+
+
+def panels(rows: int, columns: int, height: float, **grid: Any) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure of a height [in] and its panels; `grid` as of `matplotlib.figure.Figure.subplots`."""
+    figure = style.new_figure(height)
+    figure.set_layout_engine("constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **grid).tolist()
+
+
+def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
+    """Draw the band of two deviations of the noise."""
+    axes.axhspan(
+        -2.0 * deviation, 2.0 * deviation, color=style.REFERENCE, alpha=opacity, lw=0.0, label="noise, ± 2 s0"
+    )
+
+
+def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
+    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
+    found = np.asarray(values, dtype=float)
+    largest = float(np.nanmax(found, initial=1.0))
+    return LogNorm(0.7, max(largest, 3.0))
+
+
+def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
+    """Draw the colour scale of sizes of residuals beside panels."""
+    place = {"ax": beside, "fraction": 0.045, "pad": 0.02, "aspect": 14}
+    bar = style.color_bar(figure, ScalarMappable(norm, style.LEVELS), "rms residual / noise", **place)
+    style.plain_powers(bar.yaxis, (1.0, 2.0, 5.0) if float(norm.vmax or 1.0) < 50.0 else (1.0,))
+
+
+def heat_map(
+    axes: Axes,
+    values: FloatArray,
+    names: tuple[Iterable[str], Iterable[str]],
+    norm: Normalize,
+    slant: float,
+    texts: NDArray[Any] | None = None,
+) -> AxesImage:
+    """Draw values (R, C), nan where a cell is empty, with names of rows and columns, and what cells say."""
+    image = axes.imshow(np.ma.masked_invalid(values), cmap=style.LEVELS, norm=norm, aspect="auto")
+    rows, columns = map(list, names)
+    axes.set_xticks(range(len(columns)), columns, rotation=slant, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(rows)), rows)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_facecolor(EMPTY)
+    for (row, column), text in np.ndenumerate([] if texts is None else texts):
+        if text:
+            dark = float(norm(values[row, column])) < 0.6
+            colour = "white" if dark else "black"
+            axes.text(column, row, text, ha="center", va="center", fontsize=6.0, color=colour)
+    return image
+
 
 MOST_RECORDS = 12
 """Records that are drawn; those with the largest gaps go first."""
 LONGEST_NAME = 26
 MOST_CELLS = 12
 """Rows or columns up to which a heat map has its numbers written in."""
-GAUGE: dict[str, Any] = {"cmap": LEVELS, "s": 46, "edgecolors": "#333333", "linewidths": 0.6, "zorder": 3}
+GAUGE: dict[str, Any] = {
+    "cmap": style.LEVELS,
+    "s": 46,
+    "edgecolors": "#333333",
+    "linewidths": 0.6,
+    "zorder": 3,
+}
 BELOW: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "top", "fontsize": 6.5}
 """How gauges and their names are drawn on the wing."""
-_STRAIN = re.compile(r"strain\[(\d+)\]")
 
 
 def size(trials: Sequence[FittedTrial], channel: str) -> float:
@@ -59,11 +143,11 @@ def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, t
     places: dict[str, tuple[float, float]] = {}
     positions = design.gauges.positions
     for channel in channels:
-        gauge = _STRAIN.fullmatch(channel.output)
+        gauge = strain_gauge(channel.output)
         if channel.station is not None:
             places[channel.name] = (channel.station, 0.4 if channel.chord is None else channel.chord)
-        elif gauge is not None and 1 <= int(gauge.group(1)) <= len(positions):
-            places[channel.name] = positions[int(gauge.group(1)) - 1]
+        elif 0 <= gauge < len(positions):
+            places[channel.name] = positions[gauge]
         elif channel.output == "tip_displacement":
             places[channel.name] = (design.planform.semi_span, design.planform.straight_chord_line)
     return places
@@ -152,18 +236,16 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
     found = found[:4]
     columns = min(len(found), 2)
     rows = (len(found) + columns - 1) // columns
-    figure, cells = panels(rows, columns, 2.25 * rows + 0.3)
-    for spare in cells[-1][len(found) - columns * (rows - 1) :]:
-        spare.remove()
-    for number, (kind, label, quantity, names) in enumerate(found):
-        axes = cells[number // columns][number % columns]
+    figure, grid = panels(rows, columns, 2.25 * rows + 0.3)
+    cells = style.first_of(grid, len(found))
+    for number, (axes, (kind, label, quantity, names)) in enumerate(zip(cells, found, strict=True)):
         factor, unit = UNITS[quantity].drawn
         noise, *_ = [_draw_loads(axes, item, kind, names, factor) for item in models(before, after)]
         draw_noise(axes, noise, 0.25)
-        axes.axhline(0.0, color=OBSERVED, lw=0.6)
+        axes.axhline(0.0, color=style.OBSERVED, lw=0.6)
         title = f"{'abcd'[number]}  {kind.value}, {quantity.value}"
         axes.set(xlabel=label, ylabel=f"residual, {unit}", title=title)
-    figure.legend(*cells[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
+    figure.legend(*cells[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
 
@@ -217,12 +299,14 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
 
 def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool) -> None:
     first, last = windows[0].first, windows[0].last
-    axes.hlines((row - 0.14, row + 0.2) if both else row, first, last, color=REFERENCE, lw=1.0, zorder=1)
+    axes.hlines(
+        (row - 0.14, row + 0.2) if both else row, first, last, color=style.REFERENCE, lw=1.0, zorder=1
+    )
     for window in windows:
         begin = first if window.begin is None else window.begin.value
         end = last if window.end is None else window.end.value
         low, height = (row + 0.1, 0.2) if window.with_effect else (row - 0.34, 0.4 if both else 0.68)
-        colour = colormaps[LEVELS](float(norm(window.size)))
+        colour = colormaps[style.LEVELS](float(norm(window.size)))
         axes.broken_barh(
             [(begin, end - begin)], (low, height), facecolor=colour, edgecolor="#333333", lw=0.5, zorder=2
         )
@@ -230,8 +314,8 @@ def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Norma
         for moment in filter(None, (window.begin, window.end)):
             low, high = moment.low, moment.high
             axes.hlines(middle, low, high, color="white", lw=2.6, zorder=3)
-            axes.hlines(middle, low, high, color=OBSERVED, lw=1.2, zorder=4)
-            axes.vlines([low, high], middle - cap, middle + cap, color=OBSERVED, lw=0.9, zorder=4)
+            axes.hlines(middle, low, high, color=style.OBSERVED, lw=1.2, zorder=4)
+            axes.vlines([low, high], middle - cap, middle + cap, color=style.OBSERVED, lw=0.9, zorder=4)
 
 
 def _short(name: str) -> str:

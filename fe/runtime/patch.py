@@ -367,10 +367,7 @@ class ModelPatch:
         return ModelPatch(self.primitives + other.primitives)
 
     def in_trial(self, trial: str) -> "ModelPatch":
-        """Return what acts in a trial: without the primitives whose windows are in other trials only.
-
-        A primitive that acts throughout the trial has no window in it.
-        """
+        """Return what acts in a trial: no windows of other trials, and none of what acts throughout."""
         if not self.has_windows:
             return self
         found = []
@@ -389,6 +386,10 @@ class ModelPatch:
     def of(self, *kinds: type[Primitive]) -> "ModelPatch":
         """Return the part whose primitives are of the given classes."""
         return ModelPatch(tuple(item for item in self.primitives if isinstance(item, kinds)))
+
+    def without(self, *kinds: type[Primitive]) -> "ModelPatch":
+        """Return the part whose primitives are of other classes."""
+        return ModelPatch(tuple(item for item in self.primitives if not isinstance(item, kinds)))
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return the primitives as plain data; `from_list` gives the patch back, equal to the last bit."""

@@ -85,10 +85,7 @@ class PatchFile:
     @property
     def of_structure(self) -> PatchFile:
         """The same without what changes what is read and not what happens."""
-        rest = (
-            Effect(name, ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS))))
-            for name, patch in self.effects
-        )
+        rest = (Effect(name, patch.without(*SENSORS)) for name, patch in self.effects)
         return PatchFile(tuple(effect for effect in rest if len(effect.patch)), self.channels)
 
     @property

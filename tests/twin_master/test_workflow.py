@@ -15,7 +15,7 @@ import pytest
 
 from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
-from tests.twin_master.runs import check_same, cut_off_after, figures_of, noted, written
+from tests.twin_master.runs import check_same, cut_off_after, noted, written
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
@@ -137,22 +137,6 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
         assert finished_run(tmp_path) is None
 
 
-def test_what_a_run_folder_holds(flown):
-    folder = flown.folder
-    tree = open_run(folder)
-    groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
-    assert set(tree.children) == groups
-    for group in tree.children.values():
-        for name, variable in group.data_vars.items():
-            assert variable.attrs["units"], name
-            assert variable.attrs["long_name"], name
-    assert tree["filtered"]["sensors_received"].values[36] == 0
-    assert int(tree.attrs["seed"]) == 2021
-    assert "seconds" not in (folder / "summary.json").read_text(encoding="utf-8")
-    assert figures_of(folder)["blind_steps"] == "36, 37"
-    assert json.loads((folder / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
-
-
 def test_the_field_of_a_belief_that_rounds_beyond_the_last_level():
     """A mean of 0.8000000000000003 lies outside every model that ends at 0.8."""
     model = SimpleNamespace(states=SimpleNamespace(mean=lambda _belief: np.array([0.8000000000000003, 0.3])))
@@ -192,6 +176,9 @@ def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, turns):
 
 def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, tmp_path, monkeypatch):
     whole = Path(shutil.copytree(flown.folder, tmp_path / "whole"))
+    groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
+    assert {*open_run(whole).children} == groups
+    assert json.loads((whole / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
 
     def report(folder: Path) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")

@@ -1,7 +1,8 @@
-"""Every effect on a real model: what it changes, what it does not, over its whole prior."""
+"""Every effect on a real model, over its whole prior; what lumped models are offered; its page."""
 
 import json
 import pickle
+import struct
 from dataclasses import replace
 from itertools import product
 from math import pi
@@ -12,15 +13,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH
-from benchmarks.effect_pictures import FLOWS
-from discrepancy.campaign.records import Quantity, TrialKind
+from benchmarks.effect_pages import FOLDER, pages
+from benchmarks.effect_pictures import FLOWS, draw, picture_setting
+from benchmarks.tank import tank_setting
+from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
 from discrepancy.catalogue.effect_file import loss_integral
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
-from discrepancy.catalogue.library import effect_by_identifier, library
+from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import mains_lines
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import ACROSS, Conditions
+from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
+from discrepancy.sources.examples import example_campaign, plan_for
 from fe.runtime.patch import (
     EVERY_CHANNEL,
     SENSORS,
@@ -28,6 +33,7 @@ from fe.runtime.patch import (
     DecayingLine,
     FreePlay,
     LoadGain,
+    LoggerClock,
     ModelPatch,
     PointMass,
     PowerStiffness,
@@ -37,6 +43,10 @@ from fe.runtime.patch import (
     SensorRotation,
     StiffnessDrift,
 )
+from tests.discrepancy.rigs import INPUTS, campaign, chosen, model_of, seen, setting_of
+from tests.discrepancy.rigs import trial as asked
+
+pytestmark = pytest.mark.xdist_group("compiling")
 
 BEAM = [effect for effect in library() if effect.identifier not in FLOWS]  # flows need a store: test_outflow
 WARM = {"thermal_strain", "temperature_dependent_modulus"}
@@ -53,17 +63,13 @@ def medians(effect):
     return {item.name: item.prior.value(0.0) or item.prior.value(1.0) for item in effect.parameters}
 
 
-def shown(setting, trial, patch, campaign=None):
-    return observe(setting.model, campaign or setting.campaign, trial, patch, Conditions(np.ones(1))).values
-
-
-def by_name(identifier):
-    return effect_by_identifier(identifier, library())
+def shown(setting, trial, patch):
+    return observe(setting.model, setting.campaign, trial, patch, Conditions(np.ones(1))).values
 
 
 def only(setting, effect, values, place=""):
-    """Return the one primitive of an effect, given by name or itself."""
-    effect = by_name(effect) if isinstance(effect, str) else effect
+    """Return the one primitive of an effect of the catalogue."""
+    (effect,) = chosen(effect)
     (primitive,) = effect.patch(setting, values, place)
     return primitive
 
@@ -251,7 +257,7 @@ def test_lines_that_a_sampling_rate_can_show(setting, rate, lines):
     resampled = replace(trial, time=5000.0 + np.arange(len(trial.time)) / rate)
     given = replace(setting, campaign=replace(setting.campaign, trials=(resampled,)))
     assert mains_lines(given) == lines
-    hum = by_name("mains_hum")
+    (hum,) = chosen("mains_hum")
     assert (hum.unavailable(given) is None) == bool(lines)
 
 
@@ -267,3 +273,90 @@ def test_steps_of_sizes_are_straight_in_the_value(u, step):
     reached = prior.value(prior.stepped(u, step))
     assert reached == pytest.approx(max(target, LEAST_SHRINKAGE * prior.value(u)), rel=1e-6)
     assert Prior("normal", -1.0, 1.0).stepped(u, step) == u + step
+
+
+# ---------------------------------------------------------------- on lumped models
+
+WITHOUT_STATION = {"local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief"}
+OF_STORES = {"outflow", "overflow"}
+
+
+def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show():
+    model = LumpedModel.load("three_mass_chain")
+    plan = plan_for(model, ("x3", "base_strain"), "end")
+    setting = setting_of(example_campaign(model, "laboratory", 1, plan), model)
+    reasons = {effect.identifier: effect.unavailable(setting) for effect in library()}
+    absent = {name for name, reason in reasons.items() if reason is not None}
+    assert absent == WITHOUT_STATION | OF_STORES | WARM | {"logger_clock"}
+    assert all(reasons[name].endswith(".") for name in absent)
+
+
+def test_flows_are_offered_at_states_and_forces_are_not():
+    setting = tank_setting()
+    what = setting.campaign.trials[0]
+    for effect in chosen("outflow", "overflow"):
+        assert effect.unavailable(setting) is None
+        assert effect.places(setting) == ("outlet",)
+        middle = {item.name: item.prior.value(0.0) for item in effect.parameters}
+        shown = seen(setting.model, what, {"level": Quantity.LEVEL}, *effect.patch(setting, middle, "outlet"))
+        assert 0.02 < np.abs(shown - what.values).max() / what.values.max() < 0.9
+    (friction,) = chosen("coulomb_friction")
+    assert "are of states, where flows act and no forces" in str(friction.unavailable(setting))
+
+
+def test_a_port_whose_motion_goes_one_way_shows_no_memory():
+    """A body that falls shows drag and no hysteresis; one that is pushed to and fro may show both."""
+    model = model_of(INPUTS.text("falling_body.toml"))
+    falls = asked(TrialKind.DRIVEN, np.linspace(0.0, 1.0, 101), begins=Start.STILL)
+    given = campaign(falls, height=Channel("height", Quantity.DISPLACEMENT, "height", None))
+    setting = setting_of(given, model)
+    assert not setting.scales.ports["air"].turns
+    remember = "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"
+    for effect in chosen(*remember):
+        assert "motion that turns" in (effect.unavailable(setting) or "")
+    assert chosen("quadratic_damping")[0].unavailable(setting) is None
+    still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
+    assert model.scales(still).ports["air"].turns
+
+
+ALL, BOTH = {"all": ("shaker", "laser", "camera")}, {"rack": ("shaker", "laser"), "film": ("camera",)}
+
+
+@pytest.mark.parametrize(
+    ("loggers", "places", "motion"), [({}, ("",), True), (ALL, ("",), False), (BOTH, ("rack", "film"), True)]
+)
+def test_each_logger_may_have_a_wrong_clock(loggers, places, motion):
+    model = model_of(INPUTS.text("shaken_mass.toml"))
+    read = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
+    what = asked(TrialKind.FORCED, 400, channels=tuple(read), force=np.ones(400), load_place="shaker")
+    shared, own = chosen("logger_clock", "clock_error")
+    given = replace(campaign(what, **read), loggers=loggers)
+    setting = setting_of(given, model)
+    assert shared.unavailable(setting) is None
+    assert shared.places(setting) == places
+    assert (own.unavailable(setting) is None) is motion
+    patch = shared.patch(setting, {"rate_error": 4e-3}, places[0])
+    assert patch == ModelPatch((LoggerClock(places[0] or "*", 4e-3),))
+
+
+# ---------------------------------------------------------------- pages
+
+
+def test_the_pages_are_those_of_the_catalogue():
+    """If this fails: python -m benchmarks.effect_pages."""
+    made = pages()
+    assert {path.name for path in FOLDER.glob("*.md")} == set(made)
+    for name, text in made.items():
+        assert (FOLDER / name).read_text(encoding="utf-8") == text, name
+
+
+def test_every_effect_has_a_small_picture():
+    pictures = {path.stem: path.read_bytes() for path in (FOLDER / "images").iterdir()}
+    assert pictures.keys() == {effect.identifier for effect in library()}
+    for name, data in pictures.items():
+        width, height = struct.unpack(">II", data[16:24])
+        assert len(data) <= 40 * 1024, name
+        assert 500 <= width <= 700, name
+        assert 150 <= height <= 300, name
+    (effect,) = chosen("cubic_stiffness")
+    assert draw(effect, picture_setting()).startswith(b"\x89PNG")  # again

@@ -5,6 +5,7 @@ from importlib.resources import files
 from math import inf
 
 import numpy as np
+from scipy.signal import lfilter
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.protocol import Release
@@ -84,6 +85,12 @@ class ClosedForm(Model):
             values += np.outer((size * wave).real, MODES[mode])
             rates += np.outer((size * pole * wave).real, MODES[mode])
         return Response(values[:, columns], rates[:, columns] * (1.0 + rate))
+
+
+def coloured(generator, coefficients, *shape, before=2000):
+    """Return an autoregression of white noise of deviation one, that began long before."""
+    white = generator.standard_normal((before + shape[0], *shape[1:]))
+    return lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], white, axis=0)[before:]
 
 
 def blank_trial(name, kind, channels, rows, *, start=0.0, **given) -> Trial:

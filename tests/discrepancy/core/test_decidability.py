@@ -1,5 +1,6 @@
-"""What campaigns cannot decide, before any data: the known confusion groups."""
+"""What campaigns cannot decide, before any data; the workflow tried on simulated ones of a rig."""
 
+import json
 from dataclasses import replace
 from math import inf, log
 
@@ -21,7 +22,17 @@ from discrepancy.judgement.next_experiment import (
 )
 from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
 from discrepancy.report.text import group_lines
-from tests.discrepancy.rigs import model_of
+from discrepancy.self_calibration import (
+    NOTHING,
+    Simulator,
+    outcome_of,
+    self_calibrate,
+    wilson,
+    write_self_calibration,
+)
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import investigate
+from tests.discrepancy.rigs import FEW, ORIGIN, measured, model_of
 from tests.refusals import Inputs
 
 from . import kit
@@ -173,14 +184,10 @@ def test_information_of_one_reading_against_quadrature(shift, weight):
     assert 0.0 <= got <= entropy
     # 300 outcomes each: standard error about 0.02
     assert got == pytest.approx(exact, abs=0.06)
-
-
-def test_what_a_nuisance_hides_tells_nothing():
-    """An offset of two deviations under a free zero."""
-    problem, proposal, fits = one_reading(2.0)
+    # under a free zero it tells nothing
     channels = {"y1": replace(problem.campaign.channels["y1"], offset_deviation=inf)}
     free = kit.problem_of(replace(problem.campaign, channels=channels), problem.model)
-    assert mutual_information(free, proposal, fits, HALF) < 0.02
+    assert mutual_information(free, proposal, fits, weights) < 0.02
 
 
 def test_another_amplitude_decides_between_amplitude_and_time():
@@ -229,3 +236,65 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
     names = [item.trial.name for item in proposals(problem, swings=False)]
     assert names
     assert "longer record" not in names
+
+
+# ---------------------------------------------------------------- self-calibration
+
+
+@pytest.mark.parametrize(
+    ("hidden", "kind", "named", "group", "outcome"),
+    [
+        (NOTHING, VerdictKind.NOTHING_MISSING, (), (), "right"),
+        (NOTHING, VerdictKind.NAMED, ("a",), (), "wrong"),
+        ("a", VerdictKind.NAMED, ("a",), (), "right"),
+        ("a", VerdictKind.NAMED, ("b",), (), "wrong"),
+        ("a", VerdictKind.NAMED, ("a", "b"), (), "wrong"),
+        ("a", VerdictKind.GROUP, ("b", "a"), ("b", "a"), "group"),
+        ("a", VerdictKind.GROUP, ("b", "c"), ("b", "c"), "wrong"),
+        ("a", VerdictKind.GROUP, ("a", "b"), ("a + b",), "group"),
+        ("a", VerdictKind.FAMILY, ("a",), (), "family"),
+        ("a", VerdictKind.FAMILY, ("b",), (), "wrong"),
+        ("a", VerdictKind.NOTHING_MISSING, (), (), "missed"),
+        ("a", VerdictKind.UNEXPLAINED, (), (), "unexplained"),
+    ],
+)
+def test_how_verdicts_count(hidden, kind, named, group, outcome):
+    assert outcome_of(hidden, kind, named, group) == outcome
+
+
+def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one():
+    campaign, model = measured()
+    simulator = Simulator(campaign, model)
+    squares = []
+    for seed in range(12):
+        drawn = simulator.simulate(None, np.random.default_rng(seed))
+        assert [trial.name for trial in drawn.trials] == [trial.name for trial in campaign.trials]
+        found = investigate(drawn, model, (), thorough=False) if seed < 2 else None
+        assert found is None or found.verdict.kind is VerdictKind.NOTHING_MISSING
+        again = simulator.simulate(None, np.random.default_rng(seed)).trials[-1].values
+        assert np.array_equal(again, drawn.trials[-1].values)
+        # sixth differences of a slow motion hold noise alone: variance times the sum of squared binomials
+        sixth = np.diff(drawn.trials[-1].values[:, 0], 6)
+        noise = simulator.problem.noise[drawn.trials[-1].channels[0]].standard_deviation
+        squares.append(float(np.mean(sixth**2)) / 924.0 / noise**2)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
+
+
+def test_the_workflow_tried_on_its_own_geometry(tmp_path):
+    campaign, model = measured(kind="static")
+    steps = []
+    found = self_calibrate(campaign, model, FEW, 9, seed=2, workers=1, advance=lambda: steps.append(1))
+    assert len(steps) == len(found.cases) == 9
+    assert [case.hidden == NOTHING for case in found.cases] == [True, False, False] * 3
+    assert all(case.distance >= 25.0 for case in found.cases if case.hidden != NOTHING)
+    assert sum(found.confusion()[2].ravel()) == 9
+    assert found.share("right", null=True).total == 3
+    none, square = wilson(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)
+    assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, square / (9.0 + square)))
+    assert wilson(0, 0).total == 0
+    again = self_calibrate(campaign, model, FEW, 9, seed=2, workers=2)
+    assert again == found
+    path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    assert stored["schema"] == "uav-twin self calibration 1"
+    assert len(stored["cases"]) == 9

@@ -31,13 +31,9 @@ CENTRAL = 1e-3  # by effects no curvature is in them: of frequencies nuisances l
 BOTH = Candidate((kit.OFFSET, kit.DRIFT))
 
 
-def coloured_record(deviation=0.02, interval=0.01):
-    generator = np.random.default_rng(11)
-    samples, state = np.empty(3000), 0.0
-    for n in range(len(samples)):
-        state = 0.7 * state + generator.standard_normal()
-        samples[n] = deviation * np.sqrt(1.0 - 0.49) * state
-    return NoiseRecord(float(samples.std()), 2999.0, samples, interval, "pre-trigger")
+def coloured_record():
+    samples = 0.02 * np.sqrt(0.51) * kit.coloured(np.random.default_rng(11), (0.7,), 3000)
+    return NoiseRecord(float(samples.std()), 2999.0, samples, 0.01, "pre-trigger")
 
 
 # ---------------------------------------------------------------- derivatives
@@ -112,6 +108,24 @@ def test_samples_that_do_not_count_change_nothing():
     # nor are they counted as residuals of nought
     for data, item in zip(problem.trials, residual_set(problem, kit.fitted(problem)).trials, strict=True):
         np.testing.assert_array_equal(item.used, data.weight > 0.0)
+
+
+@pytest.mark.parametrize(("kinds", "factor"), [(("static", "ringdown"), -37.0), (("ringdown",), 37.0)])
+def test_a_signal_of_unknown_scale_is_fitted_as_one_whose_scale_is_known(kinds, factor):
+    """At rest its sign is seen; of what is let go it is that of the release."""
+    problem = kit.closed_problem(seed=4, kinds=kinds, at_rest=len(kinds) > 1, samples=200)
+    channels = dict(problem.campaign.channels)
+    noise, zero = NoiseRecord(37.0 * 0.02, inf), 37.0 * channels["y2"].offset_deviation
+    channels["y2"] = replace(channels["y2"], gain_deviation=inf, noise=noise, offset_deviation=zero)
+    trials = tuple(
+        replace(trial, values=trial.values * [factor if name == "y2" else 1.0 for name in trial.channels])
+        for trial in problem.campaign.trials
+    )
+    scaled = kit.problem_of(replace(problem.campaign, channels=channels, trials=trials), problem.model)
+    found, known = kit.fitted(scaled), kit.fitted(problem)
+    assert found.converged
+    assert -1.0 < known.chi_square - found.chi_square < 12.0
+    np.testing.assert_allclose(found.point.shared[:2], known.point.shared[:2], atol=0.3)
 
 
 # ---------------------------------------------------------------- evidence and posterior

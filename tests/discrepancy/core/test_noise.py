@@ -24,13 +24,9 @@ from discrepancy.campaign.noise_tests import (
     variance_p_value,
 )
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
+from tests.discrepancy.core.kit import coloured
 
 INTERVAL = 0.002
-
-
-def coloured(generator, coefficients, count, burn=2000):
-    white = generator.standard_normal(count + burn)
-    return lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], white)[burn:]
 
 
 def channel(samples, interval=INTERVAL):
@@ -57,13 +53,12 @@ def test_autoregression_is_recovered(coefficients):
     assert innovation == pytest.approx(left @ left / (8000 - len(found) - 1.0), rel=1e-9)
 
 
-@pytest.mark.parametrize(("coefficients", "count", "records"), [((), 64, 4000), ((0.9,), 500, 700)])
+@pytest.mark.parametrize(("coefficients", "count", "records"), [((), 64, 1500), ((0.9,), 500, 300)])
 def test_lines_are_not_found_in_noise(coefficients, count, records):
     """Level 1e-4 a line, three lines, however few neighbours tell the level of the noise."""
     generator = np.random.default_rng(7)
-    found = sum(
-        len(without_lines(coloured(generator, coefficients, count, 200), INTERVAL)[1]) for _ in range(records)
-    )
+    drawn = (coloured(generator, coefficients, count, before=200) for _ in range(records))
+    found = sum(len(without_lines(noise, INTERVAL)[1]) for noise in drawn)
     assert found <= stats.binom.isf(1e-2, 3 * records, 1e-4)
 
 
@@ -105,7 +100,7 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients):
 
 @pytest.mark.parametrize("count", [64, 301])
 def test_p_values_of_serial_tests_are_uniform_under_white_noise(count):
-    noise = np.random.default_rng(count).standard_normal((800, count))
+    noise = np.random.default_rng(count).standard_normal((400, count))
     for test in (ljung_box, cumulative_periodogram, fisher_g):
         p = np.array([test(row)[1] for row in noise])
         for level in (0.2, 0.05, 0.01, 0.0025):

@@ -180,40 +180,73 @@ def test_trials_that_came_and_went_are_not_mistaken_for_each_other():
 # ---------------------------------------------------------------- what begins with an event
 
 
-@pytest.fixture(scope="module")
-def campaign():
-    rng = np.random.default_rng(7)
-    time = np.linspace(0.0, 8.0, 201)
-    windows = tuple(Window(name, begin) for name, begin in BEGIN.items())
-    patch = ModelPatch((PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0, windows=windows),))
+NOISE = 2e-4
+(COULOMB,) = kit.chosen("coulomb_friction")
+
+
+def held_by_a_spring(**deviations):
+    """A mass on a spring, with parameters that are known to a deviation."""
+    rows = [
+        {"name": name, "terms": name, "deviation": size, "low": 0.1, "high": 4.0}
+        for name, size in deviations.items()
+    ]
+    return one_mass(stiffness=200.0, damping={"ratios": [0.02]}, parameter=rows)
+
+
+MODEL = held_by_a_spring(stiffness=0.02, damping=0.2)
+BEGIN = {"first": 4.137, "second": 2.221}
+
+
+def pushed(model, factors, *items, slow=0.0):
+    """Two records of the mass under a force, one held out, its parameters at factors; noise that is slow."""
+    rng, time = np.random.default_rng(7), np.linspace(0.0, 8.0, 201)
     trials = []
     for name in BEGIN:
         parts = [
             rng.normal() * np.sin(2.0 * np.pi * f * time + rng.uniform(0, 6)) for f in (0.4, 0.9, 1.3, 1.7)
         ]
-        force = 3.0 * np.sum(parts, axis=0)
         given = {"load_place": "push", "begins": Start.STILL, "held_out": name == "second"}
+        force = 3.0 * np.sum(parts, axis=0)
         trials.append(Trial.plain(name, TrialKind.FORCED, ("x",), time, force=force, **given))
     channels = {"x": Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(NOISE, 500.0))}
     events = tuple(Event("bolt_loose", (name,), time=begin) for name, begin in BEGIN.items())
     base = Campaign("a bolt", channels, tuple(trials), None, {}, "0" * 64, events=events)
     for trial in base.trials:
-        conditions = Conditions(np.array([1.01, 0.9]), refinement=4)
-        shown = observe(MODEL, base, trial, patch, conditions).values
+        conditions = Conditions(np.array(factors), refinement=4)
+        shown = observe(model, base, trial, ModelPatch(items), conditions).values
         trial.values[:] = shown + NOISE * rng.standard_normal(shown.shape)
+        if slow:
+            trial.values[:] += slow * NOISE * kit.coloured(rng, (0.9,), *shown.shape)
     return base
 
 
-NOISE = 2e-4
-(COULOMB,) = kit.chosen("coulomb_friction")
-MODEL = one_mass(
-    stiffness=200.0, damping={"ratios": [0.02]},
-    parameter=[
-        {"name": "spring", "terms": "stiffness", "deviation": 0.02, "low": 0.5, "high": 1.5},
-        {"name": "damper", "terms": "damping", "deviation": 0.2, "low": 0.1, "high": 4.0},
-    ],
-)  # fmt: skip
-BEGIN = {"first": 4.137, "second": 2.221}
+@pytest.fixture(scope="module")
+def campaign():
+    windows = tuple(Window(name, begin) for name, begin in BEGIN.items())
+    return pushed(MODEL, (1.01, 0.9), PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0, windows=windows))
+
+
+def test_a_gain_that_only_keeps_parameters_near_their_priors_is_no_name():
+    """One channel under a recorded force shows the same of a load cell as of all parameters together."""
+    model = held_by_a_spring(mass=0.004, stiffness=0.004, damping=0.004)
+    found = investigate(pushed(model, (1.05, 1.05, 1.0)), model, kit.chosen("load_cell"), thorough=False)
+    assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
+    assert found.verdict.effects == ()
+    assert "('mass' 11.0, 'stiffness' 1" in found.verdict.sentence
+    assert "with one channel these data cannot tell them apart" in found.verdict.sentence
+
+
+def test_a_law_beside_which_something_slow_is_left_is_named_in_part():
+    friction = PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0)
+    campaign = replace(pushed(MODEL, (1.01, 0.9), friction, slow=1.0), events=())
+    rivals = kit.chosen("coulomb_friction", "quadratic_damping")
+    found = investigate(campaign, MODEL, rivals, thorough=False).verdict
+    assert found.kind is VerdictKind.NAMED_IN_PART, found.sentence
+    (effect,) = found.effects
+    assert effect.identifier == "coulomb_friction"
+    (law,) = effect.patch.primitives
+    assert law.coefficient == pytest.approx(0.4, rel=0.1)
+    assert 0.8 < found.explained.low < found.explained.value < 1.0
 
 
 def test_friction_that_begins_with_an_event_is_named_with_it(campaign):

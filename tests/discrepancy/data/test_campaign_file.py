@@ -1,7 +1,9 @@
 """Campaign folders: round trip, units, noise records, and one sentence for what is wrong."""
 
 import math
+import re
 from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -181,6 +183,28 @@ def test_a_load_cell_of_driven_trials_may_be_called_force(tmp_path):
     assert campaign.trials[0].values[2, 1] == 180e3
     again = read_campaign(write_campaign(campaign, tmp_path / "again"))
     np.testing.assert_array_equal(again.trials[0].values, campaign.trials[0].values)
+
+
+def test_the_documented_campaign_is_read(tmp_path):
+    """That of docs/campaign.md, which shows how its tables begin; a record is longer."""
+    text = (Path(__file__).parents[3] / "docs" / "campaign.md").read_text(encoding="utf-8")
+    toml = re.search(r"```toml\n(.*?)```", text, re.DOTALL)
+    tables = re.search(r"begin with\n\n```\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "campaign.toml").write_text(toml.group(1), encoding="utf-8")
+    record = "\n".join(f"{0.002 * k:.3f},{(-1) ** k}" for k in range(3, 50))
+    for table in tables.group(1).split("\n\n"):
+        name, columns, *_ = table.removeprefix("# ").splitlines()
+        more = f"\n{record}" if columns == "time,g17" else ""
+        (tmp_path / name).write_text(f"{table.rstrip()}{more}\n", encoding="utf-8")
+    campaign = read_campaign(tmp_path)
+    up, release, turns = campaign.trials
+    assert [trial.kind.value for trial in campaign.trials] == ["static", "ringdown", "flight"]
+    assert up.values[1].tolist() == [54.1e-6, 2.98e-3]
+    assert up.temperature.tolist() == [1.5] * 3
+    assert release.release.displacement == 0.015
+    assert turns.health[2].tolist() == [0.2, 0.0]
+    assert campaign.channels["g17"].noise.source == "pre-trigger"
+    assert campaign.remarks == ()
 
 
 # ---------------------------------------------------------------- round trip

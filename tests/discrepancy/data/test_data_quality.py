@@ -15,8 +15,18 @@ from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
 from discrepancy.checks.quality import _freedom, check_data, clipped_run
-from discrepancy.sources.examples import ExamplePlan, example_campaign
-from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
+from discrepancy.errors import ModelError
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.sources.examples import ExamplePlan, example_campaign, plan_for, write_example
+from fe.runtime.patch import (
+    HighPass,
+    ModelPatch,
+    PointMass,
+    PowerDamping,
+    RootCompliance,
+    SensorDrift,
+    SensorGain,
+)
 from tests.discrepancy.core import kit
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
@@ -88,6 +98,35 @@ def test_sound_data_have_no_fault(cantilever, seed):
         assert check_against_model(campaign, cantilever) == ()
         marked = mark_outliers(campaign)
         assert all(trial.used.mean() > 0.999 for trial in marked.trials)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_examples_are_sound_and_repeat_whatever_effect_they_hide(tmp_path, seed):
+    """And say what is held out."""
+    chain = LumpedModel.load("three_mass_chain")
+    plan = plan_for(chain, ("x3", "x1", "base_strain", "joint_strain"), "end")
+    one, two = (write_example(chain, tmp_path / name, "laboratory", seed, plan) for name in "ab")
+    assert one.data_hash == two.data_hash
+    assert one.data_hash != write_example(chain, tmp_path / "c", "laboratory", 4, plan).data_hash
+    assert [trial.name for trial in one.held_out] == ["loading again", "release 3"]
+    scales = chain.scales(one)
+    force = 0.05 * scales.ports["joint"].stiffness * scales.ports["joint"].displacement
+    for items in (
+        (),
+        (PointMass(0.3 * scales.modal_mass, 0.6),),
+        (RootCompliance(0.3 / scales.tip_stiffness / 0.36),),
+        (PowerDamping("joint", force, 0.0, 0.0, 1.0, 1.0),),
+        (SensorGain("base_strain", -0.15), HighPass("x3", 0.5)),
+    ):
+        campaign = example_campaign(chain, "laboratory", seed, plan, ModelPatch(items))
+        assert [fault for fault in check_data(campaign) if fault.fatal or not items] == []
+        assert check_against_model(campaign, chain) == ()
+        assert sum(int((~trial.used).sum()) for trial in mark_outliers(campaign).trials) <= 2
+
+
+def test_an_example_of_an_output_that_is_none_is_refused():
+    with pytest.raises(ModelError, match="has no output 'x9'"):
+        plan_for(LumpedModel.load("three_mass_chain"), ("x9",), "end")
 
 
 # ---------------------------------------------------------------- units, signs, exchanged channels

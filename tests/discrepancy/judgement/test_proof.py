@@ -1,4 +1,4 @@
-"""Proof: scores of calibrated predictions, gaps, errors over trials. Consistency: statistic, level, power."""
+"""Trials held out for the proof; scores, gaps, errors over trials. Consistency: statistic, level, power."""
 
 from dataclasses import replace
 from math import isnan, log, pi
@@ -8,7 +8,9 @@ import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
-from discrepancy.campaign.records import NoiseRecord, TrialKind
+from discrepancy.campaign.held_out import choose_held_out
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import FitError
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.judgement.consistency_gate import (
@@ -284,3 +286,67 @@ def test_without_loads_there_is_nothing_to_be_consistent_with():
     gate = consistency_gate(without, kit.fitted(without))
     assert gate.passed is None
     assert np.isnan(gate.statistic)
+
+
+# ---------------------------------------------------------------- what is held out
+
+
+def trial(name, kind, top, count=4, run="A", channels=("x",)):
+    rows = np.linspace(0.0, top, count)
+    drive = {
+        TrialKind.RINGDOWN: {"release": Release(top)},
+        TrialKind.STATIC: {"force": rows},
+        TrialKind.FLIGHT: {"load_factor": rows},
+    }.get(kind, {})
+    values = np.arange(float(count * len(channels))).reshape(count, len(channels))
+    return Trial.plain(name, kind, tuple(channels), rows, values=values, load_place="x", run=run, **drive)
+
+
+def chosen_of(*trials):
+    channels = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("x", "y")}
+    return choose_held_out(Campaign("", channels, trials, None, {}, ""))
+
+
+def held(*trials):
+    return [item.name for item in chosen_of(*trials).held_out]
+
+
+def releases(*levels):
+    return [trial(f"r{n}", TrialKind.RINGDOWN, value) for n, value in enumerate(levels)]
+
+
+def test_what_only_one_trial_has_stays_and_what_is_marked_is_respected():
+    first, second, third = releases(1.0, 0.5, 0.2)
+    assert held(first, replace(second, run="B"), third) == []
+    assert held(first, trial("r1", TrialKind.RINGDOWN, 0.5, channels=("x", "y")), third) == []
+    marked = chosen_of(first, second, replace(third, held_out=True))
+    assert [item.name for item in marked.held_out] == ["r2"]
+    assert choose_held_out(marked) is marked
+    few = chosen_of(first, second)
+    assert not few.held_out
+    assert "Nothing is held out" in few.remarks[-1]
+    assert [item.name for item in few.trials] == ["r0", "r1"]
+
+
+def test_amplitudes_inside_come_first():
+    assert held(*releases(1.0, 0.5, 0.2)) == ["r1"]
+    assert held(*releases(0.2, 1.0, 0.3, 0.6)) == ["r3"]
+    assert held(*releases(1.0, 0.9, 0.6, 0.5, 0.3, 0.2)) == ["r2", "r3"]
+    # The extremes stay: with three trials at two levels the one that repeats can go.
+    assert held(*releases(1.0, 1.0, 0.2)) == ["r1"]
+    assert held(*releases(1.0, 1.0, 1.0, 1.0, 1.0)) == ["r4"]
+
+
+@pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.FLIGHT])
+def test_load_levels_of_a_single_trial(kind):
+    single = trial("s", kind, 8.0, count=9)
+    chosen = chosen_of(single)
+    (fitted,), (proof,) = chosen.fitted, chosen.held_out
+    load = "force" if kind is TrialKind.STATIC else "load_factor"
+    assert getattr(proof, load).tolist() == [2.0, 5.0]
+    assert getattr(fitted, load).tolist() == [0.0, 1.0, 3.0, 4.0, 6.0, 7.0, 8.0]
+    assert proof.values.tolist() == [[2.0], [5.0]]
+    assert proof.name == "s, levels held out"
+    assert held(trial("s", kind, 8.0, count=5)) == []
+    path = np.concatenate([np.arange(5.0), np.arange(3.0, -1.0, -1.0)])
+    assert held(replace(single, force=path, load_factor=0 * path)) == []  # a path that turns stays whole

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from benchmarks.force_events import counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.judgement.when import begins_inside, when_sentence
+from discrepancy.judgement.conclusion import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
 from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
 from discrepancy.missing_force.shares import _noise

@@ -87,10 +87,10 @@ def show(problem, gain=1.0):
         data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
 
 
-def blind(folder, number, seed=1):
-    """Write a campaign of the blind rigs and return it with its model."""
+def blind(folder, number, seed=1, samples=64):
+    """Write a campaign of the blind rigs, shorter than theirs, and return it with its model."""
     folder = folder / "campaign"
-    bench, truth, _ = drawn(number, seed)
+    bench, truth, _ = drawn(number, seed, samples)
     write(folder, bench, truth, "plain", (seed, number))
     return read(folder)
 
@@ -130,7 +130,7 @@ def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
     problem = blind(tmp_path, number, 37)
     best = ForceSearch(problem).name(chosen(effect))[0]
     (law,) = at_unit(best.candidate.patch(problem.setting, best.effect))
-    for key, value in drawn(number, 37)[2]["values"].items():
+    for key, value in drawn(number, 37, 64)[2]["values"].items():
         assert getattr(law, key.removeprefix(f"{effect}.")) == pytest.approx(value, rel=0.05)
 
 
@@ -142,8 +142,8 @@ def test_one_effect_at_two_places_has_a_prior():
 
 
 def test_a_report_opens_with_the_missing_force(tmp_path):
-    blind(tmp_path, CART)
-    found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml")
+    blind(tmp_path, CART, samples=96)
+    found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml", FEW)
     missing = found.missing
     assert missing.told.port == "rail"
     assert missing.law == "Coulomb friction"

@@ -30,9 +30,8 @@ from fe.runtime.patch import (
     PowerDamping,
     PowerStiffness,
 )
-from tests.discrepancy.asking import FloatArray, campaign, seen
-from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import INPUTS, fmu_rig
+from tests.discrepancy.rigs import INPUTS, FloatArray, campaign, fmu_rig, seen
+from tests.discrepancy.rigs import trial as asked
 from tests.refusals import refused
 
 TABLE = INPUTS.table("kinds.toml")

@@ -22,9 +22,8 @@ from discrepancy.models.system_model import State
 from fe.runtime import patch as patches
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
-from tests.discrepancy.asking import FloatArray, seen
-from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import laws, model_of
+from tests.discrepancy.rigs import FloatArray, laws, model_of, seen
+from tests.discrepancy.rigs import trial as asked
 from tests.fe.runtime.stepping import force_of, second_order, states_of
 from tests.refusals import Inputs
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from calibration.result.file import load_calibration, result_bytes, save_calibration
 from calibration.result.record import ParameterPrior
@@ -199,8 +198,7 @@ def test_the_colour_of_the_noise_is_no_gap_where_its_record_has_it(monkeypatch, 
     generator = np.random.default_rng(101)
 
     def coloured(rows):
-        white = generator.standard_normal(len(rows) + 300)
-        return 0.02 * lfilter([1.0], [1.0, -1.2, 0.5], white)[300:]
+        return 0.02 * kit.coloured(generator, (1.2, -0.5), len(rows), before=300)
 
     white = 0.02 * generator.standard_normal(400)
     samples = coloured(white) + white if recorded else white

@@ -1,5 +1,8 @@
-"""Rigs that others measured: their files as published become campaigns, and what the search says of them."""
+"""Rigs that others measured, and those of the documentation: their files, and what is found in them."""
 
+import re
+import subprocess
+import sys
 from functools import cache
 from math import pi
 from pathlib import Path
@@ -12,6 +15,7 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import load_model
+from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.measured_rigs import READING_ERROR, SIGNAL, TIP, write_rig_campaign
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -160,7 +164,7 @@ def wing_campaign(data, **options):
 
 
 def test_a_sample_is_the_mean_of_columns_without_the_shared_zero_and_noise_holds_reading_errors(tmp_path):
-    write_records(tmp_path)
+    write_records(tmp_path, size=500)
     plain = wing_campaign(tmp_path, detrended=False, columns=1)
     averaged = wing_campaign(tmp_path, detrended=False)
     first = plain.trials[0].values[:, 0]
@@ -196,3 +200,61 @@ def test_the_published_measurements_make_a_campaign(tmp_path):
     np.testing.assert_allclose(made.trials[1].values[:, 0], [3.3528e-3, 7.2898e-3, 10.7442e-3, 13.7922e-3])
     assert made.channels[TIP].noise is not None
     assert made.parameters["young_modulus_factor"] == (1.008, 0.0103)
+
+
+# ---------------------------------------------------------------- the rigs of the notebook and of the cart
+
+
+def named(folder, campaign):
+    """Return the only effect that is named beside rivals, its place and its size."""
+    model = LumpedModel.load(folder / "model.toml")
+    found = investigate(read_campaign(folder / campaign), model, RIVALS, thorough=False)
+    assert found.verdict.kind is VerdictKind.NAMED
+    (effect,) = found.verdict.effects
+    (law,) = effect.patch
+    return effect.identifier, effect.place, law.coefficient
+
+
+DOCS = Path(__file__).parents[3] / "docs"
+RIVALS = chosen("coulomb_friction", "load_cell")
+
+
+def write_rig(page, folder, campaign):
+    """Write what a page gives into a folder and run its script; return its text."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    script, *cells = re.findall(r"```(?:{code-cell} )?python\n(.*?)```", text, re.DOTALL)
+    written = [cell.removeprefix("%%writefile ").split("\n", 1) for cell in cells if cell.startswith("%%w")]
+    if not cells:  # no notebook, whose script makes the folder
+        (folder / campaign).mkdir()
+        names = f"{campaign}/campaign.toml", "model.toml"
+        written = zip(names, re.findall(r"```toml\n(.*?)```", text, re.DOTALL), strict=True)
+    (folder / "make_tables.py").write_text(script, encoding="utf-8")
+    subprocess.run([sys.executable, "make_tables.py"], cwd=folder, check=True)
+    for name, content in written:
+        (folder / name).write_text(content, encoding="utf-8")
+    return text
+
+
+def test_with_the_port_friction_is_named_in_the_size_that_was_hidden(tmp_path):
+    """What the notebook gives, its tables made."""
+    write_rig("tutorials/name_an_effect.md", tmp_path, "my_rig")
+    found = named(tmp_path, "my_rig")
+    # The corner of the script's friction is rounded off, that of the law is not.
+    assert found == ("coulomb_friction", "slide", pytest.approx(0.16, rel=3e-3))
+
+
+def test_friction_of_the_cart_is_named_in_the_size_shown_and_not_the_offset(tmp_path):
+    """Its tables begin as they are shown side by side, and jitter."""
+    folder, text = tmp_path, write_rig("cart_in_ten_minutes.md", tmp_path, "my_cart")
+    shown = re.search(r"my_cart/rest.csv +my_cart/ride_1.csv\n(.*?)```", text, re.DOTALL)
+    columns = zip(*(line.split() for line in shown.group(1).splitlines()), strict=True)
+    for name, lines in zip(("rest", "ride_1"), columns, strict=True):
+        made = (folder / "my_cart" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        assert tuple(made[: len(lines)]) == lines
+    for trial in read_campaign(folder / "my_cart").trials:
+        steps = np.diff(trial.time)
+        assert 0.015 < np.std(steps) / np.mean(steps) / np.sqrt(2.0) < 0.025
+    told = re.search(r"force ([\d.]+) N \(([\d.]+) to ([\d.]+)\)", text)
+    value, low, high = (float(number) for number in told.groups())
+    found = named(folder, "my_cart")
+    assert found == ("coulomb_friction", "rail", pytest.approx(value, abs=0.2 * (high - low)))

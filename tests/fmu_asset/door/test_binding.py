@@ -22,6 +22,7 @@ from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from reporting import units
 from reporting.units import Meaning, exact_meaning, meaning_of
+from tests.fmu_asset.door.kinds import WING_BINDING
 from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed, tables
 from tests.refusals import refused
@@ -49,8 +50,8 @@ def test_bad_files_are_one_sentence(tmp_path, case) -> None:
     assert "binding.toml" in str(caught.value)
 
 
-def test_limits_come_from_the_caller_then_from_the_binding(binding) -> None:
-    limited = changed(binding, limits={"step_time": 3.0, "memory": 500.0})
+def test_limits_come_from_the_caller_then_from_the_binding() -> None:
+    limited = changed(WING_BINDING, limits={"step_time": 3.0, "memory": 500.0})
     assert limits_of(limited, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
     assert limits_of(limited, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
@@ -133,10 +134,10 @@ def test_a_draft_flies(foreign_fmu, model, tmp_path) -> None:
         assert asset.step().values.size >= 1
 
 
-def test_the_wing_is_drafted_almost_as_it_is_bound(fmu, binding) -> None:
+def test_the_wing_is_drafted_almost_as_it_is_bound(fmu) -> None:
     wing = drafted(read_fmu(fmu))
-    assert (wing.control, [*wing.health.values()]) == (binding.control, [*binding.health.values()])
-    assert wing.observation["strain"] == binding.observation["strain"]
+    assert (wing.control, [*wing.health.values()]) == (WING_BINDING.control, [*WING_BINDING.health.values()])
+    assert wing.observation["strain"] == WING_BINDING.observation["strain"]
     assert wing.port["tip"].force.variables == ("tip_force",)
     assert wing.port["tip"].quantities["displacement"].variables == ("tip_displacement",)
     assert "frequency[6]" in wing.record.variables

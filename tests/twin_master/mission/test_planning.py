@@ -22,11 +22,9 @@ from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
 from scenarios import structure_files
 from tests.command_line import refused, said
-from tests.refusals import Inputs
-from tests.refusals import refused as in_one_sentence
 from tests.twin_master.runs import edited, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.errors import FleetError, MissionInputError, ScenarioError
+from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission import sensor_design
@@ -102,12 +100,6 @@ def test_an_action_is_a_control_with_a_price_and_a_repair_follows_the_growth_of_
     row = knowledge().model.transition.row(REPAIR_1, 4 * 5 + 1).reshape(5, 5)
     assert row[0] == pytest.approx([0.0, 0.95, 0.05, 0.0, 0.0])
     assert not row[1:].any()
-
-
-@pytest.mark.parametrize(("old", "new", "sentence"), Inputs(__file__).refused("actions"))
-def test_what_is_wrong_with_an_action_is_said_in_one_sentence(old, new, sentence):
-    with in_one_sentence(ScenarioError, sentence):
-        scenario((old, new))
 
 
 def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn():

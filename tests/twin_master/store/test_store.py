@@ -43,6 +43,7 @@ def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_
         for key, variable in variables.items():
             np.testing.assert_array_equal(node[key], variable.values)
             assert (node[key].dims, node[key].attrs) == (variable.dims, variable.attrs)
+            assert key not in made.variables or (variable.attrs["units"] and variable.attrs["long_name"])
     np.testing.assert_array_equal(read["observed"]["strain"], result.flight.observed)
     (tmp_path / "a/run.nc").write_bytes(first[:1000])
     with pytest.raises(RunFolderError, match="not a whole run"):
@@ -64,6 +65,7 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
     noise = result.knowledge.sensor_model.total_standard_deviation  # with the place between the levels
     np.testing.assert_allclose(filtered["noise_standard_deviation"][0], noise[0, 1])
     assert noise.max() > 1.1 * noise.min()
+    assert filtered["sensors_received"].values[36] == 0
     assert np.isnan(filtered["reward_mean"].sel(reward="error").values[36:38]).all()
     assert np.isnan(predicted["reward_mean"].sel(reward="error")).all()
     assert set(tree["truth"]["sensor_status"].values[8:36, 11]) == {2}  # it drifts

@@ -13,7 +13,7 @@ import pytest
 
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal
-from tests.twin_master.watch.watches import (
+from tests.twin_master.watch.conftest import (
     beliefs_of,
     decided,
     of_gauge,

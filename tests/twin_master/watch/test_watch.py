@@ -21,7 +21,7 @@ from reporting.netcdf import Group, Variable, write_groups
 from reporting.progress import SilentProgress
 from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
-from tests.twin_master.watch.watches import (
+from tests.twin_master.watch.conftest import (
     begun,
     decided,
     killed_at,
@@ -56,7 +56,7 @@ def journalled(watch: Watch, folder: Path | None = None) -> list[Any]:
 
 
 def belief_of(watch: Watch) -> object:
-    return json.loads(last_line(watch.folder))["filtered"]
+    return [line["filtered"] for line in journal(watch.folder) if "filtered" in line][-1]
 
 
 def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tmp_path):
@@ -292,6 +292,7 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
 
     assert kinds(1) == [(-1, ["quiet"])]  # nobody has decided anything yet
     assert "control" not in told[0]
+    assert "see whether logger and broker are there" in told[0]["notices"][0]["sentence"]
     os.write(write, texts[0].encode())
     assert kinds(3)[1:] == [(0, ["heard"]), (0, ["quiet"])]
     assert told[2] == told[1] | {"notices": told[2]["notices"], "told_again": True}
