@@ -384,17 +384,3 @@ def beam_reduction(beam: Structure) -> Reduction:
     from fe.reduction.reduced_basis import reduce_structure
 
     return reduce_structure(beam)
-
-
-@pytest.fixture(scope="session")
-def plate_pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Structure, ReducedModel]:
-    """A coarse plate with a hole, four regions around it, and its reduced model, good to half a per cent."""
-    from benchmarks.study_regions import plate
-    from fe.reduction.reduced_basis import reduce_structure
-    from fe.structure.operators import load_and_assemble
-
-    file = plate(tmp_path_factory.mktemp("plate"), 4, around=8, across=3)
-    with file.open("a", encoding="utf-8") as text:
-        text.write("\n[reduction]\ntolerance = 5e-3\n")
-    full = load_and_assemble(file)
-    return full, kept("coarse-plate", lambda: reduce_structure(full).model, FE, full.design_hash)

@@ -120,22 +120,25 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
 TABLES = INPUTS.table("pages.toml")
 
 
+def flown(folder: Path, name: str, steps: int) -> Path:
+    """The run folder of the first turns of a mission, without its report."""
+    scenario = (ROOT / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
+    text = re.sub(r"(?m)^steps = \d+", f"steps = {steps}", scenario)
+    (folder / "short.toml").write_text(text, encoding="utf-8")
+    command(folder, "run", "short.toml", "--no-report", "--out", "run")
+    return folder / "run"
+
+
 @pytest.fixture(scope="module")
 def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of a mission."""
-    folder = tmp_path_factory.mktemp("mission")
-    command(folder, "run", "level_turns", "--out", "run")
-    return folder / "run"
+    """With the turn up to which a page reports, and one more."""
+    return flown(tmp_path_factory.mktemp("mission"), "level_turns", 22)
 
 
 @pytest.fixture(scope="module")
 def short_mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of twelve turns, each of which has damage of its own in the search for an effect."""
-    folder = tmp_path_factory.mktemp("short_mission")
-    scenario = (ROOT / "scenarios" / "growing_damage.toml").read_text(encoding="utf-8")
-    (folder / "short.toml").write_text(re.sub(r"(?m)^steps = \d+", "steps = 12", scenario), encoding="utf-8")
-    command(folder, "run", "short.toml", "--out", "run")
-    return folder / "run"
+    """Each turn has damage of its own in the search for an effect."""
+    return flown(tmp_path_factory.mktemp("short_mission"), "growing_damage", 12)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError, said
-from reporting.provenance import hash_record
+from reporting.files import hash_record
 from reporting.table_file import TextTable
 from reporting.words import be, counted, listing
 

@@ -8,12 +8,8 @@ import pytest
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.package import find_compiler
-from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.errors import FmuBuildError
-from scenarios import binding_files
-from tests.conftest import BEAM
 from tests.fmu_asset.ours import OurFmus, wing_model
-from tests.kept import FE, kept
 
 
 @pytest.fixture
@@ -50,18 +46,6 @@ def model() -> ReducedModel:
 
 
 @pytest.fixture(scope="session")
-def beam_model(request: pytest.FixtureRequest) -> ReducedModel:
-    """The beam of the tests, reduced."""
-    return kept("beam", lambda: request.getfixturevalue("beam_reduction").model, FE, BEAM)
-
-
-@pytest.fixture(scope="session")
-def plate_model(plate_pair: tuple[object, ReducedModel]) -> ReducedModel:
-    """The plate with a hole, reduced."""
-    return plate_pair[1]
-
-
-@pytest.fixture(scope="session")
 def ours(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OurFmus:
     """Pack our own FMUs: `ours("compiled")` is a path."""
     return OurFmus(tmp_path_factory.mktemp("ours"), request.getfixturevalue)
@@ -76,13 +60,3 @@ def _packed(name: str) -> Any:
 
 NAMED = "python", "compiled", "spring_mass", "sensing", "patched"
 fmu, compiled_fmu, spring_mass, sensing, patched = map(_packed, NAMED)
-
-
-@pytest.fixture(scope="session")
-def binding() -> Binding:
-    return load_binding(binding_files()["uav_wing"])
-
-
-@pytest.fixture(scope="session")
-def spring_binding() -> Binding:
-    return load_binding(Path(__file__).parent / "door" / "bindings" / "spring_mass.toml")

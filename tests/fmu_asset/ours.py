@@ -26,19 +26,20 @@ from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
+from tests.conftest import BEAM
 from tests.fmu_asset.making import tables
 from tests.kept import FE, ROOT, compiled_wing, exported, kept
 
 HERE = Path(__file__).parent
 SPRING_MASS = HERE / "spring_mass.py"
 COARSE, NAMED = {"refinement": 0.25}, {"name": "tip_panel"}
+FEW_CELLS = {**COARSE, "edge_size": None, "span_size": 0.2, "chord_size": 0.2}
 THREE = load_design(ROOT / "fe" / "designs" / "uav_wing_three_regions.toml")
 LAST = THREE.defects[2].model_copy(update=NAMED)
 DESIGNS = {
     "wing": load_design().changed(mesh=COARSE),
-    "regions": THREE.changed(mesh=COARSE, defects=[*THREE.defects[:2], LAST]),
+    "regions": THREE.changed(mesh=FEW_CELLS, defects=[*THREE.defects[:2], LAST]),
 }
-REGIONS = DESIGNS["regions"].regions
 STRUCTURES = tables(__file__, "ours")
 NAMES = (*STRUCTURES, "spring_mass", *COMPANION_NAMES, *asset_scripts())
 
@@ -96,8 +97,9 @@ class OurFmus:
     def model(self, name: str) -> ReducedModel:
         """Return the reduced model of a structure's FMU."""
         which = STRUCTURES[name]["model"]
-        model: ReducedModel = wing_model(which) if which in DESIGNS else self._fixture(f"{which}_model")
-        return model
+        if which in DESIGNS:
+            return wing_model(which)
+        return kept("beam", lambda: self._fixture("beam_reduction").model, FE, BEAM)
 
     def options(self, name: str) -> dict[str, Any]:
         """Return the options of `build_fmu` for a structure's FMU."""

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from reporting.progress import Progress, RichProgress, SilentProgress
-from reporting.terminal import broken, console_table
+from reporting.terminal import console_table
 
 
 def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:
@@ -15,20 +15,6 @@ def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) 
     console.print(console_table(headings, rows, width))
     assert isinstance(console.file, StringIO)
     return console.file.getvalue().splitlines()
-
-
-@pytest.mark.parametrize(
-    ("text", "lines"),
-    [
-        ("coulomb_friction", ["coulomb_friction"]),
-        ("temperature_dependent_modulus", ["temperature_", "dependent_modulus"]),
-        ("temperature-dependent modulus", ["temperature-", "dependent modulus"]),
-        ("a_verylongwordwithoutanybreak", ["a_", "verylongwordwithoutanybreak"]),
-        ("", [""]),
-    ],
-)
-def test_long_words_break_where_a_reader_expects_it(text, lines):
-    assert broken(text, 20).split("\n") == lines
 
 
 @pytest.mark.parametrize("width", [80, 100, 200])

@@ -326,31 +326,6 @@ def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(ra
     assert moved.q[-1, 0] == pytest.approx(2.0 * ratio - 1.0, abs=0.03 * shift)
 
 
-# ---------------------------------------------------------------- damping on flexibility
-
-
-@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])
-def test_less_and_less_flexibility_tends_to_none(exponent: float) -> None:
-    """With large steps a port with little is one without (`port_flexibility`).
-
-    What it does is compared with an integrator in `tests/discrepancy/models/test_lumped.py`.
-    """
-    acts = laws_of(ModelPatch((PowerDamping("mass", 1.5, exponent, 0.0, 6.0, 1.0),)), ["mass"])
-    start = {"q": np.ones(1), "v": np.zeros(1), "force": np.zeros(801), "interval": 0.005, "substeps": 40}
-
-    def moved(flexibility: float) -> Any:
-        system = ModalSystem(np.sqrt([40.0]), np.zeros((1, 1)), {"mass": np.ones(1)}, np.array([flexibility]))
-        return simulate(system, acts, **start, kernel=compiled_kernel()).q
-
-    rigid, *others = (moved(flexibility) for flexibility in (0.0, 1.2e-2, 6e-3, 3e-3, 2e-3))
-    errors = [np.abs(q - rigid).max() for q in others]
-    assert errors[2] < 0.6 * errors[0]
-    assert np.array_equal(others[-1], rigid)
-
-
-# ---------------------------------------------------------------- stiffness
-
-
 # ---------------------------------------------------------------- hysteresis
 
 

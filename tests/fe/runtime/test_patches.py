@@ -238,29 +238,3 @@ def test_a_high_pass_follows_uneven_stamps():
     steady = np.imag(1j * wave * 0.3 / (1.0 + 1j * wave * 0.3) * np.exp(1j * wave * time))
     # the gap of eight intervals is bridged by a straight line
     np.testing.assert_allclose(found[:, 0], steady - steady[0] * np.exp(-time / 0.3), atol=8e-3)
-
-
-# ---------------------------------------------------------------- sample by sample
-
-STREAMED = ModelPatch(
-    tuple(patch.PRIMITIVES[kind](*given) for kind, *given in INPUTS.table("channels.toml")["streamed"])
-)
-
-
-@pytest.mark.parametrize("kind", ["ringdown", "flight"])
-def test_samples_are_the_rows_of_the_whole_record(kind):
-    generator, count, dynamic = np.random.default_rng(3), 60, kind == "ringdown"
-    values, across, shear = (1e-4 * generator.normal(size=(count, 3)) for _ in range(3))
-    time, temperature = 0.01 * np.arange(count) + 4.0 * (not dynamic), generator.normal(size=count)
-    record = SensorRecord(CHANNELS, kind, time, 4.0, temperature, release=0.05)
-    expected, _ = applied(STREAMED, record, values, None, across, shear)
-    memory, found = None, []
-    for row in range(count):
-        one, filters = slice(row, row + 1), FilterMemory(memory, 0.01)
-        sample = replace(record, time=time[one], temperature=temperature[one])
-        parts = values[one], None, across[one], shear[one]
-        (read,), _ = applied(STREAMED, sample, *parts, filtered=filters.filtered)
-        memory = filters.after
-        found.append(read)
-        assert len(memory) == (9 if dynamic else 0)  # signal and stages: 5 of one gauge, then 2 of each gauge
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())

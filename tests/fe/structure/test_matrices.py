@@ -38,24 +38,17 @@ def tables(free: list[int], forces: list[tuple[int, Point]], gauge: tuple[int, i
 
 
 @needs_calculix
-@pytest.mark.parametrize(
-    ("build", "kind"),
-    [(decks.stiffened_skin, "S8R"), (decks.stiffened_skin, "S4"), (decks.frame, "B32"), (decks.frame, "B31")],
-)
-def test_shells_and_beams_are_calculixs_own(build, kind, tmp_path):
+@pytest.mark.parametrize("build", [decks.stiffened_skin, decks.frame])
+def test_shells_and_beams_are_calculixs_own(build, tmp_path):
     """Displacements, an extension, six frequencies, also in a state of which no matrix was made."""
-    deck = build(kind)
-    places = [*PARTS[build]]
-    if kind == "S4":  # which has no nodes in the middle of its edges
-        places[1] = (250.0, 0.0, 0.0)
-    corner, middle, *ends = (deck.node[place] for place in places)
+    deck = build()
+    corner, middle, *ends = (deck.node[place] for place in PARTS[build])
     forces = [(corner, (0.0, 0.0, 1.0)), (corner, (0.0, 1.0, 0.0)), (middle, (0.0, 0.0, 1.0))]
     free = sorted(set(deck.node.values()) - set(deck.held))
     rest = tables(free, forces, (ends[0], ends[1]))
-    file = decks.write_structure(tmp_path, lambda **changes: build(kind, **changes), rest)
-    structure = assemble_structure(file)
+    structure = assemble_structure(decks.write_structure(tmp_path, build, rest))
     for e, loss in ((1.0, 0.0), (1.07, 0.7)):
-        other = build(kind, skin=e, patch=e * (1.0 - loss))
+        other = build(skin=e, patch=e * (1.0 - loss))
         stiffness = structure.stiffness({"e": e}, {"z1": loss})
         factors = Factorisation(stiffness)
         for number, theirs in enumerate(decks.solved(other, tmp_path / "calculix", forces)):

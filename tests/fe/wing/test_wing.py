@@ -17,7 +17,7 @@ from fe.runtime.state import STANDARD_GRAVITY
 from fe.wing import operators as modelled
 from fe.wing.design import SHIPPED_DESIGN, load_design, parse_design
 from fe.wing.mesh import build_mesh
-from fe.wing.operators import assemble, eigenmodes, lift_load, solve_static
+from fe.wing.operators import assemble, eigenmodes, lift_load
 from fe.wing.parts import DISTRIBUTIONS, Planform, lifting_line
 from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
@@ -232,40 +232,9 @@ def test_the_weight_relieves_the_lift_and_keeps_its_sum(coarse_design):
     assert found == pytest.approx(weight * (lift_arm - arm), rel=1e-6)
 
 
-def test_a_rod_stiffens_and_weighs(coarse_design, coarse_operators):
-    rod = {"web": 1, "reach": 0.25, "diameter": 0.01, "young_modulus": 120e9, "density": 1600.0}
-    with_rod = modelled.assemble(coarse_design.changed(rods=[rod]))
-    assert tip_stiffness(with_rod) > 1.01 * tip_stiffness(coarse_operators)
-    heave = rigid(with_rod)
-    added = heave @ ((with_rod.mass_terms[0] - coarse_operators.mass_terms[0]) @ heave)
-    reach = max(c[1] for c in with_rod.wing_mesh.points if c[1] <= 0.25 * 1.828 + 1e-3)
-    assert added == pytest.approx(1600.0 * np.pi * 0.005**2 * reach, rel=0.2)
-
-
 # ---------------------------------------------------------------- responses against what is published
 
 STATE = (1.0, (0.0, 0.0), 0.16875, 0.1345)
-LIBRARY_FACTOR = 1.0073  # the published library's mean strains belong to this e
-
-
-def test_strains_at_3g_are_those_of_the_library(shipped_operators, published_library):
-    """Those of the healthy wing, what damage makes of them, and which gauge limits the flight."""
-    observations = json.loads(published_library.read_text())["observations"]
-    states, ours, theirs = ((0, 0), (40, 0), (80, 0), (0, 80)), {}, {}
-    for z1, z2 in states:
-        found = solve_static(shipped_operators, LIBRARY_FACTOR, (z1 / 100, z2 / 100), load_factor=3.0)
-        ours[z1, z2] = found.strain
-        theirs[z1, z2] = np.array(observations[str(z1)][str(z2)]["3g"]["mean"]) * 1e-6
-    ratio = ours[0, 0] / theirs[0, 0]
-    assert np.abs(ratio - 1.0).max() < 0.055
-    assert np.sqrt(np.mean((ratio - 1.0) ** 2)) < 0.03
-    for state in states[1:]:
-        difference = ours[state] / ours[0, 0] - theirs[state] / theirs[0, 0]
-        assert np.sqrt(np.mean(difference**2)) < 0.016
-        assert np.abs(difference).max() < 0.040
-    for state in states[:3]:
-        assert ours[state].argmax() == theirs[state].argmax() == 16
-        assert ours[state].max() == pytest.approx(theirs[state].max(), rel=0.011)
 
 
 def test_bending_is_found_wherever_the_lag_mode_lies(coarse_design, coarse_operators):
@@ -285,3 +254,6 @@ def test_the_wing_has_the_published_stiffness_and_frequencies(shipped_operators)
     modes = eigenmodes(shipped_operators, *STATE)
     assert modes.frequency[modes.flapwise_bending] == pytest.approx([5.632, 28.544], rel=0.0007)
     assert modes.flapwise_bending.tolist() == [0, 2]
+    # No weight is published: this is what the parts of the design weigh on its mesh.
+    heave = rigid(shipped_operators)
+    assert heave @ (shipped_operators.mass_terms[0] @ heave) == pytest.approx(0.947, rel=0.002)

@@ -14,7 +14,7 @@ from fmu_asset import errors
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import HOSTILE
+from tests.fmu_asset.door.kinds import HOSTILE, WING_BINDING
 from tests.fmu_asset.making import DESCRIPTION, archive_of, edited, members, tables
 
 REFUSED = tables(__file__)["refused"]
@@ -64,10 +64,10 @@ def test_what_is_no_fmu_is_one_sentence(fmu, tmp_path) -> None:
         read_fmu(path)
 
 
-def test_what_is_seen_when_it_is_loaded_is_one_sentence(foreign_fmu, fmu, binding, tmp_path, scratch) -> None:
+def test_what_is_seen_when_it_is_loaded_is_one_sentence(foreign_fmu, fmu, tmp_path, scratch) -> None:
     strange = edited(fmu, tmp_path / "strange.fmu", ('start="1.0"', 'start="abc"'))
     with pytest.raises(errors.FmuFileError, match=r"start value that is no number .*'abc'"):
-        FmiAsset(strange, binding).reset()
+        FmiAsset(strange, WING_BINDING).reset()
     contents = members(foreign_fmu("hostile2"))
     library = bytearray(contents["binaries/linux64/hostile2.so"])
     struct.pack_into("<H", library, 18, 183)  # ELF e_machine: AArch64

@@ -20,7 +20,6 @@ from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.structures import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
-from tests.fmu_asset.coupling.reference import recursion
 from tests.fmu_asset.making import parameters_of, tables
 from tests.fmu_asset.ours import OurFmus
 
@@ -87,7 +86,7 @@ _FILES = *BINDINGS_FOLDER.glob("*.toml"), *binding_files().values()
 BINDINGS = {path.stem: load_binding(path) for path in _FILES}
 """By the name of the file."""
 BINDINGS["beam"] = structure_binding(parse_structure(tomllib.loads(BEAM)))
-HOSTILE, WING = BINDINGS["hostile2"], BINDINGS["uav_wing"]
+HOSTILE, WING_BINDING, SPRING_BINDING = (BINDINGS[name] for name in ("hostile2", "uav_wing", "spring_mass"))
 
 # ---------------------------------------------------------------------- structures
 
@@ -255,16 +254,6 @@ def damage(kind: Kind, ours: OurFmus) -> Shown:
     behaviour.start(values, 0.0, [1.0])
     loads = enumerate(kind.course["control"]["load_factor"])
     return [behaviour.advance(float(time), 1.0, [load]) for time, load in loads], {}
-
-
-# ---------------------------------------------------------------------- systems
-
-
-def masses(kind: Kind, _: OurFmus) -> Shown:
-    """Positions and force of the two masses of the system `oscillator`."""
-    pushes, jacobi = kind.course["control"]["push"], kind.file.endswith("jacobi")
-    found = recursion("oscillator", ("first", "second"), kind.binding.interval, pushes, jacobi=jacobi)
-    return np.column_stack((found["first"], found["second"][:, 0]))[1:], {}
 
 
 # ---------------------------------------------------------------------- the table

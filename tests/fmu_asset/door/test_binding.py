@@ -14,12 +14,15 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
+from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
-from reporting.units import Meaning, meaning_of
+from reporting import units
+from reporting.units import Meaning, exact_meaning, meaning_of
+from tests.fmu_asset.door.kinds import WING_BINDING
 from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed, tables
 from tests.refusals import refused
@@ -47,8 +50,8 @@ def test_bad_files_are_one_sentence(tmp_path, case) -> None:
     assert "binding.toml" in str(caught.value)
 
 
-def test_limits_come_from_the_caller_then_from_the_binding(binding) -> None:
-    limited = changed(binding, limits={"step_time": 3.0, "memory": 500.0})
+def test_limits_come_from_the_caller_then_from_the_binding() -> None:
+    limited = changed(WING_BINDING, limits={"step_time": 3.0, "memory": 500.0})
     assert limits_of(limited, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
     assert limits_of(limited, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
@@ -77,6 +80,12 @@ DEFINED = (
 def test_unit_texts_mean_what_is_defined(unit) -> None:
     factor = pytest.approx(unit["factor"] / unit.get("divisor", 1.0), rel=1e-12)
     assert meaning_of(unit["text"]) == Meaning(si(**unit["of"]), factor, unit.get("offset", 0.0))
+
+
+def test_units_that_pint_is_not_asked_for_mean_what_it_says():
+    for unit in units._PLAIN:
+        exponents, factor, offset = exact_meaning(unit)
+        assert meaning_of(unit) == Meaning(exponents, float(factor), float(offset)), unit
 
 
 def test_other_texts_mean_nothing() -> None:
@@ -125,17 +134,18 @@ def test_a_draft_flies(foreign_fmu, model, tmp_path) -> None:
         assert asset.step().values.size >= 1
 
 
-def test_the_wing_is_drafted_almost_as_it_is_bound(fmu, binding) -> None:
+def test_the_wing_is_drafted_almost_as_it_is_bound(fmu) -> None:
     wing = drafted(read_fmu(fmu))
-    assert (wing.control, [*wing.health.values()]) == (binding.control, [*binding.health.values()])
-    assert wing.observation["strain"] == binding.observation["strain"]
+    assert (wing.control, [*wing.health.values()]) == (WING_BINDING.control, [*WING_BINDING.health.values()])
+    assert wing.observation["strain"] == WING_BINDING.observation["strain"]
     assert wing.port["tip"].force.variables == ("tip_force",)
     assert wing.port["tip"].quantities["displacement"].variables == ("tip_displacement",)
     assert "frequency[6]" in wing.record.variables
     assert wing.parameter["damping_alpha"].unit == "1/s"
-    for size in (0.0, -1.0, float("nan")):
-        with pytest.raises(BindingError, match="must be a positive number of seconds"):
-            draft_binding(read_fmu(fmu), step_size=size)
+    for size in (0.0, -1.0, float("nan"), float("inf")):
+        for made in (draft_binding, default_experiment):
+            with pytest.raises(BindingError, match="must be a positive number of seconds"):
+                made(read_fmu(fmu), step_size=size)
 
 
 def test_roles_units_and_step_size_come_from_the_description(foreign_fmu) -> None:

@@ -14,7 +14,7 @@ from fmu_asset import errors
 from fmu_asset.check import check_fmu
 from fmu_asset.door import session
 from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import BINDINGS, HOSTILE, INPUTS, KINDS, bounces
+from tests.fmu_asset.door.kinds import BINDINGS, HOSTILE, INPUTS, KINDS, SPRING_BINDING, WING_BINDING, bounces
 from tests.fmu_asset.making import archive_of, bound, changed, members
 
 # ---------------------------------------------------------------------- the wing
@@ -30,9 +30,9 @@ def test_what_does_not_fit_the_fmu_is_one_sentence(
 
 
 @pytest.mark.parametrize(("parameters", "kind", "sentence"), INPUTS["parameters"])
-def test_parameters_that_do_not_fit_are_one_sentence(fmu, binding, parameters, kind, sentence) -> None:
+def test_parameters_that_do_not_fit_are_one_sentence(fmu, parameters, kind, sentence) -> None:
     with pytest.raises(getattr(errors, kind), match=sentence):
-        FmiAsset(fmu, binding, parameters=parameters)
+        FmiAsset(fmu, WING_BINDING, parameters=parameters)
 
 
 # ---------------------------------------------------------------------- in the midst of a run
@@ -42,14 +42,14 @@ NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD = 1, 2, 3, 4, 5
 
 @pytest.mark.parametrize(("behaviour", "kind", "sentence"), INPUTS["wrong"])
 def test_a_step_that_goes_wrong_ends_a_run_there(
-    spring_mass, spring_binding, isolated, behaviour, kind, sentence, monkeypatch
+    spring_mass, isolated, behaviour, kind, sentence, monkeypatch
 ) -> None:
     """Whatever blocks it is made in; as single steps end there."""
     monkeypatch.setattr(session, "_BLOCK_BYTES", 3 * 6 * 8)
     push = np.linspace(0.0, 1.0, 10)
     with (
-        FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset,
-        FmiAsset(spring_mass, spring_binding, isolated=False) as other,
+        FmiAsset(spring_mass, SPRING_BINDING, isolated=isolated) as asset,
+        FmiAsset(spring_mass, SPRING_BINDING, isolated=False) as other,
     ):
         for bad in (0, 1, 9):
             for one in (asset, other):
@@ -70,8 +70,8 @@ def test_a_step_that_goes_wrong_ends_a_run_there(
                     asset.simulate(steps=2)
 
 
-def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass, spring_binding) -> None:
-    with FmiAsset(spring_mass, spring_binding, step_timeout=0.4) as asset:
+def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass) -> None:
+    with FmiAsset(spring_mass, SPRING_BINDING, step_timeout=0.4) as asset:
         # The limit is that of a step: thousands in one message take longer than one may.
         assert asset.simulate({"push": 1.0}, steps=20_000).extra["steps"][-1] == 20_000
         misbehaviour = np.where(np.arange(500) == 300, SLEEP, 0)
@@ -87,8 +87,8 @@ def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass, spring_binding) 
         assert asset.simulate(steps=3).extra["steps"].tolist() == [1.0, 2.0, 3.0]
 
 
-def test_histories_that_are_refused(foreign_fmu, spring_mass, spring_binding) -> None:
-    with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
+def test_histories_that_are_refused(foreign_fmu, spring_mass) -> None:
+    with FmiAsset(spring_mass, SPRING_BINDING, isolated=False) as asset:
         for inputs, sentence in INPUTS["histories"]:
             with pytest.raises(ValueError, match=sentence):
                 asset.simulate(**inputs)
@@ -129,29 +129,6 @@ def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu, state, isolated
 
 
 # ---------------------------------------------------------------------- starts
-
-
-def flown(asset: FmiAsset) -> list[float]:
-    return [asset.step({"push": push}).values[0] for push in (1.0, 3.0)]
-
-
-def test_every_start_is_the_same_where_a_reset_does_nothing(foreign_fmu, isolated, caplog) -> None:
-    # A file of its own for each case: what is wrong with a file is said once in a process.
-    fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING", f"CASE={int(isolated)}")
-    with caplog.at_level(logging.WARNING), FmiAsset(fmu, BINDINGS["spring2"], isolated=isolated) as asset:
-        process, first = asset.worker_process_id, flown(asset)
-        asset.reset()
-        asset.step({"push": -2.0})
-        asset.reset()
-        assert flown(asset) == first
-        with asset.sibling() as other:
-            other.step({"push": 5.0})
-            other.reset()
-            assert flown(other) == first
-        assert asset.worker_process_id == process
-        assert asset.reset_trial.works is False
-    (said,) = caplog.messages
-    assert f"{fmu}: Its reset returns OK and does not bring it back to its start" in said
 
 
 def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu) -> None:

@@ -22,12 +22,12 @@ from fmu_asset.archive.fmu_file import inspect_fmu, read_fmu
 from fmu_asset.check import check_file, check_fmu
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.compiled.package import compile_library, find_compiler
-from fmu_asset.door.binding import load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
-from scenarios import asset_scripts, binding_files
+from scenarios import asset_scripts
+from tests.fmu_asset.door.kinds import BINDINGS, WING_BINDING
 from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python, tables
 from tests.fmu_asset.ours import STRUCTURES
 
@@ -39,6 +39,8 @@ FURTHER = (*COMPANION_NAMES, *asset_scripts())
 TOLD = ["python", "source", "fmi3", "exchange", "exchange3", "sensing", *FURTHER]
 """Of different model descriptions, which is all that the other tool reads."""
 SOUND = [*TOLD, "compiled", "beam", "compiled_beam", "source3_beam"]
+FLOWN = ["python", "compiled", "fmi3", "exchange3", "sensing"]
+"""Of each kind one; others fly in the tests of what they do."""
 EQUAL = ["python", "compiled", "source3_beam", "beam", "sensing", "patched", *FURTHER]
 
 
@@ -54,10 +56,10 @@ def installed(program: str) -> str:
 @pytest.mark.parametrize("name", SOUND)
 def test_a_packed_fmu_is_sound(ours, name) -> None:
     """`fmpy validate`, the standard's rules and ours, a flight in a worker; without a word."""
-    if "source" in name or name == "exchange" or name in asset_scripts():
+    if name not in FLOWN:
         found = [*check_file(inspect_fmu(ours(name))[0])]
     else:
-        binding = load_binding(binding_files()["uav_wing_fmi3"]) if name == "fmi3" else None
+        binding = BINDINGS["uav_wing_fmi3"] if name == "fmi3" else None
         check = check_fmu(ours(name), binding, cycles=5 if name in ("compiled", "fmi3", "exchange3") else 0)
         found = [(finding.check, finding.verdict, finding.text) for finding in check.findings]
         assert name == "exchange3" or {verdict for _, verdict, _ in found} == {"ok"}
@@ -239,9 +241,7 @@ def test_it_needs_numpy_alone(ours, tmp_path) -> None:
 # ---------------------------------------------------------------------- the compiled kind
 
 
-def test_the_sources_alone_are_the_same_fmu_without_a_binary(
-    ours, model, tmp_path, binding, monkeypatch
-) -> None:
+def test_the_sources_alone_are_the_same_fmu_without_a_binary(ours, model, tmp_path, monkeypatch) -> None:
     whole = members(ours("compiled"))
     with monkeypatch.context() as patch:
         patch.setenv("PATH", str(tmp_path))  # needs no compiler
@@ -251,19 +251,19 @@ def test_the_sources_alone_are_the_same_fmu_without_a_binary(
     assert len(whole) == len(members(sources.path)) + 1
     assert json.loads(whole["resources/design.json"]) == {"design_hash": model.design_hash}
     with pytest.raises(errors.FmuUnsupportedError, match="no binary for this platform"):
-        FmiAsset(sources.path, binding)
+        FmiAsset(sources.path, WING_BINDING)
 
 
-def test_a_damaged_data_file_is_refused_with_a_sentence(ours, binding, tmp_path, isolated) -> None:
+def test_a_damaged_data_file_is_refused_with_a_sentence(ours, tmp_path, isolated) -> None:
     contents = members(ours("compiled"))
     name = "resources/reduced_model.bin"
     contents[name] = contents[name][:999] + bytes([contents[name][999] ^ 4]) + contents[name][1000:]
     with pytest.raises(errors.FmuCallError, match="checksum is wrong"):
-        FmiAsset(archive_of(tmp_path / "damaged.fmu", contents), binding, isolated=isolated).step()
+        FmiAsset(archive_of(tmp_path / "damaged.fmu", contents), WING_BINDING, isolated=isolated).step()
 
 
 @pytest.mark.long
-def test_fmpy_compiles_the_sources(ours, binding, tmp_path) -> None:
+def test_fmpy_compiles_the_sources(ours, tmp_path) -> None:
     """As a user of another platform does: the sources alone, through fmpy's own CMake project."""
     installed("cmake")
     kept = {n: c for n, c in members(ours("compiled")).items() if not n.startswith("binaries/")}
@@ -271,7 +271,7 @@ def test_fmpy_compiles_the_sources(ours, binding, tmp_path) -> None:
     words = [BIN / "fmpy", "compile", path, "--all-warnings", "--warning-as-error"]
     run(words, check=True, env={**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"})
     assert check_fmu(path).passed
-    with FmiAsset(path, binding) as theirs, FmiAsset(ours("compiled"), binding) as mine:
+    with FmiAsset(path, WING_BINDING) as theirs, FmiAsset(ours("compiled"), WING_BINDING) as mine:
         for z1 in (0.0, 0.5):
             seen = [asset.step({"load_factor": 3.0}, {"z1": z1}) for asset in (theirs, mine)]
             np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)

@@ -22,7 +22,7 @@ from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.worker.client import WorkerInstance
 from fmu_asset.worker.protocol import HEADER, Question
-from tests.fmu_asset.door.kinds import HOSTILE
+from tests.fmu_asset.door.kinds import HOSTILE, SPRING_BINDING, WING_BINDING
 from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python, tables
 
 MISBEHAVIOURS = tables(__file__, "misbehaviours")
@@ -266,10 +266,8 @@ def test_nothing_is_left_when_the_twin_is_killed_during_a_step(foreign_fmu, scra
 
 
 @pytest.mark.parametrize(("misbehaviour", "kind", "sentence"), MISBEHAVIOURS["spoilt"])
-def test_an_fmu_in_python_that_spoils_what_we_share(
-    spring_mass, spring_binding, misbehaviour, kind, sentence
-) -> None:
-    with FmiAsset(spring_mass, spring_binding) as asset:
+def test_an_fmu_in_python_that_spoils_what_we_share(spring_mass, misbehaviour, kind, sentence) -> None:
+    with FmiAsset(spring_mass, SPRING_BINDING) as asset:
         with pytest.raises(getattr(errors, kind), match=sentence) as caught:
             asset.step(load={"misbehaviour": misbehaviour})
         told = [str(caught.value), *(text for _, text in asset.log)]
@@ -279,13 +277,13 @@ def test_an_fmu_in_python_that_spoils_what_we_share(
 
 
 @pytest.mark.parametrize("misbehaviour", [8, 9], ids=["loop", "hold"])
-def test_an_fmu_in_python_that_loops(spring_mass, spring_binding, scratch, misbehaviour) -> None:
+def test_an_fmu_in_python_that_loops(spring_mass, scratch, misbehaviour) -> None:
     """It holds the interpreter of the worker; neither the limit nor the death of the twin needs that."""
-    asset, load = FmiAsset(spring_mass, spring_binding, step_timeout=0.5), {"misbehaviour": misbehaviour}
+    asset, load = FmiAsset(spring_mass, SPRING_BINDING, step_timeout=0.5), {"misbehaviour": misbehaviour}
     with asset, pytest.raises(errors.FmuTimeoutError, match=r"longer than 0\.5 s for the step"):
         asset.step(load=load)
     lines = "asset.step()", "print('loops', flush=True)", f"asset.step(load={load})"
-    with twin(spring_mass, spring_binding, *lines) as process:
+    with twin(spring_mass, SPRING_BINDING, *lines) as process:
         assert process.stdout.readline() == b"loops\n"
     await_nothing(scratch, 30.0)
 
@@ -295,11 +293,11 @@ def test_an_fmu_in_python_that_loops(spring_mass, spring_binding, scratch, misbe
 PUSHED = {"push": 1.0}
 
 
-def test_an_interruption_leaves_no_stale_answer(spring_mass, spring_binding, monkeypatch) -> None:
+def test_an_interruption_leaves_no_stale_answer(spring_mass, monkeypatch) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with FmiAsset(spring_mass, spring_binding) as asset:
+    with FmiAsset(spring_mass, SPRING_BINDING) as asset:
         expected = asset.step(PUSHED).values
         with monkeypatch.context() as patch:
             patch.setattr("fmu_asset.worker.client.WorkerInstance._await", interrupt)
@@ -311,10 +309,10 @@ def test_an_interruption_leaves_no_stale_answer(spring_mass, spring_binding, mon
         np.testing.assert_array_equal(asset.step(PUSHED).values, expected)
 
 
-def test_what_an_fmu_does_to_its_process_stays_there(spring_mass, spring_binding, capfd) -> None:
+def test_what_an_fmu_does_to_its_process_stays_there(spring_mass, capfd) -> None:
     """Neither its chatter nor its working directory are the twin's."""
     here = Path.cwd()
-    with FmiAsset(spring_mass, spring_binding) as asset:
+    with FmiAsset(spring_mass, SPRING_BINDING) as asset:
         for behaviour in (7.0, 6.0, 0.0):  # it talks, goes elsewhere, is fine
             asset.step(load={"misbehaviour": behaviour})
         assert asset.log[0] == ("OK", "the spring creaks")
@@ -322,10 +320,10 @@ def test_what_an_fmu_does_to_its_process_stays_there(spring_mass, spring_binding
     assert Path.cwd() == here
 
 
-def test_a_temporary_folder_with_odd_characters(fmu, binding, tmp_path, isolated, monkeypatch) -> None:
+def test_a_temporary_folder_with_odd_characters(fmu, tmp_path, isolated, monkeypatch) -> None:
     odd = tmp_path / "Flügel é # % + 翼 'x' \"y\" $z"
     odd.mkdir()
     file = archive_of(odd / "wing é.fmu", members(fmu) | {"resources/Größe ß.txt": b"x"})
     monkeypatch.setattr(tempfile, "tempdir", str(odd))
-    with FmiAsset(file, binding, isolated=isolated) as asset:
+    with FmiAsset(file, WING_BINDING, isolated=isolated) as asset:
         assert np.all(asset.step({"load_factor": 3.0}).values > 0.0)

@@ -20,7 +20,7 @@ from fmu_asset.door import placement
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.folders import remove_folder
 from fmu_asset.worker.sandbox import landlock_version
-from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE
+from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE, SPRING_BINDING
 from tests.fmu_asset.making import ROOT, bound, changed, run_python, system
 from tests.fmu_asset.worker.test_hostile import MISBEHAVIOURS
 from twin_master.library.grid import SamplingGrid
@@ -129,13 +129,11 @@ def test_what_is_not_its_own_is_out_of_reach(attempting, target, key, row) -> No
     granted(attempting(row["call"], told, sandbox=False))
 
 
-def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(
-    attempting, key, spring_mass, spring_binding
-) -> None:
+def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(attempting, key, spring_mass) -> None:
     silent = attempting("look_into(TARGET)", key, "SILENT")
     refused(silent, r"The system refused it something \(Permission denied\)")
     words = rf"\(Permission denied; the last .* tried was open\('{key}', 'r'\)\)"
-    with FmiAsset(spring_mass, spring_binding) as asset, pytest.raises(errors.FmuCallError, match=words):
+    with FmiAsset(spring_mass, SPRING_BINDING) as asset, pytest.raises(errors.FmuCallError, match=words):
         asset.step(load={"misbehaviour": 13.0})
 
 
