@@ -135,7 +135,7 @@ def _recorded_colour(
         rho, chance = noise_tests.autocorrelation([values])
         at = np.interp(item / record.interval, np.arange(1 + len(rho)), np.r_[1.0, rho])
         fewer = 1.0 if white else noise_tests.times_fewer(rho, chance)
-        found.append((rho[0] if white else np.mean(at), 1.0 / len(raw), fewer))
+        found.append((float(rho[0] if white else np.mean(at)), 1.0 / len(raw), fewer))
     colour, doubt, fewer = np.mean(found, axis=0).tolist()
     return colour, doubt, fewer
 
