@@ -28,10 +28,10 @@ from discrepancy.sources.examples import example_campaign, plan_of, write_exampl
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
-from fe.runtime.patch import ModelPatch, PowerDamping, SensorGain
+from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.archive.fmu_file import read_fmu
 from reporting.errors import FileNotWrittenError
-from reporting.provenance import collect_provenance
+from reporting.files import collect_provenance
 from tests import command_line
 from tests.discrepancy.core.kit import problem_of
 from tests.discrepancy.rigs import chosen, fmu_rig, hiding
@@ -44,7 +44,7 @@ def run(*words, failed=False):
     return done.stderr if failed else done.stdout
 
 
-SPRING = chosen("cubic_stiffness", "seating_offset", "load_cell")
+SPRING = chosen("cubic_stiffness", "load_cell")
 CUBIC = {"stiffening": 0.15}
 
 
@@ -60,8 +60,8 @@ def verdict_of(choice, campaign, effects, folder, *, replace_it=False):
 
 
 def example(choice, kind, seed, folder, effect, values, place):
-    """Write an example that hides an effect."""
-    plan = plan_of(choice.model)
+    """Write an example that hides an effect; what moves is half as long as usual."""
+    plan = replace(plan_of(choice.model), duration=0.5 * plan_of(choice.model).duration)
     patch = hiding(example_campaign(choice.model, kind, seed, plan), choice.model, effect, values, place)
     return write_example(choice.model, folder, kind, seed, plan, patch)
 
@@ -205,7 +205,7 @@ def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
 def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     """A hardening spring with nothing but a stiffness that drifts to explain it."""
     choice = choose_model("single_mass_rig")
-    campaign = example(choice, "ringdown", 3, tmp_path / "campaign", "cubic_stiffness", CUBIC, "slide")
+    campaign = example(choice, "ringdown", 4, tmp_path / "campaign", "cubic_stiffness", CUBIC, "slide")
     found = verdict_of(choice, campaign, chosen("stiffness_drift"), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
     assert gives(found.verdict)
@@ -282,9 +282,8 @@ def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     """What a patched model lacks goes into one file with what it had."""
     first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
     assert len(first.model.patch)
-    plan = plan_of(first.model)
-    drag = ModelPatch((PowerDamping("slide", 0.8, 2.0, 0.0, 0.05, 0.01),))
-    campaign = write_example(first.model, tmp_path / "campaign", "ringdown", 5, plan, drag)
+    drag = "quadratic_damping", {"equivalent_damping_ratio": 0.02}, "slide"
+    campaign = example(first, "ringdown", 5, tmp_path / "campaign", *drag)
     found = verdict_of(first, campaign, chosen("quadratic_damping"), tmp_path / "verdict")
     assert [item.identifier for item in found.verdict.effects] == ["quadratic_damping"]
     beneath = (str(laboratory / "rig.toml"), str(tmp_path / "first.json"))

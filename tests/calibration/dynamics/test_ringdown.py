@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
@@ -207,8 +206,6 @@ def test_damping_of_a_drawn_signal():
 
 # ---------------------------------------------------------------- modes of records
 
-
-Float = NDArray[np.float64]
 
 RATE = 100.0
 STIFFNESS = 4000.0 * np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])

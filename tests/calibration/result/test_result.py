@@ -1,6 +1,5 @@
 """The record of a whole calibration and its file: what it gives back, and what is no such file."""
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 
 import numpy as np
@@ -11,10 +10,7 @@ from hypothesis import strategies as st
 
 from calibration.errors import CalibrationRecordError
 from calibration.result.file import load_calibration, result_bytes, save_calibration
-from calibration.result.record import Calibration
 from calibration.wing.calibrate import calibrate
-
-MakeCalibration = Callable[..., Calibration]
 
 
 def test_what_it_gives(make_calibration):

@@ -1,5 +1,6 @@
 """Effects of a user: TOML files, entry points, `time` and the events of a campaign."""
 
+import math
 import re
 import sys
 from dataclasses import replace
@@ -37,7 +38,14 @@ def write(tmp_path):
     return file
 
 
-def test_a_file_with_one_effect(write, setting):
+def test_what_cannot_be_built_says_once_where(setting):
+    effect = effect_by_identifier("coulomb_friction", library())
+    with pytest.raises(CatalogueError, match="is not a finite number") as caught:
+        effect.patch(setting, {"friction_ratio": math.nan}, setting.model.ports[0])
+    assert str(caught.value).count("primitives 1") == 1
+
+
+def test_files_with_one_effect_and_with_several_of_a_family_at_places(write, setting):
     catalogue = load_catalogue([write(PYLON)], installed=False)
     assert len(catalogue) == len(library()) + 1
     pylon = effect_by_identifier("store_pylon", catalogue)
@@ -45,9 +53,6 @@ def test_a_file_with_one_effect(write, setting):
     assert pylon.places(setting) == ("",)
     (mass,) = pylon.patch(setting, {"mass_ratio": 0.2})
     assert mass == PointMass(pytest.approx(0.02 * setting.scales.modal_mass), setting.scales.length / 2.0)
-
-
-def test_a_file_with_several_effects_places_and_a_family(write, setting):
     buffer, gauge = load_catalogue([write(BUFFER)], installed=False)[-2:]
     assert buffer.places(setting) == ("root", "tip", "span")
     spring, damper = buffer.patch(setting, {"share": 0.05}, "tip")

@@ -110,6 +110,24 @@ def test_samples_that_do_not_count_change_nothing():
         np.testing.assert_array_equal(item.used, data.weight > 0.0)
 
 
+@pytest.mark.parametrize(("kinds", "factor"), [(("static", "ringdown"), -37.0), (("ringdown",), 37.0)])
+def test_a_signal_of_unknown_scale_is_fitted_as_one_whose_scale_is_known(kinds, factor):
+    """At rest its sign is seen; of what is let go it is that of the release."""
+    problem = kit.closed_problem(seed=4, kinds=kinds, at_rest=len(kinds) > 1, samples=200)
+    channels = dict(problem.campaign.channels)
+    noise, zero = NoiseRecord(37.0 * 0.02, inf), 37.0 * channels["y2"].offset_deviation
+    channels["y2"] = replace(channels["y2"], gain_deviation=inf, noise=noise, offset_deviation=zero)
+    trials = tuple(
+        replace(trial, values=trial.values * [factor if name == "y2" else 1.0 for name in trial.channels])
+        for trial in problem.campaign.trials
+    )
+    scaled = kit.problem_of(replace(problem.campaign, channels=channels, trials=trials), problem.model)
+    found, known = kit.fitted(scaled), kit.fitted(problem)
+    assert found.converged
+    assert -1.0 < known.chi_square - found.chi_square < 12.0
+    np.testing.assert_allclose(found.point.shared[:2], known.point.shared[:2], atol=0.3)
+
+
 # ---------------------------------------------------------------- evidence and posterior
 
 

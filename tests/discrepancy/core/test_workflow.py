@@ -197,8 +197,8 @@ MODEL = held_by_a_spring(stiffness=0.02, damping=0.2)
 BEGIN = {"first": 4.137, "second": 2.221}
 
 
-def pushed(model, factors, *items):
-    """Two records of the mass under a force, one held out, with parameters at their factors."""
+def pushed(model, factors, *items, slow=0.0):
+    """Two records of the mass under a force, one held out, its parameters at factors; noise that is slow."""
     rng, time = np.random.default_rng(7), np.linspace(0.0, 8.0, 201)
     trials = []
     for name in BEGIN:
@@ -215,6 +215,8 @@ def pushed(model, factors, *items):
         conditions = Conditions(np.array(factors), refinement=4)
         shown = observe(model, base, trial, ModelPatch(items), conditions).values
         trial.values[:] = shown + NOISE * rng.standard_normal(shown.shape)
+        if slow:
+            trial.values[:] += slow * NOISE * kit.coloured(rng, (0.9,), *shown.shape)
     return base
 
 
@@ -232,6 +234,19 @@ def test_a_gain_that_only_keeps_parameters_near_their_priors_is_no_name():
     assert found.verdict.effects == ()
     assert "('mass' 11.0, 'stiffness' 1" in found.verdict.sentence
     assert "with one channel these data cannot tell them apart" in found.verdict.sentence
+
+
+def test_a_law_beside_which_something_slow_is_left_is_named_in_part():
+    friction = PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0)
+    campaign = replace(pushed(MODEL, (1.01, 0.9), friction, slow=1.0), events=())
+    rivals = kit.chosen("coulomb_friction", "quadratic_damping")
+    found = investigate(campaign, MODEL, rivals, thorough=False).verdict
+    assert found.kind is VerdictKind.NAMED_IN_PART, found.sentence
+    (effect,) = found.effects
+    assert effect.identifier == "coulomb_friction"
+    (law,) = effect.patch.primitives
+    assert law.coefficient == pytest.approx(0.4, rel=0.1)
+    assert 0.8 < found.explained.low < found.explained.value < 1.0
 
 
 def test_friction_that_begins_with_an_event_is_named_with_it(campaign):

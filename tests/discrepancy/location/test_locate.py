@@ -1,25 +1,18 @@
 """Locating: calibration under the null, discoveries, words of disagreements; backbones of known laws."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
-from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import NoiseRecord, Quantity
+from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
-from discrepancy.fits.predictive import residual_set
-from discrepancy.location.dependence import backbones, modal_motion
+from discrepancy.location.dependence import backbones, modal_motion, predicted_frequencies
 from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
 from discrepancy.location.map import features, residual_map
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
 from tests.discrepancy.bench import SHAPES, Bench, with_noise
-from tests.discrepancy.core.kit import fitted, problem_of
-from tests.discrepancy.rigs import integrated
 
 # ---------------------------------------------------------------- calibration of the whole
 
@@ -117,6 +110,14 @@ def test_few_static_readings_do_not_drown_in_many_samples():
     assert variance.rejected
     assert variance.where.startswith("steps, ")
     assert variance.statistic < 1.1
+
+
+def test_modes_are_those_of_records_at_one_rate():
+    """Of a record at half the rate the peaks would be at twice their frequencies."""
+    fast, long = (Bench(count=count).fit(np.random.default_rng(7)).trials[0] for count in (300, 600))
+    wave = {"trial": replace(fast.trial, time=2.0 * fast.trial.time), "prediction": long.prediction[::2]}
+    slow = replace(fast, **wave)
+    assert predicted_frequencies((fast, slow)) == predicted_frequencies((fast,))
 
 
 def test_lines_and_temperature_are_told():
@@ -303,13 +304,8 @@ def test_two_damped_modes_are_split_up_to_the_ends():
 # ---------------------------------------------------------------- backbones of known laws
 
 
-REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 TIME = 0.005 * np.arange(2000)
 OMEGA = 2.0 * np.pi * 5.0
-
-
-def _curve(signal, **settings):
-    return backbones(TIME[: signal.size], signal, (5.1,), **settings)[0]
 
 
 def _viscous(zeta=0.01, f=5.0, size=1.0):
@@ -353,44 +349,8 @@ def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude():
     sign = np.where(half % 2 == 0, 1.0, -1.0)
     signal = sign * ((peak - delta) * np.cos(OMEGA * TIME - half * np.pi) + delta)
     keep = int(0.9 / (2.0 * delta) * np.pi / OMEGA / 0.005)
-    curve = _curve(signal[:keep])
+    curve = backbones(TIME[:keep], signal[:keep], (5.1,))[0]
     exact = 2.0 * delta / (np.pi * curve.amplitude)  # zeta_eq = 2 Fc / (pi k A)
     assert curve.damping_ratio[-1] > 3.0 * curve.damping_ratio[0]
     np.testing.assert_allclose(curve.damping_ratio[:-2], exact[:-2], rtol=0.04)
     np.testing.assert_allclose(curve.frequency[:-2], 5.0, rtol=1e-3)
-
-
-def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude():
-    # f = f0 (1 + 3 kappa A^2 / 8) to first order
-    kappa, zeta = 0.04, 0.008
-
-    def rate(_, x):
-        return [x[1], -(OMEGA**2) * x[0] * (1.0 + kappa * x[0] ** 2) - 2.0 * zeta * OMEGA * x[1]]
-
-    curve = _curve(integrated(rate, TIME, [1.0, 0.0])[:, 0])
-    shift = curve.frequency / 5.0 - 1.0
-    np.testing.assert_allclose(shift, 0.375 * kappa * curve.amplitude**2, atol=2e-4, rtol=0.04)
-    slope = np.polyfit(np.log(curve.amplitude[:6]), np.log(shift[:6]), 1)[0]
-    assert slope == pytest.approx(2.0, abs=0.1)
-
-
-@pytest.mark.skipif(not REFERENCE.is_dir(), reason=f"the published ring-downs are not at {REFERENCE}")
-def test_one_linear_mode_does_not_explain_the_real_ring_downs(tmp_path):
-    """From 0.3 s on, when the second bending mode has died away; all five releases have one amplitude."""
-    wing = read_campaign(write_rig_campaign("real_wing", REFERENCE, tmp_path / "campaign", begin=0.3))
-    free = [replace(trial, held_out=False) for trial in wing.trials if trial.release is not None]
-    of_mode = replace(
-        wing,
-        channels={
-            SIGNAL: replace(wing.channels[SIGNAL], output="displacement", quantity=Quantity.DISPLACEMENT)
-        },
-        trials=tuple(replace(trial, release=replace(trial.release, mode_count=1)) for trial in free),
-        parameters={"stiffness_factor": (1.25, 0.05), "damping_factor": (2.5, 0.8)},
-    )
-    problem = problem_of(of_mode, LumpedModel.load("single_mass_rig"))
-    located = locate(residual_set(problem, fitted(problem)))
-    assert located.disagrees
-    told = located.disagreements[0]
-    assert (told.subject, told.trials) == ("mode 1", "ring-down")
-    assert told.share > 0.7
-    assert "by amplitude or time (these releases do not tell the two apart)" in told.sentence

@@ -142,7 +142,7 @@ def test_one_effect_at_two_places_has_a_prior():
 
 
 def test_a_report_opens_with_the_missing_force(tmp_path):
-    blind(tmp_path, CART, samples=128)
+    blind(tmp_path, CART, samples=96)
     found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml", FEW)
     missing = found.missing
     assert missing.told.port == "rail"

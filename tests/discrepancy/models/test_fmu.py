@@ -124,12 +124,7 @@ class Console(Fmi2Slave):
 def test_a_force_elsewhere_is_the_force_with_its_moments(tmp_path: Path) -> None:
     (tmp_path / "console.py").write_text(CONSOLE, encoding="utf-8")
     build_script_fmu(tmp_path / "console.py", tmp_path / "console.fmu")
-    (tmp_path / "console.toml").write_text(
-        'format = 1\nkind = "fmu"\nname = "Console"\nfmu = "console.fmu"\n'
-        'inputs = { force = { mass = "F" }, bending_moment = "M", torque = "T" }\n'
-        'output = [{ name = "strain", quantity = "strain" }]\n',
-        encoding="utf-8",
-    )
+    (tmp_path / "console.toml").write_text(INPUTS.text("console.toml"), encoding="utf-8")
     with closing(FmuModel.load(tmp_path / "console.toml")) as model:
         moved = LoadPlace(along_span=0.5, along_chord=-0.2)
         found = shown(model, LOADS, (("strain", Quantity.STRAIN),), moved, parameters=np.zeros(0))

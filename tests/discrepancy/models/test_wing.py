@@ -110,24 +110,19 @@ def wing(coarse_patch_arrays: PatchArrays) -> Wing:
 
 
 def test_at_rest_it_is_the_solution_of_the_matrices(wing: Wing) -> None:
+    """Each row with its own health and temperature; hysteresis remembers the path, also while it warms."""
     items = RootCompliance(3e-5), patch.LoadPlace(0.02, 0.01), LocalStiffnessLoss(0.3, 0.5, 0.2)
     u = wing.static(np.outer(wing.wing.force_row("tip_load", ModelPatch(items)), STATIC.force), *items)
     assert wing.seen(STATIC, *items) == pytest.approx((wing.rows(*items) @ u).T, rel=1e-9)
     items = patch.Washout(0.1, 2.0), PointMass(0.1, 1.0)
     u = wing.static(np.transpose([wing.lift(n, *items) for n in FLIGHT.load_factor]))
     assert wing.seen(FLIGHT, *items) == pytest.approx((wing.rows() @ u).T, rel=1e-9)
-
-
-def test_each_row_has_its_own_health_and_temperature(wing: Wing) -> None:
     warm = replace(FLIGHT, temperature=np.array([0.0, 20.0, 20.0]))
     health = np.array([[0.0, 0.0], [0.3, 0.1], [0.3, 0.4]])
     values = wing.seen(warm, patch.ModulusTemperature(1e-3), health=health)
     for row, n in enumerate(warm.load_factor):
         u = wing.static(wing.lift(n), loss=health[row], warm=1.0 - 1e-3 * warm.temperature[row])
         assert values[row] == pytest.approx(wing.rows() @ u, rel=1e-9)
-
-
-def test_hysteresis_remembers_the_path_also_while_the_structure_warms(wing: Wing) -> None:
     slip = patch.MicroSlip("root", 8.0, 3e4, -0.3)
     values = wing.seen(STATIC, slip)
     assert values[-1, 3] > 1e-5  # unloaded, it does not come back

@@ -57,7 +57,7 @@ from reporting.figures import to_svg
 from reporting.folders import lock_folder
 from reporting.words import listing, rounded
 from tests.discrepancy.bench import Bench
-from tests.discrepancy.rigs import FEW, ORIGIN, drag_found, model_of
+from tests.discrepancy.rigs import FEW, INPUTS, ORIGIN, drag_found, model_of
 
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
@@ -314,22 +314,7 @@ def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, coarse_patch_a
 
 
 def test_a_port_turns_as_what_is_measured_or_prescribed_of_it():
-    model = model_of("""
-format = 1
-name = "Four"
-mass = [1.0, 1.0, 1.0, 1.0]
-free = true
-input = [{ name = "b", vector = [0.0, 1.0, 0.0, 0.0], quantity = "angular_velocity" }]
-output = [
-  { name = "a", vector = [1.0, 0.0, 0.0, 0.0], quantity = "angle" },
-  { name = "x", vector = [0.0, 0.0, 1.0, 0.0] },
-]
-port = [
-  { name = "measured", vector = [1.0, 0.0, 0.0, 0.0] }, { name = "driven", vector = [0.0, 1.0, 0.0, 0.0] },
-  { name = "straight", vector = [0.0, 0.0, 1.0, 0.0] }, { name = "free", vector = [0.0, 0.0, 0.0, 1.0] },
-  { name = "half known", vector = [1.0, 0.0, 0.0, -1.0] }, { name = "mixed", vector = [0.0, 1.0, -1.0, 0.0] },
-]
-""")
+    model = model_of(INPUTS.text("turning.toml"))
     units = {name: model.port_units(name)[0] for name in model.ports}
     known = {"measured": "N m", "driven": "N m", "straight": "N"}
     assert units == known | dict.fromkeys(("free", "half known", "mixed"), "N or N m")

@@ -52,7 +52,7 @@ def flown(model, tree):
 
 
 @pytest.mark.xdist_group("wing")
-def test_every_turn_is_in_one_trial_as_it_was_observed(run, tmp_path):
+def test_every_turn_is_in_one_trial_and_the_model_has_the_strains_of_the_fmu(run, tmp_path):
     tree, campaign = tree_of(run), run_campaign(run)
     assert [trial.held_out for trial in campaign.trials] == [False, True]
     time = np.concatenate([trial.time for trial in campaign.trials])
@@ -75,11 +75,8 @@ def test_every_turn_is_in_one_trial_as_it_was_observed(run, tmp_path):
     for one, other in zip(campaign.trials, run_campaign(tmp_path / "bare").trials, strict=True):
         np.testing.assert_array_equal(one.values, other.values)
         np.testing.assert_array_equal(one.health, other.health)
-
-
-@pytest.mark.xdist_group("wing")
-def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(run):
-    trial, tree, model = run_campaign(run, held_out_share=0.0).trials[0], tree_of(run), run_model(run)[0]
+    # the model gives what the FMU had
+    trial, model = run_campaign(run, held_out_share=0.0).trials[0], run_model(run)[0]
     outputs, conditions = flown(model, tree)
     response = model.respond(trial, outputs, ModelPatch(), conditions).values.copy()
     response[:, 16] += DRIFT.amplitude * trial.time / DRIFT.time
