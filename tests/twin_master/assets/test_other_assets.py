@@ -117,17 +117,7 @@ def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, nam
     assert not [*tmp_path.iterdir()]
 
 
-def test_files_that_cannot_be_flown_are_refused_before_a_folder_is_made(folder, tmp_path):
-    for file in ("broken.fmu", "broken.ssp"):
-        (folder / file).write_bytes(b"PK no archive")
-    for name, file, words in (
-        ("fouling", "none.fmu", r"none\.fmu cannot be read"),
-        ("fouling", "broken.fmu", r"broken\.fmu"),
-        ("coupled_fouling", "none.ssp", r"none\.ssp cannot be read"),
-        ("coupled_fouling", "broken.ssp", "not a sound SSP archive"),
-    ):
-        with refused(ANY, words):
-            new_run(load_scenario(folder / f"{name}.toml"), tmp_path / "run", {file[-3:]: folder / file})
+def test_damage_that_the_asset_lives_by_itself_needs_a_model_for_the_twin(folder, tmp_path):
     text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
     own = '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
     path = written(folder, text[: text.index("[truth]")] + own, name="own.toml")
