@@ -36,9 +36,9 @@ def model(factor: float = 1.0, levels: int = 3) -> GraphicalModel:
     return GraphicalModel.from_tables({"z": range(levels)}, tables, {"z": first})
 
 
-def sensors(levels: int = 3, average: str = "outside") -> GaussianSensorModel:
-    value = np.random.default_rng(1).normal(size=(DRAWS, levels, 2, GAUGES))
-    return GaussianSensorModel(value, [0.7, 1.1], [0.2, 0.5, 0.3], average=average)  # type: ignore[arg-type]
+def sensors() -> GaussianSensorModel:
+    value = np.random.default_rng(1).normal(size=(DRAWS, 3, 2, GAUGES))
+    return GaussianSensorModel(value, [0.7, 1.1], [0.2, 0.5, 0.3])
 
 
 def observations() -> Float:
