@@ -104,7 +104,12 @@ def test_prior_and_truth_are_those_of_the_scenario(learnt, run):
 @pytest.mark.parametrize(("faster", "truth"), [({"2g": 0.1, "3g": 0.2}, 2.0), ({"2g": 0.1, "3g": 0.1}, None)])
 def test_the_true_factor_is_that_of_the_true_probabilities(faster, truth):
     learning = {"parameter": False, "noise": False, "transition_factors": [1.0, 2.0]}
-    changes = {"learning": learning, "truth": {"probability": faster}, "mission": {"steps": 2}}
+    changes = {
+        "learning": learning,
+        "truth": {"probability": faster},
+        "mission": {"steps": 2},
+        "notice": False,
+    }
     known, source = of_wing(changed_scenario("growing_damage", changes | {"notice": False}).scenario)
     (factor,) = MissionResult(known.scenario, known, flight_of(known, source), known.truth(3)).learnt
     assert (factor.name, factor.truth) == ("transition_factor", truth)

@@ -212,7 +212,8 @@ def test_a_limit_is_kept_by_the_plan():
     assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
 
 
-def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
+def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path, monkeypatch):
+    monkeypatch.setattr("twin_master.mission.planning.PERIODS", (5,))
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
     worse = 2 * (("[0, 40]", "[0, 80]"),)
     words = ("plan", written(tmp_path, TEXT, *FOUR_STATES, *worse), "--value-of")
