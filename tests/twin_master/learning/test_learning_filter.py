@@ -11,11 +11,7 @@ from scipy.stats import foldnorm, invgamma, multivariate_normal, multivariate_t,
 
 from tests.twin_master.network.decision_oracles import trajectories
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import (
-    LearningFilter,
-    posterior_of_draws,
-    quantiles_of,
-)
+from twin_master.learning.learning_filter import LearningFilter, posterior_of_draws, quantiles_of
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
