@@ -106,7 +106,7 @@ def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path, librar
     kept = "first" if moves == 1 else "second"
     assert kept in (folder / "config.json").read_text(encoding="utf-8")
     assert (folder / "notes.txt").exists() is (moves == 1)
-    assert not list(tmp_path.glob(".*.replaced-*"))
+    assert not list(tmp_path.glob(".*"))
     assert restore_folder(folder) is False
 
 

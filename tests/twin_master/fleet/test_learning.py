@@ -303,6 +303,9 @@ def test_the_report_names_who_needs_attention(grown):
     chance = 1.0 - np.linalg.matrix_power(stays, scenario.mission.prediction_steps - 1).sum(axis=1)
     np.testing.assert_allclose(found[kept], chance, atol=1e-12)
     assert np.ptp(chance) > 0.1
+    section = scenario.planner.model_copy(update={"decide_on": "predicted"})
+    ahead = replace(knowledge, scenario=scenario.model_copy(update={"planner": section}))
+    np.testing.assert_allclose(attention(ahead, belief, 1), model.transition.matrix[1] @ found, atol=1e-12)
 
     # Who gave an alarm comes first, then who leaves soon; with the same percentage by its state.
     beliefs, alarms = group["belief"].values.astype(float), group["notices"].values[:, 0]

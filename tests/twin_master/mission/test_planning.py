@@ -140,7 +140,11 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
     path, policy, folder = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz", tmp_path / "run"
     given = BeliefPolicy(np.random.default_rng(0).random((1, 25)), np.array([INSPECT]))
     policy.write_bytes(policy_file(given, knowledge().model))
-    assert "is no policy" in refused("run", path, "--policy", path, "--out", folder)
+    (tmp_path / "empty").touch()
+    for wrong in (path, tmp_path / "empty"):
+        told = refused("run", path, "--policy", wrong, "--out", folder)
+        assert "is no policy" in told
+        assert "pickle" not in told
     said("run", path, "--policy", policy, "--out", folder, "--no-report")
     kept = kept_knowledge(folder, kept_scenario(folder)).plan.on_belief
     assert np.array_equal(kept.vectors, given.vectors)

@@ -164,3 +164,9 @@ def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
+    blind = np.full((2, 2, 3), np.nan)  # the asset shows nothing anywhere, or one gauge alone
+    assert "model_misfit_rms" not in [f.key for f in summarise(complete, np.zeros((50, 3)), blind)]
+    blind[:, 1, 2] = 0.3, -0.4
+    found = {f.key: f.value for f in summarise(complete, np.zeros((50, 3)), blind)}
+    assert found["model_misfit_largest"] == pytest.approx(40.0)
+    assert found["model_misfit_rms"] == pytest.approx(100.0 * np.sqrt(0.125))
