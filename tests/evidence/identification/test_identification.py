@@ -31,7 +31,6 @@ from evidence.identification.parameters import (
     with_values,
 )
 from evidence.identification.pieces import reduced, wing_pieces
-from evidence.identification.residuals import fitted_residuals
 from evidence.identification.targets import (
     LEVELS,
     MASS_TOTAL,
@@ -304,26 +303,6 @@ def test_slopes_are_differences_of_values(virtual_model):
     ):
         difference = np.log(value(factor * np.exp(h)) / value(factor * np.exp(-h))) / (2.0 * h)
         assert slope == pytest.approx(difference, rel=1e-5)
-
-
-@pytest.mark.long
-def test_the_jacobian_is_that_of_the_full_model(virtual_model, virtual_targets):
-    # Two wings on either side, each with a basis of its own: every approximation is in the difference.
-    weights, width = Weights(), deviations(SOME)
-    base = values_of(VIRTUAL, SOME)
-    jacobian = fitted_residuals(virtual_model.wing, virtual_targets, weights).gradient * width
-    step = 0.02  # the soft webs give as 1 / G: over a tenth of a deviation that is no derivative any more
-    for number in (2, 7):
-        sides = []
-        for sign in (1.0, -1.0):
-            values = base.copy()
-            values[number] += sign * step * width[number]
-            model = build_local_model(with_values(VIRTUAL, SOME, values), ())
-            sides.append(fitted_residuals(model.wing, virtual_targets, weights).value)
-        difference = (sides[0] - sides[1]) / (2.0 * step)
-        largest = np.abs(jacobian[:, number]).max()
-        assert largest > 0.1
-        assert np.abs(jacobian[:, number] - difference).max() < 0.002 * largest + 0.02
 
 
 def test_an_affine_step_is_exact(virtual_model):

@@ -9,7 +9,7 @@ from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import bound, changed, tables
 
 FAULTS = tables(__file__, "faults")
-QUICK = ("array3", "ball2", "hostile2")
+QUICK = ("array3", "ball2")
 
 
 def verdicts(check: FmuCheck) -> dict[str, str]:

@@ -89,8 +89,7 @@ def test_tables_are_in_the_units_of_their_headers(result):
 
 SCENARIO = load_scenario("level_turns").scenario
 MODEL = build_graphical_model(SCENARIO)
-Z1 = MODEL.states.coordinates[:, 0]
-POLICY = np.where(Z1 > 0.59, 0, 1)
+POLICY = np.where(MODEL.states.coordinates[:, 0] > 0.59, 0, 1)
 TRUTH = np.zeros((50, 2))
 TRUTH[20:, 0], TRUTH[30:, 0] = 0.4, 0.6
 
