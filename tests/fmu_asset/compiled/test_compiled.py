@@ -306,7 +306,6 @@ def test_derivatives_that_there_are_not_are_refused_in_a_sentence(ours) -> None:
 STATES = [f"{name}[{mode}]" for name in STATE_NAMES for mode in range(1, 7)]
 RATES = [f"der({name})" for name in STATES]
 COUNT = len(STATES)
-Doubles = ctypes.c_double * COUNT
 START = {
     "damping__alpha": 1.5, "damping__beta": 3e-4, "initial_tip_displacement": 0.05, "health__z1": 0.3,
 }  # fmt: skip
