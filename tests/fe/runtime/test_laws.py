@@ -23,6 +23,7 @@ from fe.runtime.motion import (
     Laws,
     at_stations,
     laws_of,
+    port_flexibility,
     static_solution,
 )
 from fe.runtime.motion_arrays import ModalMotion
@@ -324,6 +325,15 @@ def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(ra
     )
     assert moved.v[-1, 0] == pytest.approx(0.0, abs=1e-12)
     assert moved.q[-1, 0] == pytest.approx(2.0 * ratio - 1.0, abs=0.03 * shift)
+
+
+def test_damping_acts_on_modes_that_hold_nearly_all_of_a_ports_flexibility():
+    """All but a tenth; what it does elsewhere is compared with an integrator in `test_lumped.py`."""
+    acts = laws_of(ModelPatch((PowerDamping("mass", 1.5, 0.5, 0.0, 6.0, 1.0),)), ["mass"])
+    for share, on_modes in ((0.095, True), (0.105, False)):
+        left_out = np.array([share / (1.0 - share) / 40.0])
+        system = ModalSystem(np.sqrt([40.0]), np.zeros((1, 1)), {"mass": np.ones(1)}, left_out)
+        assert port_flexibility(system, acts).tolist() == [0.0 if on_modes else left_out[0]]
 
 
 # ---------------------------------------------------------------- hysteresis
