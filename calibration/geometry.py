@@ -13,7 +13,7 @@ from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
 from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
-from reporting.provenance import hash_record
+from reporting.files import hash_record
 
 from .lab_folder import lab_table
 

@@ -19,8 +19,8 @@ from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign
 from fmu_asset.archive.fmu_file import packed_design_hash
+from reporting.files import hash_file, hash_record
 from reporting.progress import Progress
-from reporting.provenance import hash_file, hash_record
 from reporting.toml_file import read_toml
 from scenarios import structure_files
 

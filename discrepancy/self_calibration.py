@@ -30,7 +30,7 @@ from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
-from discrepancy.judgement.separability import DETECTED, as_predicted, usable
+from discrepancy.judgement.separability import DETECTED, as_predicted, began_before, usable
 from discrepancy.models.interface import Model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
@@ -108,11 +108,9 @@ class Simulator:
         channels = {name: self._deviation(name, generator) for name in self.campaign.channels}
         trials: list[Trial] = []
         for number, data in enumerate(problem.trials):
-            # A motion that began before the record has a prior without information: it stays as fitted.
-            free = data.trial.release is not None and not data.trial.release.at_rest
             local = _drawn(self.found.local[number], data.unknowns.precision, generator)
-            if free:
-                initials = slice(data.unknowns.zeros, data.unknowns.ends[2])
+            if began_before(data.trial):  # whose prior has no information: the state stays as fitted
+                initials = slice(*data.unknowns.ends[:2])
                 local[initials] = self.found.local[number][initials]
             acts = data.trial.kind in candidate.acts_on
             response, _ = problem.response(number, shared, local, patch if acts else nothing, REFINEMENT)

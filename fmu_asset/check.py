@@ -22,8 +22,8 @@ from fmu_asset.door.layout import Place, find
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import contradictions
 from fmu_asset.errors import BindingError, FmuCallError, FmuError, visible
-from fmu_asset.instances.plan import Floats
 from fmu_asset.packing.structure_fmu import recorded_content_hash
+from reporting.arrays import Float
 from reporting.progress import Progress, reporter
 from reporting.units import meaning_of
 
@@ -290,7 +290,7 @@ class Flights:
     def _place(self, role: str, name: str, item: Input) -> Place:
         return find(self._description, item.variable, f"{role}.{name}", "input")
 
-    def _fly(self, asset: FmiAsset | None = None) -> Floats:
+    def _fly(self, asset: FmiAsset | None = None) -> Float:
         """Return the outputs (N, n) of a flight at the start values, from the start."""
         if asset is None:
             with closing(self._asset()) as own:
@@ -415,13 +415,13 @@ class Flights:
         return "warning", f"{text}: it leaks a little."
 
 
-def _outputs(asset: FmiAsset, steps: int) -> Floats:
+def _outputs(asset: FmiAsset, steps: int) -> Float:
     """Return the outputs (N, n) of steps with the inputs as they are."""
     seen = (asset.step() for _ in range(steps))
     return np.array([[*one.values.tolist(), *one.extra.values()] for one in seen])
 
 
-def _difference(one: Floats, two: Floats) -> str:
+def _difference(one: Float, two: Float) -> str:
     # By their bits: 0.0 and -0.0 are equal numbers.
     at = np.flatnonzero(one.ravel().view(np.uint64) != two.ravel().view(np.uint64))
     return f"first {one.flat[at[0]]!r}, then {two.flat[at[0]]!r}".replace("np.float64", "")

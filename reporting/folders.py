@@ -5,13 +5,13 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from reporting.errors import FileNotWrittenError
-from reporting.files import write_error, written
+from reporting.files import written
 
-_OLD, _REPLACED = "old", "replaced"
+_NEW, _OLD, _REPLACED = "new", "old", "replaced"
 
 
 def lock_folder(folder: Path) -> int | None:
@@ -30,6 +30,15 @@ def lock_folder(folder: Path) -> int | None:
     return descriptor
 
 
+@contextmanager
+def held(lock: int) -> Iterator[None]:
+    """Let go of a folder at the end."""
+    try:
+        yield
+    finally:
+        os.close(lock)
+
+
 def fresh_folder(folder: Path) -> Path:
     """Return an empty folder beside the one to be, with the permissions of the user's umask.
 
@@ -39,7 +48,7 @@ def fresh_folder(folder: Path) -> Path:
         The place is not writable.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=_prefix(folder, "new"), dir=folder.parent))
+    fresh = Path(tempfile.mkdtemp(prefix=_prefix(folder, _NEW), dir=folder.parent))
     mask = os.umask(0)
     os.umask(mask)
     fresh.chmod(0o777 & ~mask)
@@ -54,31 +63,29 @@ def _taken(folder: Path) -> int:
 
 
 @contextmanager
-def whole_folder(folder: Path, take: Callable[[Path], int] = _taken) -> Iterator[Path]:
+def whole_folder(
+    folder: Path, take: Callable[[Path], int] = _taken, holding: ExitStack | None = None
+) -> Iterator[Path]:
     """Give an empty folder to be filled, and put it in the place of `folder` when the block ends.
 
-    An exception in the block leaves `folder` as it was. `take` holds a folder that is to be replaced for this
-    process, as `lock_folder` does, or says why not.
+    An exception in the block leaves `folder` as it was. `take` holds a folder for this process, as
+    `lock_folder` does, or says why not: one that is to be replaced, and the new one, to the end of `holding`.
 
     Raises
     ------
     FileNotWrittenError
         The disk is full, the place is not writable, or another process holds the folder.
     """
-    with written(folder):
+    with written(folder), ExitStack() as ended:
         fresh = fresh_folder(folder)
-        try:
-            yield fresh
-            if not folder.is_dir():
-                fresh.rename(folder)
-                return
-            held = take(folder)
-            try:
-                replace_folder(fresh, folder)
-            finally:
-                os.close(held)
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
+        ended.callback(shutil.rmtree, fresh, ignore_errors=True)
+        (holding or ended).enter_context(held(take(fresh)))
+        yield fresh
+        if not folder.is_dir():
+            fresh.rename(folder)
+            return
+        with held(take(folder)):
+            replace_folder(fresh, folder)
 
 
 def replace_folder(fresh: Path, folder: Path) -> None:
@@ -91,7 +98,7 @@ def replace_folder(fresh: Path, folder: Path) -> None:
     OSError
         The place is not writable; the old folder is there as it was.
     """
-    old = Path(tempfile.mkdtemp(prefix=_prefix(folder, _OLD), dir=folder.parent))
+    old = Path(tempfile.mkdtemp(prefix=_prefix(folder, _replaced_by(fresh)), dir=folder.parent))
     aside = old / folder.name
     try:
         folder.rename(aside)
@@ -101,7 +108,7 @@ def replace_folder(fresh: Path, folder: Path) -> None:
             aside.rename(folder)
         old.rmdir()
         raise
-    replaced = old.with_name(old.name.replace(f".{_OLD}-", f".{_REPLACED}-"))
+    replaced = Path(tempfile.mkdtemp(prefix=_prefix(folder, _REPLACED), dir=folder.parent))
     old.rename(replaced)
     shutil.rmtree(replaced, ignore_errors=True)
 
@@ -109,7 +116,7 @@ def replace_folder(fresh: Path, folder: Path) -> None:
 def restore_folder(folder: Path) -> bool:
     """Put back a folder that a killed process had moved aside; return whether there was one.
 
-    What a killed process had replaced already, and was about to remove, is removed.
+    What a killed process had replaced already, and was about to remove, is removed, and what it had begun.
 
     Raises
     ------
@@ -119,21 +126,27 @@ def restore_folder(folder: Path) -> bool:
     restored = False
     for old in _asides(folder, _OLD):
         aside = old / folder.name
-        # A folder that is held is being replaced at this moment; one whose place is taken is left alone.
-        if folder.exists() or not aside.is_dir() or (descriptor := lock_folder(aside)) is None:
+        # A folder that is held is being replaced at this moment; one whose place is taken is left alone, but
+        # where what took it is known.
+        if not aside.is_dir() or (descriptor := lock_folder(aside)) is None:
             continue
-        try:
-            aside.rename(folder)
-            restored = True
-        except OSError as error:
-            raise write_error(error, folder) from error
-        finally:
-            os.close(descriptor)
+        with held(descriptor), written(folder):
+            if not folder.exists():
+                aside.rename(folder)
+                restored = True
+            elif old.name.startswith(_prefix(folder, _replaced_by(folder))):
+                shutil.rmtree(old, ignore_errors=True)
         with suppress(OSError):
             old.rmdir()
-    for replaced in _asides(folder, _REPLACED):
-        shutil.rmtree(replaced, ignore_errors=True)
+    for left in (*_asides(folder, _NEW), *_asides(folder, _REPLACED)):
+        if (descriptor := lock_folder(left)) is not None:
+            with held(descriptor):
+                shutil.rmtree(left, ignore_errors=True)
     return restored
+
+
+def _replaced_by(fresh: Path) -> str:
+    return f"{_OLD}-{fresh.stat().st_ino}"
 
 
 def _prefix(folder: Path, what: str) -> str:

@@ -15,13 +15,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.sentences import said
 from reporting.text_file import read_text
 from reporting.words import counted
-
-FloatArray = NDArray[np.float64]
 
 
 class TableErrors(NamedTuple):
@@ -84,7 +82,7 @@ class TextTable:
 
     def numbers(
         self, column: str, needed_by: str, *, empty_allowed: bool = False, positive: bool = False
-    ) -> FloatArray:
+    ) -> Float:
         """Return a column as numbers; NaN stands for an empty cell where it is allowed.
 
         Raises
@@ -216,7 +214,7 @@ def _separated(
     return found
 
 
-def table_text(columns: Mapping[str, Sequence[str] | FloatArray]) -> str:
+def table_text(columns: Mapping[str, Sequence[str] | Float]) -> str:
     """Return the text of a table, which `parse_table` reads back; a number that is none is an empty cell."""
     cells = (
         ["" if value != value else repr(value) for value in column.tolist()]

@@ -11,7 +11,8 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import TYPE_CHECKING, Annotated, Any
@@ -221,6 +222,15 @@ def failed(text: str, code: int = 1) -> typer.Exit:
     return typer.Exit(code)
 
 
+@contextmanager
+def interruptible(kept: Callable[[], str] = str) -> Iterator[None]:
+    """End a command after Ctrl-C, and say what is kept and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise failed("; ".join(filter(None, ("Interrupted", kept()))) + ".", INTERRUPTED) from None
+
+
 def print_json(record: Mapping[str, Any]) -> None:
     """Print a record as JSON text; a number that is not finite becomes null."""
     from reporting.json_file import plain
@@ -276,9 +286,8 @@ def _interruptible(call: Callable[..., Any]) -> Callable[..., Any]:
     def guarded(*arguments: Any, **options: Any) -> Any:
         before, reporting.progress.narrator = reporting.progress.narrator, functools.cache(progress)
         try:
-            return call(*arguments, **options)
-        except KeyboardInterrupt:
-            raise failed("Interrupted.", INTERRUPTED) from None
+            with interruptible():
+                return call(*arguments, **options)
         finally:
             reporting.progress.narrator = before
 

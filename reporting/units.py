@@ -33,6 +33,14 @@ _WORDS = {
 """What pint takes for lengths and ratios, and measuring programmes do not."""
 
 
+_PLAIN = {
+    "1": (1.0, {}), "%": (0.01, {}), "microstrain": (1e-6, {}), "m": (1.0, {"m": 1}), "mm": (1e-3, {"m": 1}),
+    "kg": (1.0, {"kg": 1}), "g": (1e-3, {"kg": 1}), "s": (1.0, {"s": 1}), "Hz": (1.0, {"s": -1}),
+    "1/s": (1.0, {"s": -1}), "N": (1.0, {"kg": 1, "m": 1, "s": -2}),
+}  # fmt: skip
+"""Factors and exponents of units that nearly every FMU has: pint takes long to begin."""
+
+
 class Meaning(NamedTuple):
     """SI value = `factor` * value + `offset`, in the SI unit with these exponents (of `BASE_UNITS`)."""
 
@@ -89,11 +97,12 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...],
     ValueError
         If pint does not know it.
     """
+    text = _expression(unit, gravity=gravity)
     from pint.errors import PintError
 
     known = _known_units()
     try:
-        parsed = known.parse_units(_expression(unit, gravity=gravity))
+        parsed = known.parse_units(text)
         factor, roots = known.get_root_units(parsed)
         offset = known.Quantity(Fraction(0), parsed).to_root_units().magnitude
     except (PintError, TokenError, AttributeError, TypeError, ArithmeticError) as cause:
@@ -108,6 +117,9 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...],
 @lru_cache(maxsize=1024)
 def meaning_of(unit: str) -> Meaning | None:
     """Return what a unit means, or None if it is not understood; see `exact_meaning`."""
+    if unit in _PLAIN:
+        size, powers = _PLAIN[unit]
+        return Meaning(tuple(powers.get(base, 0) for base in BASE_UNITS), size)
     try:
         exponents, factor, offset = exact_meaning(unit)
         return Meaning(exponents, float(factor), float(offset))

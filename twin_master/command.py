@@ -1,4 +1,4 @@
-"""Commands of one asset: `uav-twin run`, which is `python -m twin_master`, too, `watch` and `view`."""
+"""Commands of one asset: `run`, which is `python -m twin_master`, too, `watch`, `view`, `scenario check`."""
 
 import json
 import os
@@ -9,7 +9,6 @@ import time
 import traceback
 import webbrowser
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import typer
 from reporting import terminal
 from reporting.errors import ReportingError
 from reporting.words import counted
+from scenarios import scenario_files
 from twin_master import parts
 from twin_master.errors import TwinMasterError, said
 from twin_master.fleet_command import engine_of, fly_and_show, shown
@@ -51,7 +51,6 @@ def run(
     overrides = parts.Overrides(
         seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt
     )
-    told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report}
     if seeds is not None:
         if scenario is None or resume is not None or seed is not None or view or policy is not None:
             raise typer.BadParameter(said("fleet.seeds"), param_hint="--seeds")
@@ -67,14 +66,24 @@ def run(
     if resume is not None:
         if out is not None or replace or policy is not None or overrides != parts.Overrides():
             raise typer.BadParameter(said("run_folder.resume"), param_hint="--resume")
-        folder, fly = resume, partial(parts.resume, resume, loaded)
+        folder = resume
     else:
         if loaded is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-        fly = partial(parts.fly, loaded, folder, overrides, policy=policy, replace=replace)
+
+    def kept() -> str:
+        begun = (folder / "config.json").is_file()
+        hint = f"continue with `uav-twin run --resume {folder}`" if begun else "no run was begun"
+        return f"nothing is lost: {hint}"
+
     with shown(view) as begun:
-        outcome = _interruptible(lambda: fly(begun=begun, **told), folder)
+        told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report, "begun": begun}
+        with terminal.interruptible(kept):
+            if loaded is None or resume is not None:
+                outcome = parts.resume(folder, loaded, **told)
+            else:
+                outcome = parts.fly(loaded, folder, overrides, policy=policy, replace=replace, **told)
         if json:
             terminal.print_json(_record(outcome))
         else:
@@ -97,15 +106,6 @@ def _record(outcome: "parts.RunOutcome") -> dict[str, Any]:
     record: dict[str, Any] = json.loads((outcome.folder / parts.SUMMARY_NAME).read_text(encoding="utf-8"))
     report = None if outcome.report is None else str(outcome.report)
     return {"folder": str(outcome.folder), "report": report} | record
-
-
-def _interruptible(fly: "Callable[[], parts.RunOutcome]", folder: Path) -> "parts.RunOutcome":
-    try:
-        return fly()
-    except KeyboardInterrupt:
-        begun = (folder / "config.json").is_file()
-        hint = f"continue with `uav-twin run --resume {folder}`" if begun else "no run was begun"
-        raise terminal.failed(f"Interrupted; nothing is lost: {hint}.", terminal.INTERRUPTED) from None
 
 
 def show_outcome(outcome: "parts.RunOutcome") -> None:
@@ -143,7 +143,9 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
     except Exception as error:
         if terminal.loudness.verbose:
             traceback.print_exc()
-        if not (_is_ours(error) or isinstance(error, others)):
+        # The system's own refusals (a folder without permission, a full disk) are no defect of the program.
+        ours = parts.FmuError, parts.FiniteElementError, parts.CalibrationError, ReportingError
+        if not isinstance(error, (OSError, TwinMasterError, *ours, *others)):
             raise
         sentence = str(error)
         if isinstance(error, OSError):
@@ -151,12 +153,6 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
         for line in (sentence, *getattr(error, "__notes__", ())):
             typer.secho(line, fg="red", err=True)
         raise SystemExit(1) from None
-
-
-def _is_ours(error: Exception) -> bool:
-    # The system's own refusals (a folder without permission, a full disk) are no defect of the program.
-    ours = parts.FmuError, parts.FiniteElementError, parts.CalibrationError, ReportingError
-    return isinstance(error, (OSError, TwinMasterError, *ours))
 
 
 def main() -> None:
@@ -271,3 +267,16 @@ def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
             webbrowser.open(address)
 
     (parts.serve_fleet if parts.is_fleet(folder) else parts.serve)(folder, port, ready)
+
+
+def list_scenarios() -> None:
+    """List the scenarios that are shipped."""
+    files = scenario_files()
+    shown = {name: parts.load_scenario(path).scenario for name, path in files.items()}
+    terminal.show("scenarios", "twin_master", shown=shown, folder=next(iter(files.values())).parent)
+
+
+def check_scenario(file: str, *, calibration: Path | None = None, json: bool = False) -> None:
+    """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
+    record = parts.check_scenario(parts.load_scenario(file), {"calibration": calibration})
+    terminal.answer("scenario check", "twin_master", record, json=json)

@@ -164,11 +164,8 @@ def fly_and_show(
 ) -> "parts.FleetOutcome":
     """Fly a fleet and print what became of it."""
     folder = out if out is not None else Path("runs") / fleet.head.name
-    try:
+    with terminal.interruptible(lambda: f"what was flown is kept in {folder}: repeat the command to go on"):
         outcome = parts.fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
-    except KeyboardInterrupt:
-        sentence = f"Interrupted; what was flown is kept in {folder}: repeat the command to go on."
-        raise terminal.failed(sentence, terminal.INTERRUPTED) from None
     if report:
         _report(outcome.folder)
     figures = _figures([outcome.folder])

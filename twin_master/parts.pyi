@@ -69,5 +69,6 @@ from twin_master.watch.feeds import is_broker as is_broker
 from twin_master.watch.folder import Watch as Watch
 from twin_master.watch.intake import listening as listening
 from twin_master.watch.opening import watch as watch
+from twin_master.workflow import check_scenario as check_scenario
 from twin_master.workflow import fly as fly
 from twin_master.workflow import resume as resume

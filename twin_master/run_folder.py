@@ -11,11 +11,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_text, remove_leftovers, write_members
-from reporting.folders import lock_folder, restore_folder, whole_folder
+from reporting.files import atomic_write_text, collect_provenance, remove_leftovers, write_members
+from reporting.folders import held, lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress
-from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError, said
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
@@ -84,8 +83,7 @@ def create_run_folder(
     if occupied and not replace:
         raise RunFolderError(said("run_folder.there", folder=folder))
     with ExitStack() as holding:
-        with whole_folder(folder, lock_run_folder) as fresh:
-            holding.callback(os.close, lock_run_folder(fresh))
+        with whole_folder(folder, lock_run_folder, holding) as fresh:
             write_members(fresh, files or {})
             atomic_write_text(fresh / CONFIG_NAME, to_json(config))
         yield
@@ -256,15 +254,6 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
         raise NotResumableError(said("mission.another", **there, path=loaded.path))
     with held(lock_run_folder(folder)):
         yield config, scenario.moved(folder)
-
-
-@contextmanager
-def held(lock: int) -> Iterator[None]:
-    """Let go of a folder at the end."""
-    try:
-        yield
-    finally:
-        os.close(lock)
 
 
 def restore(folder: Path, progress: Progress) -> None:

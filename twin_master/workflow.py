@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
-from reporting.files import atomic_write_text
+from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import AssetSource, calibrated_with, shown_without_noise
 from twin_master.assets.resolution import (
     Overrides,

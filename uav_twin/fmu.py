@@ -1,7 +1,4 @@
-"""`uav-twin fmu ...`, `uav-twin ssp ...`, the scenarios that fly FMUs, and libraries of what FMUs show.
-
-`uav-twin scenarios`, `uav-twin scenario check` and `uav-twin library sample`.
-"""
+"""`uav-twin fmu ...`, `uav-twin ssp ...`, and `uav-twin library sample`: what FMUs show."""
 
 import gc
 import re
@@ -18,7 +15,7 @@ from reporting import terminal
 from reporting.errors import ReportingError
 from reporting.files import atomic_write_bytes, atomic_write_text, refuse_existing
 from reporting.words import counted
-from scenarios import asset_scripts, scenario_files
+from scenarios import asset_scripts
 from uav_twin import parts
 from uav_twin.options import answer, said, show
 from uav_twin.structure import fmu as build_structure
@@ -299,19 +296,6 @@ def _draw(path: Path, history: "parts.ObservationHistory", columns: list[tuple[s
         atomic_write_bytes(path, (parts.to_svg if path.suffix == ".svg" else parts.to_png)(figure))
 
 
-def list_scenarios() -> None:
-    """List the scenarios that are shipped."""
-    files = scenario_files()
-    shown = {name: parts.load_scenario(path).scenario for name, path in files.items()}
-    show("scenarios", shown=shown, folder=next(iter(files.values())).parent)
-
-
-def check_scenario(file: str, *, calibration: Path | None = None, json: bool = False) -> None:
-    """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
-    record = parts.check_scenario(parts.load_scenario(file), {"calibration": calibration})
-    answer("scenario check", record=record, json=json)
-
-
 def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
     parts.checked_target(out, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
@@ -359,26 +343,27 @@ def sample(
         raise typer.BadParameter("give either --resume or --replace.", param_hint="--resume")
     if scenario is not None and role is not None:
         raise typer.BadParameter("the scenario says what is observed.", param_hint="--role")
-    try:
-        with tempfile.TemporaryDirectory(prefix="uav_twin_library_") as folder:
-            if scenario is not None:
-                wanted = parts.grid_of_scenario(
-                    parts.load_scenario(scenario),
-                    Path(folder),
-                    grid or (),
-                    overrides=parts.Overrides(seed=seed, fmu=fmu, binding=binding),
-                    settling_steps=settle,
-                )
-            elif fmu is None or binding is None:
-                raise typer.BadParameter("give a scenario, or --fmu and --binding.", param_hint="SCENARIO")
-            else:
-                wanted = parts.grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
-            found = parts.sample_library(
-                wanted, out, workers=workers, resume=resume, replace_existing=replace
+
+    def kept() -> str:
+        there = parts.blocks_folder(out).is_dir()
+        hint = "go on with the same command and --resume" if there else "nothing was sampled yet"
+        return f"finished blocks are kept: {hint}"
+
+    with (
+        terminal.interruptible(kept),
+        tempfile.TemporaryDirectory(prefix="uav_twin_library_") as folder,
+    ):
+        if scenario is not None:
+            wanted = parts.grid_of_scenario(
+                parts.load_scenario(scenario),
+                Path(folder),
+                grid or (),
+                overrides=parts.Overrides(seed=seed, fmu=fmu, binding=binding),
+                settling_steps=settle,
             )
-    except KeyboardInterrupt:
-        kept = parts.blocks_folder(out).is_dir()
-        hint = "go on with the same command and --resume" if kept else "nothing was sampled yet"
-        told = f"Interrupted; finished blocks are kept: {hint}."
-        raise terminal.failed(told, terminal.INTERRUPTED) from None
+        elif fmu is None or binding is None:
+            raise typer.BadParameter("give a scenario, or --fmu and --binding.", param_hint="SCENARIO")
+        else:
+            wanted = parts.grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
+        found = parts.sample_library(wanted, out, workers=workers, resume=resume, replace_existing=replace)
     show("library", found=found, library=found.library)

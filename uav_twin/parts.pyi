@@ -133,9 +133,9 @@ from reporting.figures import publication_style as publication_style
 from reporting.figures import save_figure as save_figure
 from reporting.figures import to_png as to_png
 from reporting.figures import to_svg as to_svg
+from reporting.files import collect_provenance as collect_provenance
+from reporting.files import hash_file as hash_file
 from reporting.json_file import plain as plain
-from reporting.provenance import collect_provenance as collect_provenance
-from reporting.provenance import hash_file as hash_file
 from reporting.table_file import table_text as table_text
 from reporting.toml_file import read_toml as read_toml
 from twin_master.assets.resolution import Overrides as Overrides
@@ -148,4 +148,3 @@ from twin_master.library.sampling import blocks_folder as blocks_folder
 from twin_master.library.sampling import sample_library as sample_library
 from twin_master.scenario.reading import load_scenario as load_scenario
 from twin_master.watch.opening import flown as flown
-from twin_master.workflow import check_scenario as check_scenario

@@ -137,7 +137,7 @@ def particle_filter(
         known = kernel_density(factors, normal_reference_bandwidth(factors), window)
         likelihood[pair] = np.interp(kept_at, *known)
         with np.errstate(divide="ignore"):  # a particle that no sample reaches has weight zero
-            log_weight += np.log(np.interp(particles, *known, left=0.0, right=0.0))
+            log_weight += np.log(np.interp(particles, *known))
         largest = float(log_weight.max())
         if largest == -math.inf:
             given = pair + 1, load, displacement * 1e3
@@ -202,7 +202,7 @@ class StaticCalibration:
     def before(self) -> ScalarPosterior:
         """The prior on a grid."""
         grid = np.linspace(-8.0, 8.0, 2001) * self.prior.standard_deviation + self.prior.mean
-        return ScalarPosterior(grid, self.prior.density(grid))
+        return ScalarPosterior(grid, np.exp(self.prior.log_density(grid)))
 
     @property
     def tip_stiffness_prior(self) -> ScalarPosterior:

@@ -21,9 +21,8 @@ from calibration.errors import CalibrationError, CalibrationRecordError, said
 from calibration.result.record import FROM_CAMPAIGN, FROM_LABORATORY, STATE, Calibration
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError, FileNotWrittenError
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, hash_bytes
 from reporting.netcdf import read_groups
-from reporting.provenance import hash_bytes
 from reporting.words import one_line
 
 FILE_NAME = "calibration.nc"

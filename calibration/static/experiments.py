@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibration.errors import ExperimentDataError, said
 from calibration.lab_folder import lab_table
 from reporting.arrays import Float
-from reporting.provenance import hash_record
+from reporting.files import hash_record
 
 STANDARD_GRAVITY = 9.81
 """Gravity by which the authors turn a mass on the scale into a load [m/s^2]."""

@@ -48,10 +48,6 @@ class GaussianPrior:
         standard = (np.asarray(value, dtype=float) - self.mean) / self.standard_deviation
         return np.asarray(-0.5 * standard**2 - math.log(self.standard_deviation * math.sqrt(2.0 * math.pi)))
 
-    def density(self, value: ArrayLike) -> Float:
-        """Return the density, elementwise."""
-        return np.exp(self.log_density(value))
-
     def quantile(self, probability: ArrayLike) -> Float:
         """Return quantiles, elementwise."""
         return np.asarray(self.mean + self.standard_deviation * ndtri(np.asarray(probability, dtype=float)))

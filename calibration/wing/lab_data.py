@@ -23,8 +23,7 @@ from calibration.static.experiments import (
     published_measurements,
     read_measurements,
 )
-from reporting.files import atomic_write_text
-from reporting.provenance import hash_file, hash_record
+from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.table_file import table_text
 
 WEIGHED_MASS_FILE = STEP_FOLDER / "weighed_mass.csv"

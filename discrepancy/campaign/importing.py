@@ -9,9 +9,9 @@ from discrepancy.campaign.reading import TABLE_ERRORS, assemble
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
-from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
+from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError, said
-from reporting.provenance import hash_record
+from reporting.files import hash_record
 from reporting.table_file import TextTable
 from reporting.words import be, counted, listing
 
@@ -180,7 +180,8 @@ class Understanding:
             if (quantity := self._quantity(head, role, unit)) is None:
                 return Column(sheet, head, role, unit)
             to_si = conversion_of(quantity, unit)
-            return Column(sheet, head, role, unit, UNITS[quantity].si, quantity, to_si)
+            si = unit if unit in NEVER_CONVERTED else UNITS[quantity].si
+            return Column(sheet, head, role, unit, si, quantity, to_si)
         except ValueError as cause:
             raise CampaignFileError(f"{sheet.name}, column {head!r}: {cause}; say another.") from None
 

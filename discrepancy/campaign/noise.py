@@ -210,6 +210,7 @@ def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
 SAME_INPUT = 1e-6
 """Inputs of two rows are the same if they differ by less than this share of the largest in the trial."""
 _LEAST_DEGREES = 3
+_LABELS = "kind", "run", "load_place", "noise_factor"
 
 
 def pre_trigger_record(samples: FloatArray, interval: float | None, name: str, source: str) -> NoiseRecord:
@@ -287,15 +288,21 @@ def repeated(trials: Sequence[Trial], channel: str) -> Iterator[tuple[list[Trial
 
 
 def _repeats(first: Trial, second: Trial) -> bool:
-    def labels(trial: Trial) -> tuple[object, ...]:
-        names = [item.name for item in trial.inputs]
-        return trial.kind, trial.run, trial.load_place, len(trial.time), trial.noise_factor, names
+    def acting(trial: Trial) -> dict[str, FloatArray]:
+        losses = zip(trial.regions, trial.health.T, strict=True)
+        return {
+            **{name: getattr(trial, name) for name in ("force", "load_factor", "temperature")},
+            **{f"input {item.name}": item.values for item in trial.inputs},
+            **{f"loss of {region}": loss for region, loss in losses if np.any(loss)},
+        }
 
-    def acting(trial: Trial) -> list[FloatArray]:
-        given = (trial.force, trial.load_factor, trial.temperature, trial.health)
-        return [*(item.values for item in trial.inputs), *given]
-
-    return labels(first) == labels(second) and all(
-        np.max(np.abs(one - other)) <= SAME_INPUT * np.max(np.abs(one))
-        for one, other in zip(acting(first), acting(second), strict=True)
+    one, other = acting(first), acting(second)
+    labels = (getattr(first, name) == getattr(second, name) for name in _LABELS)
+    return (
+        all(labels)
+        and len(first.time) == len(second.time)
+        and one.keys() == other.keys()
+        and all(
+            np.max(np.abs(one[name] - other[name])) <= SAME_INPUT * np.max(np.abs(one[name])) for name in one
+        )
     )

@@ -16,6 +16,8 @@ SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
 LAGS = 20
 """Largest number of autocorrelations in the Ljung-Box test."""
+LOOKED_AT = 0.25
+"""Share of a record up to which its autocorrelation is looked at."""
 LEAST_DRAWS = 8_000
 """Series that the distribution of its statistic is taken from."""
 
@@ -84,6 +86,28 @@ def lag_products(rows: FloatArray, lags: int) -> FloatArray:
     size = 2 * rows.shape[1]
     power = np.abs(np.fft.rfft(rows, size, axis=1)) ** 2
     return np.asarray(np.fft.irfft(power, axis=1)[:, : lags + 1])
+
+
+def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return the autocorrelation (K,) of records together from one sample on, and its variance for noise."""
+    lags = max(int(LOOKED_AT * max(len(item) for item in series)), 2)
+    products, pairs = np.zeros(lags + 1), np.zeros(lags + 1)
+    for item in series:
+        own = lag_products(item, min(lags, len(item) - 1))[0]
+        products[: len(own)] += own
+        pairs[: len(own)] += len(item) - np.arange(len(own))
+    return products[1:] / max(products[0], 1e-300), pairs[1:] / pairs[0] ** 2
+
+
+def times_fewer(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> float:
+    """Return how many times fewer independent samples there are, of an `autocorrelation`.
+
+    Chance takes as many times more of the squares (Bartlett 1946, Suppl. J. R. Stat. Soc. 8, 27-41). With a
+    `ratio`, of a part whose correlation is so many times that of the whole.
+    """
+    squares, by_chance = float(np.sum(rho**2)), float(np.sum(chance))
+    by_chance *= (1.0 + 2.0 * squares) / (1.0 + 2.0 * by_chance)
+    return max(1.0 + 2.0 * ratio**2 * (squares - by_chance), 1.0)
 
 
 def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:

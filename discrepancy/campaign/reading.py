@@ -27,7 +27,7 @@ from discrepancy.campaign.records import (
 from discrepancy.campaign.sampling import check_sampling, nearly_even, spacing_sentence
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError, said
-from reporting.provenance import hash_file, hash_record
+from reporting.files import hash_file, hash_record
 from reporting.table_file import TableErrors, TextTable, read_table
 from reporting.toml_file import read_toml
 from reporting.words import be, counted

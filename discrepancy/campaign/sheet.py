@@ -19,7 +19,7 @@ from pathlib import Path
 
 from discrepancy.campaign.units import conversion, quantities_of
 from discrepancy.errors import CampaignFileError, said
-from reporting.provenance import hash_file
+from reporting.files import hash_file
 from reporting.text_file import read_text
 from reporting.toml_file import shown
 from reporting.words import counted, listing, one_line

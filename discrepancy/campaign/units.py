@@ -14,7 +14,7 @@ from reporting.units import exact_meaning
 from reporting.words import listing
 
 _TABLES = Path(__file__).with_suffix(".toml")
-_NEVER_CONVERTED = {"degC", "°C", "K"}
+NEVER_CONVERTED = {"degC", "°C", "K"}
 """Temperatures: a campaign has one of the two for all."""
 
 
@@ -68,7 +68,7 @@ def conversion(unit: str, si: str) -> float:
 def conversion_of(quantity: Quantity, unit: str) -> float:
     """Return what one of a quantity's unit is in SI; raises ValueError with what is expected."""
     try:
-        if quantity is Quantity.TEMPERATURE and unit in _NEVER_CONVERTED:
+        if quantity is Quantity.TEMPERATURE and unit in NEVER_CONVERTED:
             return 1.0
         if quantity is Quantity.TEMPERATURE:
             raise ValueError

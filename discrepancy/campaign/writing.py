@@ -14,12 +14,13 @@ from discrepancy.campaign.records import (
     Channel,
     FloatArray,
     Hold,
+    InTables,
     RecordedInput,
     Start,
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.units import UNITS, conversion_of
+from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion_of
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
@@ -98,8 +99,10 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
     return table_text(columns)
 
 
-def _unit(channel: Channel, si: bool) -> str:
-    return UNITS[channel.quantity].si if si else UNITS[channel.quantity].written
+def _unit(item: InTables, si: bool) -> str:
+    if item.unit in NEVER_CONVERTED:
+        return item.unit
+    return UNITS[item.quantity].si if si else UNITS[item.quantity].written
 
 
 def _in_unit(values: FloatArray, channel: Channel, si: bool) -> FloatArray:
@@ -164,7 +167,7 @@ def _channel(channel: Channel, si: bool) -> Channel:
 
 def _input(item: RecordedInput) -> RecordedInput:
     reference = bool(item.quantity.moving) and item.hold is not Hold.SMOOTH
-    return replace(item, unit=UNITS[item.quantity].si, column="", reference=reference)
+    return replace(item, unit=_unit(item, True), column="", reference=reference)
 
 
 def _trial(campaign: Campaign, trial: Trial, file: str) -> schema.TrialSection:

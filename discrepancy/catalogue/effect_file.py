@@ -326,11 +326,11 @@ def _recipe(
     known = names | {name for name in SCALES if _OF_SHAPES.get(name, set()) <= names}
     values: dict[str, str | float | Expression] = {}
     when: dict[str, Expression] = {}
-    try:
+    with CatalogueError.instead_of(InvalidPatchError, before=f"{where}: "):
         for name, value in row.items():
             if name not in keys:
                 raise CatalogueError(f"{where} has the unknown key {name!r}; known are {', '.join(keys)}.")
-            text, place = value if isinstance(value, str) else repr(value), f"{where}: {name!r}"
+            text, place = value if isinstance(value, str) else repr(value), repr(name)
             if name not in types:
                 if name != "kind":
                     when[name] = Expression(text, known | moments if name in times else known, place)
@@ -342,9 +342,6 @@ def _recipe(
         # whether all values are there, with numbers in the place of expressions
         one = {name: "1" if name in primitive.courses else 1.0 for name in values}
         _primitive_of(kind, {n: one[n] if isinstance(v, Expression) else v for n, v in values.items()})
-    except InvalidPatchError as cause:
-        message = str(cause)
-        raise CatalogueError(message if message.startswith(where) else f"{where}: {message}") from cause
     written = [item for item in (*values.values(), *when.values()) if isinstance(item, Expression)]
     used = frozenset(name for item in written for name in item.used())
     return _Recipe(where, kind, values, when, used & SCALES.keys() - names, used & moments)

@@ -137,8 +137,7 @@ def _holds(campaign: Campaign, model: Model, trial: Trial) -> Iterator[DataFault
     curved = replace(trial, inputs=inputs, hold=Hold.SMOOTH if forced else trial.hold)
     conditions = prior_mean(campaign, model, trial)
     one, other = (observe(model, campaign, i, ModelPatch(), conditions).values for i in (trial, curved))
-    noises = [campaign.channels[name].noise for name in trial.channels]
-    known = [np.inf if noise is None else noise.standard_deviation for noise in noises]
+    known = [campaign.channels[name].noise_in(trial) or np.inf for name in trial.channels]
     sizes = np.sqrt(np.mean((one - other) ** 2, axis=0)) / known
     if (worst := sizes.max()) > MATTERS:
         told = {"names": ", ".join(map(repr, straight)), "where": trial.channels[int(sizes.argmax())]}

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise import MAINS, line_near, repeat_record, without_lines
-from discrepancy.campaign.noise_tests import lag_products
+from discrepancy.campaign.noise_tests import autocorrelation, times_fewer
 from discrepancy.campaign.records import (
     BoolArray,
     Campaign,
@@ -90,8 +90,7 @@ def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
 
 def _freedom(series: FloatArray) -> float:
     """Return the degrees of freedom of the variance of a series that is correlated in time."""
-    correlation = lag_products(series, len(series) // 4 - 1)[0]
-    return float(len(series) / (2.0 * np.sum((correlation / max(correlation[0], 1e-300)) ** 2) - 1.0))
+    return len(series) / times_fewer(*autocorrelation([series]))
 
 
 LEAST_HELD = 8

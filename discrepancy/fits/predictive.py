@@ -97,7 +97,7 @@ def _predicted(
                 noise_deviation=deviation,
                 predictive_deviation=deviation * np.sqrt(np.maximum(variance, 1e-9)),
                 leverage=leverage.reshape(shape),
-                rates=np.gradient(prediction, data.trial.interval, axis=0) if data.trial.is_dynamic else None,
+                rates=np.gradient(prediction, data.trial.time, axis=0) if data.trial.is_dynamic else None,
                 sensitivity=sensitive,
             )
         )

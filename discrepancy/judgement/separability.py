@@ -114,6 +114,11 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     return replace(ideal, channels=channels)
 
 
+def began_before(trial: Trial) -> bool:
+    """Whether a motion began before its record, in a state that only the data tell."""
+    return trial.begins is Start.UNKNOWN or bool(trial.release and not trial.release.at_rest)
+
+
 def begun(problem: Problem) -> Point:
     """Return the prior means, with the initial states that only the data tell, fitted with the model.
 
@@ -123,8 +128,7 @@ def begun(problem: Problem) -> Point:
         As `fit`.
     """
     start = problem.start(Candidate())
-    trials = [data.trial for data in problem.trials]  # some begin in a state that only their data tell
-    unknown = [i.begins is Start.UNKNOWN or (i.release and not i.release.at_rest) for i in trials]
+    unknown = [began_before(data.trial) for data in problem.trials]
     if not any(unknown):
         return start
     # parameters follow: beside a frequency that is off, what begins would fade out of the record

@@ -81,7 +81,8 @@ def predicted_frequencies(items: Sequence[FittedTrial]) -> tuple[float, ...]:
     longest = max(items, key=lambda item: len(item.trial.time))
     power = np.zeros((len(longest.trial.time) - 1) // 2)
     for item in items:
-        if len(item.trial.time) != len(longest.trial.time):
+        faster = item.trial.interval / longest.trial.interval
+        if len(item.trial.time) != len(longest.trial.time) or abs(faster - 1.0) > 1e-6:
             continue
         values = item.prediction - item.prediction.mean(axis=0)
         taper = np.hanning(2 * len(values))[len(values) :, np.newaxis]  # the start of a ring-down counts

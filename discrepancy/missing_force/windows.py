@@ -7,7 +7,7 @@ the channels in which the residuals of a fit are largest.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 
@@ -66,7 +66,8 @@ def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
     port = max(search.at, key=lambda name: search.at[name].log_evidence)
     laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
     law = search.followed(search.at[port], *fit.candidate.some(laws, fit.effect)) if laws else None
-    number, found = _most_telling(search.ports.index(port), search.rough(port))
+    channels = [data.trial.channels for data in problem.trials]
+    number, found = _most_telling(search.ports.index(port), search.rough(port), channels)
     if found.log_evidence < of_nothing(found) + GROUND:
         return ()
     best = events(found.view, number, found.processes[number], -np.inf if law is None else law.log_evidence)
@@ -74,7 +75,7 @@ def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
     for trial, motion in zip(found.view.trials, found.motions, strict=True):
         force = motion.forces[number]
         shown.append(trial.readings(trial.pushed(number, force), {number: force}))
-    return _windows(best, [data.trial.channels for data in problem.trials], shown, with_effect=False)
+    return _windows(best, channels, shown, with_effect=False)
 
 
 def residual_windows(
@@ -105,13 +106,17 @@ def residual_windows(
     return found
 
 
-def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
-    """Return the missing force, or what one channel shows where that tells more, and its port first."""
+def _most_telling(port: int, at: Explained, channels: Sequence[tuple[str, ...]]) -> tuple[int, Explained]:
+    """Return the missing force, or what one channel shows where that tells more, and its port first.
+
+    `channels` are those of each trial.
+    """
     view, best = at.view, (port, at)
     trials = view.trials
-    for channel in range(min(trial.residual.shape[1] for trial in trials)):
+    for channel in dict.fromkeys(chain(*channels)):
         motions = [replace(motion, forces={}, left={}) for motion in view.motions]
-        on_reading = replace(view, trials=[_reading(trial, channel) for trial in trials], motions=motions)
+        shown = [_reading(*pair, channel) for pair in zip(trials, channels, strict=True)]
+        on_reading = replace(view, trials=shown, motions=motions)
         length = max(float(np.ptp(trial.time)) for trial in trials)
         processes = [
             {0: Process(size, time * length, rough=True)}
@@ -123,10 +128,9 @@ def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
     return best
 
 
-def _reading(trial: SeenTrial, channel: int) -> SeenTrial:
+def _reading(trial: SeenTrial, channels: Sequence[str], channel: str) -> SeenTrial:
     """Return a trial whose only port is a reading; a unit of its force is the deviation of the noise."""
-    shown = np.zeros((1, len(trial.deviation)))
-    shown[0, channel] = -trial.deviation[channel]
+    shown = -trial.deviation[None] * (np.array(channels) == channel)
     still = np.zeros((len(trial.positions), 1))
     none = np.zeros((1, len(trial.system.generator)))
     system = replace(

@@ -28,8 +28,8 @@ from .strategy import Search
 
 LEVEL = 1e-3
 """p-value below which what is left is more than noise, or no white noise."""
-LAGS = 0.25
-"""Share of a record up to which its autocorrelation is looked at."""
+NEAR = 0.25
+"""Share of an interval by which that of a noise record may be another."""
 SWINGS = -0.25
 """Autocorrelation at its first minimum below which a process swings."""
 LIKE_RECORD = 3.0
@@ -56,17 +56,17 @@ def left_by(problem: Problem, found: CandidateFit) -> Remainder:
         larger = known > 0.0 and noise_tests.variance_p_value(left, freedom / fewer, known / fewer) < LEVEL
         if not larger and whiteness(series, used) > LEVEL:
             continue
-        rho, chance = _autocorrelation(series)
+        rho, chance = noise_tests.autocorrelation(series)
         of_noise[channel] = not larger and abs(rho[0] - colour) < LIKE_RECORD * np.sqrt(1.0 / counted + doubt)
         level = 1.0 if of_noise[channel] else max(left, 1.0) if known > 0.0 else left
-        factor[channel] = np.sqrt(level * max(1.0 + 2.0 * float(np.sum(rho**2 - chance)), 1.0))
+        factor[channel] = np.sqrt(level * noise_tests.times_fewer(rho, chance))
         beside = left / noise_of[channel] - 1.0
         if of_noise[channel] or beside <= 0.0:
             continue
         ratio = (1.0 + beside) / beside
         own = rho * ratio
         size[channel] = np.sqrt(beside)
-        time[channel] = interval * max(1.0 + 2.0 * float(np.sum(own**2 - ratio**2 * chance)), 1.0)
+        time[channel] = interval * noise_tests.times_fewer(rho, chance, ratio)
         first = int(np.argmax(np.diff(own) > 0.0))  # the first minimum
         if own[first] < SWINGS:
             frequency[channel] = 0.5 / ((first + 1) * interval)
@@ -114,17 +114,6 @@ def refitted(problem: Problem, wide: Problem, found: CandidateFit, **options: An
     )  # fmt: skip
 
 
-def _autocorrelation(series: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return the autocorrelation (K,) of records together from one sample on, and its variance for noise."""
-    lags = max(int(LAGS * max(len(item) for item in series)), 2)
-    products, pairs = np.zeros(lags + 1), np.zeros(lags + 1)
-    for item in series:
-        own = noise_tests.lag_products(item, min(lags, len(item) - 1))[0]
-        products[: len(own)] += own
-        pairs[: len(own)] += len(item) - np.arange(len(own))
-    return products[1:] / max(products[0], 1e-300), pairs[1:] / pairs[0] ** 2
-
-
 def _recorded_colour(
     problem: Problem, name: str, steps: list[FloatArray], interval: float
 ) -> tuple[float, float, float]:
@@ -137,16 +126,16 @@ def _recorded_colour(
     if record is None or record.samples is None or record.interval is None or not np.any(record.samples):
         return np.nan, 0.0, 1.0
     raw = record.samples - record.samples.mean()
-    if abs(record.interval - interval) > LAGS * interval:
+    if abs(record.interval - interval) > NEAR * interval:
         return np.nan, 0.0, 1.0
     found = []
     for item in steps:
         white = len(item) == 1
         values = noise.whiten(raw, record.interval) if white else raw
-        rho = noise_tests.lag_products(values, len(raw) // 4)[0] / float(values @ values)
-        beside = 0.0 if white else 2.0 * float(np.sum(rho[1:] ** 2 - 1.0 / len(raw)))
-        along = rho[1] if white else np.mean(np.interp(item / record.interval, np.arange(len(rho)), rho))
-        found.append((along, 1.0 / len(raw), 1.0 + max(beside, 0.0)))
+        rho, chance = noise_tests.autocorrelation([values])
+        at = np.interp(item / record.interval, np.arange(1 + len(rho)), np.r_[1.0, rho])
+        fewer = 1.0 if white else noise_tests.times_fewer(rho, chance)
+        found.append((float(rho[0] if white else np.mean(at)), 1.0 / len(raw), fewer))
     colour, doubt, fewer = np.mean(found, axis=0).tolist()
     return colour, doubt, fewer
 

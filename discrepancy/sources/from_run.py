@@ -30,10 +30,10 @@ from fmu_asset.door.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
 from reporting.errors import DamagedFileError
+from reporting.files import hash_file
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from reporting.netcdf import read_groups
-from reporting.provenance import hash_file
 from reporting.words import counted
 
 RUN_FILE, CONFIG_FILE = "run.nc", "config.json"

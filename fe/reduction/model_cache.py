@@ -26,9 +26,8 @@ from fe.structure.operators import assemble_structure, write_vtu
 from fe.structure.tables import StructureSettings
 from fe.wing.design import WingDesign, load_design
 from fe.wing.operators import AffineOperators, assemble
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, hash_bytes, hash_tree
 from reporting.progress import Progress, reporter
-from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
 

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from fmu_asset.errors import FmuInputError, FmuUnsupportedError, said, visible
+from fmu_asset.errors import BindingError, FmuInputError, FmuUnsupportedError, said, visible
 from fmu_asset.instances.plan import FmuIdentity, Interface
 from reporting.units import BASE_UNITS
 
@@ -248,6 +248,18 @@ class FmuDescription(FmuIdentity):
             for v in self.variables
             if v.causality in READABLE
         }
+
+    def step_of(self, given: float | None) -> float | None:
+        """Return a communication step size that is given, or the FMU's own; None where nothing says one.
+
+        Raises
+        ------
+        BindingError
+            If it is no positive number.
+        """
+        if given is not None and not (math.isfinite(given) and given > 0.0):
+            raise BindingError(f"The step size must be a positive number of seconds, and {given:g} came.")
+        return given or self.fixed_step or self.step_size
 
     def units_of(self, variable: VariableInfo) -> tuple[UnitInfo, ...]:
         """Return the definitions of units that hold for a variable."""

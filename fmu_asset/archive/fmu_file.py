@@ -17,7 +17,7 @@ from fmpy import platform_tuple, read_model_description, sharedLibraryExtension
 from fmu_asset.errors import FmuFileError, FmuUnsupportedError, said
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
-from reporting.provenance import hash_file
+from reporting.files import hash_file
 from reporting.words import one_line
 
 from .declared import FmuDescription, read_declared

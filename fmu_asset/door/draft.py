@@ -1,6 +1,5 @@
 """A first binding for an FMU nobody has bound yet: roles guessed from causality, names and units."""
 
-import math
 import re
 import tomllib
 from collections import Counter
@@ -48,8 +47,6 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     BindingError
         If the FMU has no number to observe.
     """
-    if step_size is not None and not (math.isfinite(step_size) and step_size > 0.0):
-        raise BindingError(f"The step size must be a positive number of seconds, and {step_size:g} came.")
     usable = [v for v in description.variables if bindable(v)]
     seen = observable(description, usable)
     reals = [v for v in seen if v.kind in FLOAT_KINDS]
@@ -64,7 +61,7 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
         "draft.toml",
         fmu=description,
         name=keys.of("binding", description.model_name),
-        step_size=step_size or description.fixed_step or description.step_size,
+        step_size=description.step_of(step_size),
         inputs=[(role, keys.of(role, v.name), v) for role, v in inputs],
         observed=[(keys.of("observation", _stem(group)), group) for group in _groups(observed)],
         parameters=[(keys.of("parameter", v.name), v) for v in chosen],

@@ -14,7 +14,7 @@ import numpy as np
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.errors import BindingError, FmuInputError, said
-from fmu_asset.instances.plan import Floats
+from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table, table_text
 
@@ -23,7 +23,7 @@ from .draft import bindable, observable
 from .layout import ObservationHistory
 from .session import FmiAsset
 
-Roles = dict[str, dict[str, Floats]]
+Roles = dict[str, dict[str, Float]]
 """Inputs of N steps by role and name, (N,) or (N, n) for an array: what `FmiAsset.simulate` takes."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]", re.DOTALL)
@@ -55,9 +55,16 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, Roles]:
     """
     table = read_table(path, TableErrors(FmuInputError, FmuInputError))
     time = table.numbers(_TIME, "a simulation")
-    _check_time(path, time, binding)
-    names = _input_names(binding)
-    columns: dict[tuple[str, str], dict[int, Floats]] = {}
+    wanted = binding.binding.start_time + binding.interval * np.arange(len(time))
+    for step in np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval).tolist():
+        times = time[step], wanted[step]
+        raise FmuInputError(said("inputs.times", path=path, times=times, step=step, binding=binding))
+    keys = [(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
+    keys += [("port", f"{name}.{item}") for name, port in binding.port.items() for item in port.quantities]
+    named = Counter(name for _, name in keys)
+    # A column may be called by the name alone where it is of one role.
+    names = {key[1]: key for key in keys if named[key[1]] == 1} | {".".join(key): key for key in keys}
+    columns: dict[tuple[str, str], dict[int, Float]] = {}
     for column in table.columns:
         if column == _TIME:
             continue
@@ -106,23 +113,6 @@ def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history:
     observed = dict(zip(asset.binding.observation_variables, history.values.T, strict=True))
     observed[_TIME] = history.time
     atomic_write_text(path, table_text({_TIME: history.time, **observed, **(history.extra | observed)}))
-
-
-def _check_time(path: Path, time: Floats, binding: Binding) -> None:
-    wanted = binding.binding.start_time + binding.interval * np.arange(len(time))
-    wrong = np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval)
-    if wrong.size:
-        step = int(wrong[0])
-        times = time[step], wanted[step]
-        raise FmuInputError(said("inputs.times", path=path, times=times, step=step, binding=binding))
-
-
-def _input_names(binding: Binding) -> dict[str, tuple[str, str]]:
-    """Return role and name by what a column may be called."""
-    keys = [(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
-    keys += [("port", f"{name}.{item}") for name, port in binding.port.items() for item in port.quantities]
-    times = Counter(name for _, name in keys)
-    return {key[1]: key for key in keys if times[key[1]] == 1} | {".".join(key): key for key in keys}
 
 
 def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:
@@ -200,13 +190,12 @@ def default_experiment(
     Raises
     ------
     BindingError
-        If the FMU has no number to observe, or no parameter or input of a name.
+        If the FMU has no number to observe, or no parameter or input of a name, or the step is not positive.
     FmuInputError
         If the end does not come after the start, or the steps are too many.
     """
     end = description.stop_time if stop_time is None else stop_time
-    size = step_size or description.fixed_step or description.step_size
-    steps, size = _steps_to(description.start_time or 0.0, end, size)
+    steps, size = _steps_to(description.start_time or 0.0, end, description.step_of(step_size))
     binding = whole_binding(description, step_size=size)
     structural = [v.name for v in description.variables if v.causality == "structuralParameter"]
     values = values or {}
@@ -246,7 +235,7 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
     return Binding(
         binding=Header(
             name=description.model_name or "fmu",
-            step_size=step_size or description.fixed_step or description.step_size or 1.0,
+            step_size=description.step_of(step_size) or 1.0,
             start_time=description.start_time or 0.0,
             interface=description.interface,
         ),

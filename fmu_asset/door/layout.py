@@ -11,7 +11,8 @@ import numpy as np
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError, said
-from fmu_asset.instances.plan import Floats, Group, Settings
+from fmu_asset.instances.plan import Group, Settings
+from reporting.arrays import Float
 
 from .binding import Binding
 from .units import IDENTITY, Conversion
@@ -187,7 +188,7 @@ class Slot(NamedTuple):
         """Whether it takes whole numbers only."""
         return self.variable.kind not in FLOAT_KINDS
 
-    def numbers(self, given: Any, *, history: bool = False) -> Floats:
+    def numbers(self, given: Any, *, history: bool = False) -> Float:
         """Return values in the FMU's unit, all of them checked.
 
         Parameters
@@ -291,7 +292,7 @@ class Observation(NamedTuple):
         Monitors, recorded variables and outputs of ports.
     """
 
-    values: Floats
+    values: Float
     time: float
     extra: dict[str, float]
 
@@ -313,9 +314,9 @@ class ObservationHistory:
         for, and the last time is where it ended, within a step perhaps.
     """
 
-    time: Floats
-    values: Floats
-    extra: dict[str, Floats]
+    time: Float
+    values: Float
+    extra: dict[str, Float]
     ended: str = ""
 
 
@@ -345,21 +346,21 @@ class OutputTable:
         scales = np.array(conversions).reshape(-1, 2).T
         self._scale = None if all(item == IDENTITY for item in conversions) else scales
 
-    def _converted(self, values: Floats) -> Floats:
+    def _converted(self, values: Float) -> Float:
         """Return values in the binding's units; never a view."""
         if self._scale is None:
             return values.copy()
-        converted: Floats = (values - self._scale[1]) / self._scale[0]
+        converted: Float = (values - self._scale[1]) / self._scale[0]
         return converted
 
-    def observation(self, block: Floats, time: float) -> Observation:
+    def observation(self, block: Float, time: float) -> Observation:
         """Return what a block (n_outputs,) of a moment [s] holds."""
         values = self._converted(block[self._index])
         # Both are of one table; to compare their lengths would take as long as the rest of the line.
         extra = dict(zip(self._extra, values[self._observed :].tolist()))  # noqa: B905
         return Observation(values[: self._observed], time, extra)
 
-    def history(self, time: Floats, blocks: Floats, ended: str = "") -> ObservationHistory:
+    def history(self, time: Float, blocks: Float, ended: str = "") -> ObservationHistory:
         """Return what the blocks (N, n_outputs) of moments (N,) [s] hold; `ended` as in the history."""
         values = self._converted(blocks[:, self._index])
         extra = np.ascontiguousarray(values[:, self._observed :].T)

@@ -23,9 +23,10 @@ from fmu_asset.errors import FmuCallError, FmuError, FmuInputError, said
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.base import FmuInstance, forget_modules
 from fmu_asset.instances.co_simulation import open_instance
-from fmu_asset.instances.plan import Floats, Instance, Plan, Settings
+from fmu_asset.instances.plan import Instance, Plan, Settings
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
+from reporting.arrays import Float
 from reporting.toml_file import checked
 
 from .binding import Binding
@@ -100,9 +101,9 @@ class ResetTrial:
     lies: bool = False
     way: Way = Way.RESET
     first: tuple[Start, bytes] | None = None
-    reply: Floats = field(default_factory=lambda: np.empty(0))
+    reply: Float = field(default_factory=lambda: np.empty(0))
 
-    def first_step(self, instance: Instance) -> Floats:
+    def first_step(self, instance: Instance) -> Float:
         """Return the outputs (n,) of an instance that is started and asked as the first one."""
         assert self.first is not None
         start, request = self.first
@@ -116,7 +117,7 @@ class ResetTrial:
         self.works, self.way = False, Way.RENEWAL
         self.fault = "It cannot be reset; every start takes a new instance."
 
-    def agrees(self, path: Path, way: Way, reply: Floats) -> bool:
+    def agrees(self, path: Path, way: Way, reply: Float) -> bool:
         """Return whether a start can be believed; if not, say it once and turn to the next way for good.
 
         Parameters
@@ -253,7 +254,7 @@ class Housing:
         start.make(instance)
         return instance
 
-    def contradicted(self, request: bytes, reply: Floats) -> Instance | None:
+    def contradicted(self, request: bytes, reply: Float) -> Instance | None:
         """Return another instance at its start if a flight's first step is not that of a new instance.
 
         Parameters

@@ -5,7 +5,8 @@ from typing import Self
 import numpy as np
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, said
-from fmu_asset.instances.plan import Floats, Instance
+from fmu_asset.instances.plan import Instance
+from reporting.arrays import Float
 from reporting.progress import Progress, Stage, reporter
 
 from .exchange import Histories, Values, plain_values
@@ -204,7 +205,7 @@ class FmiAsset(OpenedFmu):
         sentence = "" if ended is None else ended.sentence
         return self._exchange.outputs.history(moments[1:], replies, sentence)
 
-    def _run(self, rows: Floats, replies: Floats, stage: Stage) -> FmuEndedError | None:
+    def _run(self, rows: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
         """Make a block of steps; whatever happens, the asset is where the last complete one has left it.
 
         Return how the FMU has ended its simulation, if it has.
@@ -319,7 +320,12 @@ class FmiAsset(OpenedFmu):
         try:
             if replayed:
                 for index in range(saved.index):
-                    self._replay(saved.body[index * width : (index + 1) * width])
+                    inputs = saved.body[index * width : (index + 1) * width]
+                    self._request[0], self._request[1] = self.time, self._step_size
+                    self._request.cast("B")[16:] = inputs
+                    instance.step()
+                    self.step_index += 1
+                    self._record.append(inputs)
             else:
                 instance.restore(saved.body)
                 self.step_index = saved.index
@@ -363,13 +369,6 @@ class FmiAsset(OpenedFmu):
             or (saved.method == "replay" and len(saved.body) != width * saved.index)
         ):
             raise FmuStateError(said("state.damaged"))
-
-    def _replay(self, inputs: bytes) -> None:
-        self._request[0], self._request[1] = self.time, self._step_size
-        self._request.cast("B")[16:] = inputs
-        self._instance.step()
-        self.step_index += 1
-        self._record.append(inputs)
 
     def _outputs_now(self) -> bytes:
         """Return the outputs of this moment as the FMU gives them."""

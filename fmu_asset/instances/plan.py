@@ -9,7 +9,8 @@ from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
-import numpy.typing as npt
+
+from reporting.arrays import Float
 
 Interface = Literal["co-simulation", "model-exchange"]
 
@@ -19,7 +20,6 @@ SOLVER_TOLERANCE = 1e-6
 REPORT_PERIOD = 0.02
 """Seconds after which many steps report what is done, at the end of the step that is being made."""
 
-Floats = npt.NDArray[np.float64]
 Settings = list[tuple[str, int, list[float]]]
 """FMI base type, value reference, values: one for a scalar, all elements for an array."""
 
@@ -129,7 +129,7 @@ _C_TYPES: dict[str, Any] = {
 _BOOLEANS: dict[int, Any] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctypes.c_bool}
 
 
-def values_of(block: Any) -> Floats:
+def values_of(block: Any) -> Float:
     """Return a ctypes array of doubles as an array that shares its memory."""
     return np.frombuffer(memoryview(block).cast("B"))
 
@@ -306,7 +306,7 @@ class Instance(Protocol):
             If the instance was lost to an earlier fatal error.
         """
 
-    def run(self, requests: Floats, replies: Floats, report: Callable[[int], object]) -> None:
+    def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
         """Make many steps; end after one whose outputs are not all finite.
 
         Parameters

@@ -29,8 +29,7 @@ from fe.runtime.arrays import archive_bytes
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
 from fmu_asset.errors import FmuBuildError, FmuError, said
 from fmu_asset.slaves.variables import FmuVariable
-from reporting.files import atomic_write_bytes, members_of
-from reporting.provenance import hash_members
+from reporting.files import atomic_write_bytes, hash_members, members_of
 from reporting.text_file import read_bytes
 from reporting.units import BASE_UNITS
 

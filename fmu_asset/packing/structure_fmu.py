@@ -38,8 +38,8 @@ from fmu_asset.errors import FmuBuildError, PatchFileError, said
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
+from reporting.files import hash_members
 from reporting.progress import Progress
-from reporting.provenance import hash_members
 
 from .contents import (
     FmuInfo,

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel, StaticResponse
@@ -28,7 +28,6 @@ from .variables import TRANSIENT, FmuVariable
 if TYPE_CHECKING:
     from .effects import Acting, Effects
 
-FloatArray = npt.NDArray[np.float64]
 
 BOUND, POINT_OR_BOUND, MODES = range(3)
 """Groups of outputs that are computed when they are read."""

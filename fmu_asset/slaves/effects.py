@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES, HighPass, ModelPatch
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
@@ -23,8 +23,6 @@ from fe.runtime.wing_rows import PatchArrays
 
 from .base import UnacceptableValuesError
 from .variables import FmuVariable, Table
-
-FloatArray = npt.NDArray[np.float64]
 
 TEMPERATURE = "temperature_difference"
 """Input of FMUs with an effect of temperature: the wing's temperature less the reference temperature [K]."""

@@ -186,10 +186,8 @@ class _Tree:
             to, *given = (repr(str(end)) for end in (target, self._edges[target].source, source))
             raise self._error(said("coupling.two_sources", target=to, given=given))
         scale = self._transformation(element, f"the connection from {source} to {target}")
-        convert, delayed = (
-            not _flag(element, "suppressUnitConversion"),
-            _flag(_annotation(element), "delayed"),
-        )
+        convert = not _flag(element, "suppressUnitConversion")
+        delayed = _flag(_annotation(element), "delayed")
         self._edges[target] = Connection(source, target, *scale, convert, delayed)
 
     def _transformation(self, element: Any, where: str) -> Conversion:

@@ -14,7 +14,8 @@ from pydantic import Field
 from fmu_asset import errors
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError, said
 from fmu_asset.folders import remove_folder
-from fmu_asset.instances.plan import REPORT_PERIOD, Floats, Instance, Plan, Settings
+from fmu_asset.instances.plan import REPORT_PERIOD, Instance, Plan, Settings
+from reporting.arrays import Float
 from reporting.toml_file import Positive, Section
 
 from .process import CLOSE_LIMIT, WorkerProcess
@@ -135,7 +136,7 @@ class WorkerInstance(Instance):
         self._fill(self._reply)
         self.lost = False
 
-    def run(self, requests: Floats, replies: Floats, report: Callable[[int], object]) -> None:
+    def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
         """Make many steps; each may take the time of a step."""
         self._ask(Question.CALL, "run", self._pickled("run", requests))
         target, size, filled, more = replies.data.cast("B"), replies[0].nbytes, 0, True

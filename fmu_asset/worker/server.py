@@ -17,7 +17,7 @@ import numpy as np
 from fmu_asset.errors import FmuError, FmuWorkerError
 from fmu_asset.instances.base import FmuInstance
 from fmu_asset.instances.co_simulation import open_instance
-from fmu_asset.instances.plan import Floats
+from reporting.arrays import Float
 
 from .protocol import HEADER, Answer, Exit, Question, joined, look, receive, send
 
@@ -166,7 +166,7 @@ def _called(
     return b""
 
 
-def _run(instance: FmuInstance, requests: Floats, answer: Callable[[int, bytes], None]) -> None:
+def _run(instance: FmuInstance, requests: Float, answer: Callable[[int, bytes], None]) -> None:
     """Make many steps, and send the replies in parts."""
     replies, sent = np.empty((len(requests), len(instance.reply))), 0
 

@@ -144,7 +144,7 @@ def test_refusals_of_masses(changed, words):
 def gaussian(mean=1.0, deviation=0.02, size=2001):
     prior = GaussianPrior(mean, deviation)
     grid = mean + deviation * np.linspace(-10.0, 10.0, size)
-    return prior, ScalarPosterior(grid, prior.density(grid) * 7.0)
+    return prior, ScalarPosterior(grid, np.exp(prior.log_density(grid)) * 7.0)
 
 
 def test_moments_quantiles_and_intervals_of_a_gaussian():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reporting import provenance
+from reporting import files as provenance
 from reporting.json_file import plain
 from reporting.memory import Memory
 

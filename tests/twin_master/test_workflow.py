@@ -15,7 +15,7 @@ import pytest
 
 from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
-from tests.twin_master.runs import check_same, cut_off_after, figures_of, noted, written
+from tests.twin_master.runs import check_same, cut_off_after, noted, written
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
@@ -116,7 +116,7 @@ def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path, librar
     kept = "first" if moves == 1 else "second"
     assert kept in (folder / "config.json").read_text(encoding="utf-8")
     assert (folder / "notes.txt").exists() is (moves == 1)
-    assert not list(tmp_path.glob(".*.replaced-*"))
+    assert not list(tmp_path.glob(".*"))
     assert restore_folder(folder) is False
 
 
@@ -135,22 +135,6 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
         for file in ("timing.json", "summary.json"):
             written(tmp_path, DEEP if file == name else "{}", name=file)
         assert finished_run(tmp_path) is None
-
-
-def test_what_a_run_folder_holds(flown):
-    folder = flown.folder
-    tree = open_run(folder)
-    groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
-    assert set(tree.children) == groups
-    for group in tree.children.values():
-        for name, variable in group.data_vars.items():
-            assert variable.attrs["units"], name
-            assert variable.attrs["long_name"], name
-    assert tree["filtered"]["sensors_received"].values[36] == 0
-    assert int(tree.attrs["seed"]) == 2021
-    assert "seconds" not in (folder / "summary.json").read_text(encoding="utf-8")
-    assert figures_of(folder)["blind_steps"] == "36, 37"
-    assert json.loads((folder / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
 
 
 def test_the_field_of_a_belief_that_rounds_beyond_the_last_level():
@@ -192,6 +176,9 @@ def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, turns):
 
 def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, tmp_path, monkeypatch):
     whole = Path(shutil.copytree(flown.folder, tmp_path / "whole"))
+    groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
+    assert {*open_run(whole).children} == groups
+    assert json.loads((whole / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
 
     def report(folder: Path) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")

@@ -1,25 +1,36 @@
-"""The command line: `run`, `scenario check` and `wing verify`, and how it ends when something is wrong."""
+"""The command line and the one name to import: what commands say and refuse, what `uav_twin` hands on."""
 
+import ast
 import json
 import os
+import pydoc
 import re
+import shlex
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+import uav_twin
 from benchmarks import command_page
 from fe.verification import wing_checks
 from fe.verification.wing_checks import Check
 from reporting import terminal
-from scenarios import scenario_files
+from scenarios import scenario_files, structure_files
 from tests.command_line import command, refused, said
+from tests.conftest import synthetic_calibration
+from tests.discrepancy.rigs import measured
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
+from tests.uav_twin.test_discrepancy import TWO
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.workflow import check_scenario
-from uav_twin import assemble, cli, load_design, load_scenario
+from uav_twin import _HOMES, assemble, cli, load_design, load_scenario
 
 
 def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]:
@@ -175,3 +186,185 @@ def test_every_check_of_a_coarse_wing_is_kept_and_convergence_names_every_gauge(
     assert names[:3] == ["tip stiffness", "first bending", "second bending"]
     assert [name for name in names if name.startswith("gauge ")] == [f"gauge {n}" for n in range(1, 25)]
     assert all("order" in check.note or "monotone" in check.note for check in checks[:3])
+
+
+INPUTS = Inputs(__file__)
+RIG = "--model single_mass_rig"
+ROWS = [row for name in INPUTS.table("refused.toml") for row in INPUTS.refused(name)]
+ROWS += [(f"{line} --in-process", *rest) for line, *rest in INPUTS.refused("structural")]
+TOLD = INPUTS.table("told.toml")["rows"]
+
+
+@pytest.fixture(scope="module")
+def folder(
+    tmp_path_factory: pytest.TempPathFactory, foreign_fmu: Callable[..., Path], library_file: Path
+) -> Path:
+    """The files that the table names."""
+    place = tmp_path_factory.mktemp("refused")
+    for name in ("filled", "none", "lab/step1", "pairs/step2"):
+        (place / name).mkdir(parents=True)
+    library = f'[asset]\nkind = "strain_library"\nfile = "{library_file}"\n\n[belief]\nkind = "asset"\n\n'
+    text = text_of("level_turns")
+    flown = text[text.index("[asset]") : text.index("[calibration]")]
+    for name, content in {
+        "a file": "x", "filled/mine.txt": "mine", "pairs/step2/pairs.csv": "x", "broken.toml": "format = 3",
+        "bad.ssp": "nothing", "bar.inp": INPUTS.text("bar.inp"), "bar.toml": INPUTS.text("bar.toml"),
+        "library.toml": text.replace(flown, library), "pull.csv": TWO["pull.csv"].decode(),
+        "filled/pull.csv": TWO["pull.csv"].decode(),
+        "run.nc": "", "misspelt.csv": "turn,strian_24\n0,1e-4\n", "lines.jsonl": "{}\n",
+        "torn.toml": "mass = [", "half.toml": "name = 'half a wing'",
+        "hole.csv": "F [N];Weg [mm]\n1;0,5\n;0,75\n3;0,8\n",
+        "back.csv": "t [ms];Weg [mm]\n" + "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14)),
+        "room.toml": INPUTS.text("room.toml"), "cold.csv": "time,outside\n120,5\n180,-41\n",
+        "my_part.toml": structure_files()["bracket"].read_text(encoding="utf-8"),
+    }.items():  # fmt: skip
+        (place / name).write_text(content, encoding="utf-8")
+    for name, model in (("ball", "ball2"), ("sized", "resize3"), ("room", "room2")):
+        shutil.copy(foreign_fmu(model), place / f"{name}.fmu")
+    said("discrepancy", "example", "static", place / "campaign", *RIG.split(), "--seed", "3")
+    return place
+
+
+@pytest.mark.parametrize(("line", "sentence", "code"), ROWS, ids=[" ".join(row[:2]) for row in ROWS])
+def test_what_is_wrong_is_one_sentence_with_its_exit_code(
+    folder, heat_exchanger, monkeypatch, line, sentence, code
+):
+    monkeypatch.chdir(folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    line = line.replace("RIG", RIG).replace("FOULING", shlex.quote(str(heat_exchanger / "fouling.toml")))
+    assert sentence in refused(*shlex.split(line), code=code)
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+@pytest.mark.parametrize(("line", "words"), TOLD, ids=[row[0] for row in TOLD])
+def test_what_is_said(folder, monkeypatch, line, words):
+    monkeypatch.chdir(folder)
+    text = said(*shlex.split(line))
+    assert [word for word in words if word not in text] == []
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_every_name_is_there_under_its_own_name_and_documented():
+    tree = ast.parse(Path(uav_twin.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    told = {}
+    for line in tree.body[1:]:
+        assert isinstance(line, ast.ImportFrom)
+        (alias,) = line.names
+        assert alias.asname == alias.name  # which type checkers take as handed on
+        told[alias.name] = line.module
+    assert told == _HOMES
+    assert 15 <= len(uav_twin.__all__) <= 45
+    assert set(uav_twin.__all__) <= set(dir(uav_twin))
+    # The import of a module of the command line would take the place of a name like it.
+    assert not {path.stem for path in Path(uav_twin.__file__).parent.glob("*.py")} & {*uav_twin.__all__}
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    for name in uav_twin.__all__:
+        found = getattr(uav_twin, name)
+        assert (callable(found), found.__name__) == (True, name)
+        assert found.__doc__, name
+        assert f"`{name}`" in page, name
+        text = pydoc.plaintext.document(found)
+        assert f"class {name}" in text or f"{name}(" in text
+    with pytest.raises(AttributeError, match=r"no attribute 'simulate_fmu'.*load_design"):
+        uav_twin.simulate_fmu  # noqa: B018
+
+
+MODULE, NAME = "import uav_twin; uav_twin.load_design()", "from uav_twin import load_design; load_design()"
+
+
+@pytest.mark.parametrize(
+    ("hidden", "words"),
+    [
+        ("fe.py", ("-c", MODULE)),
+        ("scenarios/__init__.py", ("-c", NAME)),
+        ("scenarios/mine.txt", ("-c", MODULE)),
+        ("fe.py", ("-m", "uav_twin", "wing")),
+    ],
+)
+def test_a_file_that_hides_a_package_is_named(hidden, words, tmp_path):
+    """A folder without `__init__.py` hides ours in editable installs only; else it is left in peace."""
+    (tmp_path / hidden).parent.mkdir(exist_ok=True)
+    (tmp_path / hidden).write_text("", encoding="utf-8")
+    line = [sys.executable, *words]
+    found = subprocess.run(line, cwd=tmp_path, check=False, capture_output=True, text=True)
+    if hidden == "scenarios/mine.txt" and not found.returncode:
+        return
+    assert found.returncode == 1
+    *before, last = found.stderr.strip().splitlines()
+    name, place = Path(hidden).parts[0].removesuffix(".py"), tmp_path / Path(hidden).parts[0]
+    assert last.startswith("uav_twin.shadowing.ShadowedPackageError: ") or not before
+    assert (found.stdout, bool(before)) == ("", "-c" in words)
+    assert f"{place} hides the package `{name}` of uav-twin" in last
+    assert "rename it" in last
+
+
+def test_records_show_themselves_in_a_few_words(library_file):
+    from calibration.wing.calibrate import WingCalibration
+    from discrepancy.document import Origin
+    from discrepancy.files.verdict import StoredVerdict
+    from discrepancy.models.fmu import FmuModel
+    from discrepancy.models.interface import Model
+    from discrepancy.models.structures import WingModel
+    from discrepancy.verdict import Verdict, VerdictKind
+    from discrepancy.workflow import Investigation
+
+    campaign, model = measured()
+    verdict = Verdict(VerdictKind.NOTHING_MISSING, "Nothing.", 0.9, 0.0)
+    wing = synthetic_calibration()
+    knowledge = uav_twin.prepare_twin("level_turns", {"strain_library": library_file})
+    shown: list[tuple[object, tuple[str, ...]]] = [
+        (campaign, (campaign.name, "trials=", "channels=")),
+        (model, ("LumpedModel", "parameters=")),
+        (verdict, ("nothing missing", "0.9")),
+        (Investigation(campaign, model, (), verdict), ("Verdict(", model.name)),
+        (StoredVerdict(verdict, None, Origin("A rig", "A model", *[""] * 3, {})), ("Verdict(", "A rig")),
+        (wing, (wing.asset, "samples=40")),
+        (WingCalibration(wing, wing, "joint", *[None] * 4), ("Calibration(", "joint")),  # type: ignore[arg-type]
+        (uav_twin.load_scenario("level_turns"), ("level_turns.toml",)),
+        (knowledge, ("level_turns", "GraphicalModel(", "GaussianSensorModel(")),
+        (knowledge.model, ("states=", "controls=2 (2g, 3g)")),
+        (knowledge.sensor_model, ("draws=", "sensors=")),
+        (knowledge.twin(), ("turns=0", "GraphicalModel(")),
+        (uav_twin.load_design(), ("regions=2 (z1, z2)", "gauges=24")),
+    ]
+    for record, words in shown:
+        text = repr(record)
+        assert text.startswith(f"{type(record).__name__}(")
+        assert len(text) < 400
+        assert "array(" not in text
+        for word in words:
+            assert word in text, text
+    assert FmuModel.__repr__ is WingModel.__repr__ is Model.__repr__
+
+
+def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path, library_file, monkeypatch):
+    from twin_master.errors import InvalidModelError, MissionInputError, NotResumableError
+
+    monkeypatch.setattr("twin_master.workflow._report", None)  # none is drawn where none is asked for
+    flown = {"strain_library": library_file}
+    known = uav_twin.prepare_twin("level_turns", flown)
+    controls = known.model.controls
+    gentle = np.zeros((known.model.states.size, len(controls)))
+    gentle[:, 0] = 1.0
+    folder = tmp_path / "run"
+    with pytest.raises(InvalidModelError, match="expected a policy of shape"):
+        uav_twin.fly("level_turns", folder, flown, policy=np.ones((3, 1)))
+    with pytest.raises(MissionInputError, match="'sead' is not a key"):
+        uav_twin.fly("level_turns", folder, {"sead": 1})
+    assert not folder.exists()
+    uav_twin.fly("level_turns", folder, flown, policy=gentle, report=False)
+    run = uav_twin.open_run(folder)
+    np.testing.assert_array_equal(np.load(folder / "policy.npy"), gentle)
+    assert not run["policy"]["control_index"].values.any()
+    first = int(run["observed"]["control_index"][0])
+    assert run["observed"]["control_index"].values[1:].tolist() == [0] * (len(run["observed"]["step"]) - 1)
+    assert first == controls.index(known.scenario.mission.first_control)
+    before = (folder / "run.nc").read_bytes()
+    uav_twin.resume(folder, report=False)
+    assert (folder / "run.nc").read_bytes() == before
+    (folder / "run.nc").unlink()  # a run that is finished is not flown again
+    np.save(folder / "policy.npy", gentle[:, ::-1])
+    with pytest.raises(NotResumableError, match="policy changed"):
+        uav_twin.resume(folder, report=False)

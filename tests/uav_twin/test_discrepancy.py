@@ -84,7 +84,6 @@ def test_a_folder_of_files_becomes_the_campaign():
     origin = next(remark for remark in read.remarks if "release 1.csv" in remark)
     assert "Imported from release 1.csv (SHA-256 " in origin
     assert "'Zeit' [ms] is time, 'Weg' [mm] is displacement and 'Dehnung' [µm/m] is leaf_strain" in origin
-    said("discrepancy", "check", "lab", "--model", MODEL)
 
 
 TWO = {

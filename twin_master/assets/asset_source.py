@@ -19,9 +19,8 @@ import numpy as np
 
 from fmu_asset.errors import FmuCallError
 from reporting.arrays import Float
-from reporting.files import write_members
+from reporting.files import hash_file, write_members
 from reporting.progress import Progress
-from reporting.provenance import hash_file
 from reporting.text_file import read_bytes
 from twin_master.assets.parameter import ParameterDraws, draw_parameter
 from twin_master.errors import MissionInputError, said

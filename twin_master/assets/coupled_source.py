@@ -16,9 +16,8 @@ from fmu_asset.coupling.structure import (
     expand_connection,
 )
 from fmu_asset.door.binding import Binding, expand
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, hash_file
 from reporting.progress import Progress
-from reporting.provenance import hash_file
 from reporting.toml_file import Fault, Number, Positive
 from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource, Session

@@ -13,8 +13,8 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
 from reporting.arrays import Float
+from reporting.files import hash_file
 from reporting.progress import Progress
-from reporting.provenance import hash_file
 from reporting.toml_file import Fault, Number, Positive
 from twin_master.assets.asset_source import (
     BINDING_COPY,

@@ -17,9 +17,8 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, hash_file
 from reporting.progress import Progress
-from reporting.provenance import hash_file
 from twin_master.assets.asset_source import OBSERVATIONS_COPY, AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
@@ -168,10 +167,6 @@ class ObservationLibrary:
         share = np.array([np.interp(draws, nodes, own) for own in np.eye(len(nodes))])
         return np.tensordot(share.T, self.values[order], axes=1)
 
-    def holds_draws(self, draws: Float) -> bool:
-        """Return whether every value of the parameter was sampled, so that nothing is interpolated."""
-        return bool(np.isin(draws, self.draws).all())
-
 
 def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
     """Write a library in one step; equal libraries give equal bytes.
@@ -310,7 +305,7 @@ class LibrarySource(AssetSource):
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter, from the calibration of the scenario."""
         draws = self._model.draws(seed)
-        if not self.library.parameter or self.library.holds_draws(draws.values):
+        if not self.library.parameter or np.isin(draws.values, self.library.draws).all():
             return draws
         return replace(
             draws, source=f"{draws.source}; the observation library is interpolated between its own"

@@ -250,14 +250,6 @@ class ReducedModelSource(NamedStructure):
         return {"design": self.model.design_hash}
 
     @property
-    def _true_values(self) -> dict[str, float]:
-        """What of the true asset is the same in every step, by the names of the model."""
-        asset = self._scenario.asset
-        means = calibrated_means(self._scenario.calibration)
-        given = {**means, **asset.true_parameters, **asset.constant_load}
-        return {name: value for name, value in given.items() if name in self.wing.chosen}
-
-    @property
     def _outputs(self) -> slice:
         """Which outputs of the model are observed, where those at rest are."""
         gauges = len(self.wing.gauges)
@@ -301,8 +293,10 @@ class ReducedModelSource(NamedStructure):
 
     def open(self) -> Asset:
         """Return the model as an asset, with the parameters of the scenario's true asset."""
-        model, known, observation = self.wing, self._true_values, self._scenario.observation
-        outputs = self._outputs
+        model, observation, outputs = self.wing, self._scenario.observation, self._outputs
+        asset, means = self._scenario.asset, calibrated_means(self._scenario.calibration)
+        given = {**means, **asset.true_parameters, **asset.constant_load}
+        known = {name: value for name, value in given.items() if name in model.chosen}
 
         def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
             values = {**known, **health, **control}

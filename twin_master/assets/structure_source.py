@@ -5,9 +5,8 @@ from pathlib import Path, PurePosixPath
 from typing import ClassVar, Literal
 
 from fmu_asset.door.binding import Binding
-from reporting.files import atomic_write_text
+from reporting.files import atomic_write_text, hash_file
 from reporting.progress import Progress
-from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
     BINDING_COPY,
     FLOWN_DESIGN_HASH,
@@ -87,10 +86,10 @@ class StructureFmuSource(NamedStructure, FmuSource):
 
     def binding(self) -> Binding:
         """Return the binding: one of its own, or that which follows from the structure."""
-        from fmu_asset.structures import structure_binding
-
         if self._folder is not None or self.section.binding:
             return super().binding()
+        from fmu_asset.structures import structure_binding
+
         return structure_binding(self.design, self._frequencies())
 
     def _check_calibration(self, binding: Binding) -> tuple[str, ...]:
@@ -114,10 +113,10 @@ class StructureFmuSource(NamedStructure, FmuSource):
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
-        from fmu_asset.structures import structure_binding_text
-
         self.model = self.reduced(progress)
         if not self.path(BINDING_COPY).exists():
+            from fmu_asset.structures import structure_binding_text
+
             text = structure_binding_text(self.design, self._frequencies())
             atomic_write_text(self.path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):

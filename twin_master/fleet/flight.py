@@ -10,10 +10,17 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reporting.files import atomic_write_text, members_of, write_members, written
+from reporting.files import (
+    atomic_write_text,
+    collect_provenance,
+    hash_record,
+    members_of,
+    write_members,
+    written,
+)
+from reporting.folders import held
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError, said
@@ -27,7 +34,6 @@ from twin_master.run_folder import (
     check_versions,
     create_run_folder,
     folder_config,
-    held,
     lock_run_folder,
     to_json,
 )
@@ -259,16 +265,11 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
     from fe.wing.design import wing_structure
 
     name, asset = "young_modulus_factor", scenario.asset.true_parameters
-    ranges = wing_structure(scenario.state_names, 0).ranges
-    true = {name: ([member.parameters.get(name, asset.get(name, 1.0)) for member in group.members], "assets")}
-    if scenario.truth.kind == "scripted":
-        history = zip(scenario.state_names, scenario.scripted_history().T.tolist(), strict=True)
-        true |= {region: (values, f"{scenario.mission.step_name}s") for region, values in history}
-    for what, (values, of) in true.items():
-        low, high = ranges[what]
-        if outside := [value for value in values if not low - 1e-12 <= value <= high + 1e-12]:
-            told = {"what": what, "count": len(outside), "number": len(values), "of": of}
-            raise FleetError(said("fleet.outside", low=low, high=high, example=outside[0], **told))
+    values = [member.parameters.get(name, asset.get(name, 1.0)) for member in group.members]
+    low, high = wing_structure(scenario.state_names, 0).ranges[name]
+    if outside := [value for value in values if not low - 1e-12 <= value <= high + 1e-12]:
+        told = {"what": name, "count": len(outside), "number": len(values)}
+        raise FleetError(said("fleet.outside", low=low, high=high, example=outside[0], **told))
 
 
 def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:

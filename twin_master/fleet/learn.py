@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reporting.arrays import Float, Index
-from reporting.files import atomic_write_text
+from reporting.files import atomic_write_text, hash_record
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import hash_record
 from reporting.toml_file import toml_text
 from reporting.words import counted
 from twin_master.assets.parameter import ParameterDraws

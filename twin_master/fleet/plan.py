@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from reporting.provenance import hash_file
+from reporting.files import hash_file
 from reporting.toml_file import Fault, NotNegative, Number, checked, read_toml
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError, said

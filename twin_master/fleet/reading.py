@@ -129,7 +129,8 @@ def severity(scenario: Scenario, mean: Float) -> Float:
 def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     """Return the probability that twins leave a control within the steps that are predicted: (B,).
 
-    Of a policy by states it is that of the state; where the belief decides it is of lives that are drawn.
+    Of a policy by states it is that of the state of each turn, or of the turn behind it where that decides;
+    where the belief decides it is of lives that are drawn.
 
     Parameters
     ----------
@@ -140,17 +141,18 @@ def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     control : int
         In force then; it stays so until it is left.
     """
-    steps, transition = knowledge.scenario.mission.prediction_steps, knowledge.model.transition
+    scenario, transition = knowledge.scenario, knowledge.model.transition
+    steps = scenario.mission.prediction_steps
     if knowledge.plan.on_belief is not None:
-        ahead, chance = (
-            transition.forward(control, belief),
-            generator(knowledge.scenario.mission.seed, "planning"),
-        )
+        ahead = transition.forward(control, belief)
+        chance = generator(scenario.mission.seed, "planning")
         return leaving_probability(knowledge.problem, knowledge.plan.on_belief, ahead, control, steps, chance)
     keeps = (knowledge.plan.control_index == control).astype(np.float64)
     stays = keeps.copy()
     for _ in range(steps - 1):
         stays = keeps * transition.expected(control, stays)
+    if scenario.planner.decide_on == "predicted":
+        stays = transition.expected(control, stays)
     return np.asarray(np.maximum(1.0 - belief @ stays, 0.0))
 
 

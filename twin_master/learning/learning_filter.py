@@ -197,10 +197,8 @@ class LearningFilter:
         """
         seen, told = self.sensor_model.apart(observation)
         forecast, statistics, count = self._forecast(before)
-        value, inverse = (
-            self.sensor_model.value_per_draw[:, :, control_index],
-            self._inverse[:, control_index],
-        )
+        value = self.sensor_model.value_per_draw[:, :, control_index]
+        inverse = self._inverse[:, control_index]
         near = self.sensor_model.nearest(seen, control_index, value)
         log_belief = forecast + told + near.log_density[self._draw]
         log_belief += self._gauges.log_density(seen, self._draw, near.value, inverse, statistics, count)

@@ -21,11 +21,10 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
 from reporting.arrays import Float
-from reporting.files import atomic_write_bytes, atomic_write_text, written
-from reporting.folders import lock_folder
+from reporting.files import atomic_write_bytes, atomic_write_text, hash_file, written
+from reporting.folders import held, lock_folder
 from reporting.json_file import parse_json
 from reporting.progress import Stage, stage
-from reporting.provenance import hash_file
 from twin_master.assets.library_source import (
     FORMAT,
     KIND,
@@ -120,7 +119,7 @@ def sample_library(
     lock = lock_folder(folder)
     if lock is None:
         raise MissionInputError(said("library.locked", folder=folder))
-    try:
+    with held(lock):
         rows = _kept_rows(folder, (grid.size, sensors))
         todo = [(first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()]
         kept, begin = len(grid.blocks) - len(todo), time.perf_counter()
@@ -131,8 +130,6 @@ def sample_library(
         library = ObservationLibrary(sampled_dataset(grid, binding, record, np.array(rows)))
         write_observation_library(out, library)
         shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        os.close(lock)
     return SamplingOutcome(out, library, kept, len(grid.blocks), count, seconds)
 
 
@@ -229,7 +226,7 @@ def _difference(kept: bytes, record: dict[str, Any]) -> str:
 def _kept_rows(folder: Path, shape: tuple[int, int]) -> Float:
     """Return the observations (N, G) on disk, NaN where there is none yet; whoever fills them keeps them."""
     path, sound = folder / ROWS_NAME, False
-    with suppress(OSError, ValueError):  # there are none, or they are damaged
+    with suppress(OSError, EOFError, ValueError):  # there are none, or they are damaged
         sound = np.load(path, mmap_mode="r").shape == shape  # a short file would grow
     if not sound:
         content = io.BytesIO()

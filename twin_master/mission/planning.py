@@ -122,8 +122,10 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
             return model.policy(kept)
         with kept:
             policy, controls = BeliefPolicy.of(kept), tuple(kept["controls"].tolist())
-    except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise PlanningError(said("mission.no_policy", path=path, error=error)) from None
+    except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+        # NumPy takes what it does not know for Python objects, and says how to load them unsafely.
+        reason = "it is neither NPY nor NPZ" if "pickle" in str(error) else error
+        raise PlanningError(said("mission.no_policy", path=path, error=reason)) from None
     if controls != model.controls or policy.vectors.shape[1] != model.states.size:
         own = {"states": policy.vectors.shape[1], "controls": controls}
         raise PlanningError(said("mission.another_policy", path=path, **own, model=model))

@@ -341,9 +341,11 @@ def prepared_alone(scenario: Scenario, source: AssetSource, progress: Progress |
 
 
 KNOWLEDGE_NAME, CALIBRATION_NAME = "twin.npz", "calibration.json"
+EARLIER_KNOWLEDGE = "twin_{}.npz"
+"""Of the models that a watch believed before its last one, by their numbers from 0."""
 
 
-def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
+def keep_knowledge(folder: Path, knowledge: Knowledge, name: str = KNOWLEDGE_NAME) -> None:
     """Write what a twin knows before its flight; the bytes depend on nothing else.
 
     The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); where it is decided by the
@@ -364,7 +366,7 @@ def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
     if knowledge.plan.on_belief is not None:
         arrays |= {f"belief_{name}": array for name, array in vars(knowledge.plan.on_belief).items()}
     np.savez(content, **arrays | ({} if true is None else {"true": true}))
-    atomic_write_bytes(folder / KNOWLEDGE_NAME, content.getvalue())
+    atomic_write_bytes(folder / name, content.getvalue())
     if knowledge.draws.record is not None:
         text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
         atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
@@ -380,7 +382,7 @@ def share_knowledge(folder: Path, other: Path) -> None:
         atomic_write_bytes(other / KNOWLEDGE_NAME, (folder / KNOWLEDGE_NAME).read_bytes())
 
 
-def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:
+def kept_knowledge(folder: Path, scenario: Scenario, name: str = KNOWLEDGE_NAME) -> Knowledge:
     """Return what the twin of a run knew before its flight.
 
     Parameters
@@ -389,13 +391,15 @@ def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:
         The run folder.
     scenario : Scenario
         Of its `config.json`.
+    name : str
+        Of the file.
 
     Raises
     ------
     RunFolderError
         The file is missing or damaged, or belongs to another scenario.
     """
-    path = folder / KNOWLEDGE_NAME
+    path = folder / name
     try:
         with np.load(path, allow_pickle=False) as kept:
             predicted, draws, policy = (

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float
+from reporting.words import listing
 from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import filter_sequence, smooth
@@ -303,6 +304,4 @@ class Words:
     def sensors(self, numbers: Sequence[int]) -> str:
         """Return sensors, counted from 0, in words."""
         names = [f"{g + 1} ({self.names[g]})" if self.names else str(g + 1) for g in numbers]
-        if len(names) == 1:
-            return f"{self.sensor} {names[0]}"
-        return f"{self.sensor}s {', '.join(names[:-1])} and {names[-1]}"
+        return f"{self.sensor}{'s' if len(names) > 1 else ''} {listing(names)}"

@@ -164,15 +164,6 @@ class QuantityModel:
         return result.reshape(*weights.shape[:-2], len(chosen), self.sensor_count)
 
 
-def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
-    """Return the health reward of sensor values (..., G): one minus the largest share of the limit.
-
-    One without load, zero where a sensor reaches its limit, one or (G,), and negative beyond.
-    """
-    # As a share first: rounding is monotonic, so that for one limit the result is that of the largest value.
-    return np.asarray(1.0 - (np.asarray(value, dtype=np.float64) / np.asarray(limit)).max(axis=-1))
-
-
 def _error_moments(observation: Float, shown: Float, variance: Float, scale: Float) -> tuple[Float, Float]:
     """Return mean and variance of the error reward: minus the mean distance of observation and model.
 
@@ -235,9 +226,13 @@ class RewardModel:
     true_per_draw: Float | None = None
 
     def health(self, values: Float) -> Float:
-        """Return the health reward of what is there at the sensors (..., G)."""
+        """Return the health reward of what is there at the sensors (..., G): one minus the largest share.
+
+        One without load, zero where a sensor reaches its limit, one or (G,), and negative beyond.
+        """
         chosen = slice(None) if self.health_sensors is None else list(self.health_sensors)
-        return health_reward(values[..., chosen], self.limit)
+        # As a share first: rounding is monotonic: for one limit the result is that of the largest value.
+        return np.asarray(1.0 - (values[..., chosen] / np.asarray(self.limit)).max(axis=-1))
 
     @cached_property
     def health_per_draw(self) -> Float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
-from reporting.words import parameter_title
+from reporting.words import counted, parameter_title
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
@@ -166,9 +166,9 @@ def summarise(
         told.append(("lost", {}, [100.0 * float(1.0 - received.mean())]))
         if blind := (flight.first_turn + np.flatnonzero(~received.any(axis=1))).tolist():
             told.append(("blind", step, [", ".join(map(str, blind))]))
-    if misfit is not None:
-        worst = np.nanmax(np.abs(misfit), axis=(0, 1))
-        sensor, rms = int(np.nanargmax(worst)), float(np.sqrt(np.nanmean(misfit**2)))
+    if misfit is not None and (known := np.isfinite(misfit)).any():
+        worst = np.max(np.abs(misfit), axis=(0, 1), where=known, initial=0.0)
+        sensor, rms = int(np.argmax(worst)), float(np.sqrt(np.mean(misfit[known] ** 2)))
         told.append(("misfit", {"sensor": sensor + 1}, [100.0 * rms, 100.0 * float(worst[sensor])]))
     bound = flight.monitors.get("strain_error_bound")
     if bound is not None and {*result.scenario.observation.sensor_units} == {"1"}:
@@ -271,7 +271,7 @@ def control_changes(
         for step in steps[:_CHANGES_SAID]
     ]
     more = len(steps) - len(changes)
-    return ", ".join(changes) + (f", and {more} more change{'s' if more > 1 else ''}" if more else "")
+    return ", ".join(changes) + (f", and {counted(more, 'more change')}" if more else "")
 
 
 def of_fallback(fallback: Fallback, scenario: Scenario) -> Told:

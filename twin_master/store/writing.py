@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
-from reporting.files import atomic_file, atomic_write_text
+from reporting.files import atomic_file, atomic_write_text, hash_record
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from reporting.netcdf import Group, read_groups, write_groups
-from reporting.provenance import hash_record
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError, said
 from twin_master.run_folder import FIELD_NAME, read_config, to_json

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from importlib import resources
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -29,7 +29,7 @@ from reporting.json_file import plain, read_json
 from twin_master.errors import RunFolderError, TwinMasterError, said
 from twin_master.learning.expectation import Expected, expected_of, joined
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
-from twin_master.mission.preparation import KNOWLEDGE_NAME, kept_knowledge
+from twin_master.mission.preparation import EARLIER_KNOWLEDGE, KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt
 from twin_master.network.inference import known_control, predict
 from twin_master.report.reading import NORMAL_95, printed_factors, printed_sensors
@@ -111,11 +111,28 @@ class Flight:
     def _forget(self, file: int) -> None:
         """Begin with a file, by its number."""
         self._file, self._end = file, 0
-        self.knowledge = kept_knowledge(self.folder, self.scenario)
+        self._models: list[tuple[int, Knowledge]] = []
+        self._believe(0)
         self._places: list[list[int]] = []  # of belief and observation of each turn, in bytes
         self._told: defaultdict[int, list[Record]] = defaultdict(list)  # notices behind it, where none came
         self.pictures: list[Picture] = []
         self.number += 1
+
+    def _believe(self, place: int) -> None:
+        """Take in the next model that is believed, from so many bytes on."""
+        name = EARLIER_KNOWLEDGE.format(len(self._models))
+        name = name if (self.folder / name).is_file() else KNOWLEDGE_NAME
+        self._models.append((place, kept_knowledge(self.folder, self.scenario, name)))
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """What the twin knows now."""
+        return self._models[-1][1]
+
+    def _known_in(self, turn: Record) -> Knowledge:
+        """Return what the twin knew when it told of a turn."""
+        told = self._places[turn["turn"]][0]
+        return next(knowledge for place, knowledge in reversed(self._models) if place <= told)
 
     def _begun_anew(self, found: os.stat_result) -> bool:
         """Return whether another file took the place of the journal, or lines were taken back."""
@@ -157,7 +174,7 @@ class Flight:
             self._places[-1][0] = self._places[late][1] = place
         self._told[turn] += [] if "filtered" in record else record.get("notices", [])
         if "model" in record:  # another one was adopted
-            self.knowledge = kept_knowledge(self.folder, self.scenario)
+            self._believe(place)
         verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))
         picture = _picture(turn, self.folder / verdict) if verdict else None
         self.pictures += [picture] if picture else []
@@ -198,14 +215,19 @@ class Flight:
 
     def believed(self, turns: Sequence[Record]) -> Belief:
         """Return what the twin believed of each of n turns when it was flown."""
-        filtered, controls = (
-            np.array([turn["filtered"] for turn in turns]),
-            [turn["control_index"] for turn in turns],
-        )
-        joint = known_control(filtered, controls, len(self.knowledge.model.controls))
-        observed, learns = self.observed(turns), self.knowledge.expectation
+        models = groupby(turns, lambda turn: id(self._known_in(turn)))
+        probability, expected, control = zip(*(self._believed([*own]) for _, own in models), strict=True)
+        return Belief(np.concatenate(probability), joined(expected), np.concatenate(control))
+
+    def _believed(self, turns: Sequence[Record]) -> Belief:
+        """Return what the twin believed of turns in which it knew the same."""
+        known = self._known_in(turns[0])
+        filtered = np.array([turn["filtered"] for turn in turns])
+        controls = [turn["control_index"] for turn in turns]
+        joint = known_control(filtered, controls, len(known.model.controls))
+        observed, learns = self.observed(turns), known.expectation
         if learns is None:
-            expected = self._expected(joint, observed)
+            expected = _expected(known, joint, observed)
         else:
             parts = []
             for turn, own, seen in zip(turns, joint, observed, strict=True):
@@ -216,20 +238,20 @@ class Flight:
 
     def predicted(self, turn: Record) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""
-        known, horizon = self.knowledge, self.scenario.mission.prediction_steps
+        known, horizon = self._known_in(turn), self.scenario.mission.prediction_steps
         flown, learns = (array_of(turn["filtered"]), turn["control_index"]), known.expectation
         coming = predict(known.model, *flown, known.plan.policy, horizon).predicted
         none = turn.get("suspicion", {}).get("hypotheses", {}).get("none of these", 0.0)
         joint = coming[..., None] * known.asked(none)
         if learns is None:
-            expected = self._expected(joint, None)
+            expected = _expected(known, joint, None)
         else:
             expected = learns.of_marginals(_learnt(turn), joint, slice(None), None)
         return Belief(coming, expected, joint.sum(axis=-2))
 
-    def _expected(self, joint: Float, observed: Float | None) -> Expected:
-        known = self.knowledge
-        return expected_of(known.sensor_model, known.rewards, joint, observed, quantiles=False)
+
+def _expected(known: Knowledge, joint: Float, observed: Float | None) -> Expected:
+    return expected_of(known.sensor_model, known.rewards, joint, observed, quantiles=False)
 
 
 def _learnt(record: Record) -> dict[str, Learnt]:

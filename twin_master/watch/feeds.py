@@ -223,6 +223,9 @@ class RunFeed(RecordedFeed):
                     said("watch.shape", count=scenario.observation.count, came=group[role].shape)
                 )
             records = [{role: row, "turn": int(turn)} for row, turn in zip(rows, turns, strict=True)]
+            for name in (name for *_, name, _ in scenario.readings if name in group):
+                for record, value in zip(records, group[name].values.tolist(), strict=True):
+                    record |= {name: value} if math.isfinite(value) else {}
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
             reason = str(error).rstrip(".")
             raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None

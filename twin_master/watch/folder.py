@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from reporting.arrays import Float
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, hash_record
 from reporting.progress import Progress
-from reporting.provenance import hash_record
 from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError, said
@@ -24,7 +23,12 @@ from twin_master.mission.journal import (
     records_backwards,
 )
 from twin_master.mission.loop import BelievedModel, journalled_decision, operate, replay
-from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
+from twin_master.mission.preparation import (
+    EARLIER_KNOWLEDGE,
+    keep_knowledge,
+    prepare_knowledge,
+    share_knowledge,
+)
 from twin_master.mission.turns import Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
@@ -95,6 +99,8 @@ class Watch:
             share_knowledge(like.folder, folder)
         else:
             keep_knowledge(folder, self.models[-1].knowledge)
+        for number, model in enumerate(self.models[:-1]):
+            keep_knowledge(folder, model.knowledge, EARLIER_KNOWLEDGE.format(number))
 
     def _prepared(self) -> BelievedModel:
         """Calibrate and plan."""
@@ -170,9 +176,12 @@ class Watch:
                 )
             self.intake, self.twin, self.filtered = intake, found.twin, None
             self.is_quiet, self._heard = "quiet" in last, time.monotonic()
+            self._told = intake.state()
             if patched is not None:
                 self._patch(*patched)
             yield
+            if self.intake.state()["counts"] != self._told["counts"]:  # of messages behind the last turn
+                self.write()
 
     def decisions(self) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until no more comes."""
@@ -209,6 +218,7 @@ class Watch:
         """Add a line to the journal, and take it in."""
         standing = {"begin": self.journal.size, "teaching": vars(self.teaching)}
         self.journal.append({**record, "standing": standing})
+        self._told = record["intake"]
         self.teaching.take(record)
 
     @property
@@ -277,7 +287,10 @@ class Watch:
             **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
-        keep_knowledge(self.folder, outcome.model.knowledge)  # before viewers read the line
+        # Before viewers read the line; they show earlier turns as they were told.
+        before = EARLIER_KNOWLEDGE.format(len(self.models) - 2)
+        keep_knowledge(self.folder, self.models[-2].knowledge, before)
+        keep_knowledge(self.folder, outcome.model.knowledge)
         self.write(model=model)
         gaps = [
             f"{name.replace('_', ' ')} {value:.4g} before, {model['after'][name]:.4g} after"

@@ -247,7 +247,7 @@ class Teaching:
             self._alarms(again)
         elif "verdict" in record:
             self._verdict(record["verdict"])
-        elif "quiet" not in record:
+        elif "filtered" in record:
             self.turn = int(record["turn"])
             told = {notice["sentence"] for notice in self.untold}
             notices = [n for n in record.get("notices", []) if n["sentence"] not in told]

@@ -1,5 +1,6 @@
 """Effects of a user: TOML files, entry points, `time` and the events of a campaign."""
 
+import math
 import re
 import sys
 from dataclasses import replace
@@ -35,6 +36,13 @@ def write(tmp_path):
         return path
 
     return file
+
+
+def test_what_cannot_be_built_says_once_where(setting):
+    effect = effect_by_identifier("coulomb_friction", library())
+    with pytest.raises(CatalogueError, match="is not a finite number") as caught:
+        effect.patch(setting, {"friction_ratio": math.nan}, setting.model.ports[0])
+    assert str(caught.value).count("primitives 1") == 1
 
 
 def test_files_with_one_effect_and_with_several_of_a_family_at_places(write, setting):

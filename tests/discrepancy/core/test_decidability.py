@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from benchmarks.cantilever import Cantilever, campaign
 from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, TrialKind
 from discrepancy.fits.candidate import Term
 from discrepancy.judgement.next_experiment import (
     Proposal,
@@ -278,6 +278,18 @@ def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one():
         noise = simulator.problem.noise[drawn.trials[-1].channels[0]].standard_deviation
         squares.append(float(np.mean(sixth**2)) / 924.0 / noise**2)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_motion_that_began_before_its_record_goes_on_in_simulated_campaigns():
+    """As in the real record, and not from a state of any size."""
+    campaign, model = measured(kind="ringdown")
+    unknown = {"kind": TrialKind.FORCED, "release": None, "begins": Start.UNKNOWN}
+    trials = tuple(replace(trial, **unknown) for trial in campaign.trials)
+    simulator = Simulator(replace(campaign, trials=trials), model)
+    for seed in range(5):
+        drawn = simulator.simulate(None, np.random.default_rng(seed))
+        for trial, own in zip(trials, drawn.trials, strict=True):
+            np.testing.assert_allclose(own.values[0], trial.values[0], atol=0.1 * np.ptp(trial.values))
 
 
 def test_the_workflow_tried_on_its_own_geometry(tmp_path):

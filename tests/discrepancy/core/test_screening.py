@@ -216,6 +216,18 @@ def test_leverages_of_fitted_readings_are_the_dense_ones():
     np.testing.assert_allclose(rows @ rows.T, covariance, rtol=1e-5, atol=1e-8)
 
 
+def test_rates_of_predictions_at_uneven_stamps():
+    problem = kit.closed_problem(samples=400)
+    rows = np.r_[0:200, 200:400:4]
+    trials = (trial.rows(rows) if trial.is_dynamic else trial for trial in problem.campaign.trials)
+    problem = kit.problem_of(replace(problem.campaign, trials=tuple(trials)), problem.model)
+    found = kit.fitted(problem)
+    for number, item in enumerate(residual_set(problem, found, sensitivities=False).trials):
+        if item.rates is not None:
+            _, rates = problem.response(number, found.point.shared, found.point.local[number], ModelPatch())
+            np.testing.assert_allclose(item.rates[1:200], rates[1:200], atol=0.1 * np.abs(rates).max())
+
+
 def test_noise_without_a_record_is_what_the_fit_leaves():
     """And nothing is found in it."""
     told = 0

@@ -302,6 +302,15 @@ def test_round_trip_keeps_everything(tmp_path_factory, campaign):
     assert same(replace(again, remarks=campaign.remarks), campaign)
 
 
+def test_temperatures_in_kelvin_stay_so(tmp_path):
+    folder = campaign_folder(tmp_path / "a", HEATED, (TOML, '"degC"', '"K"'))
+    campaign = read_campaign(folder)
+    for si in (False, True):
+        again = read_campaign(write_campaign(campaign, tmp_path / f"{si}", si=si))
+        assert again.channels["plate"].unit == "K"
+        np.testing.assert_array_equal(again.trials[0].values, campaign.trials[0].values)
+
+
 def test_what_cannot_be_written_says_so(tmp_path):
     campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN))
     other = replace(
@@ -363,6 +372,10 @@ def test_what_is_no_repeat():
     assert [group for group, *_ in repeated([trial, trial], "w")] == [[trial, trial]]
     for what in ("force", "load_factor", "temperature", "health", "noise_factor"):
         assert not [*repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")], what
+    cracked = [
+        replace(trial, regions=("z1", "z2", "web"), health=np.full((3, 3), loss)) for loss in (0.0, 0.1)
+    ]
+    assert [group for group, *_ in repeated([trial, *cracked], "w")] == [[trial, cracked[0]]]
     rows, used = np.random.default_rng(1).standard_normal((3, 6)), np.ones((3, 6), dtype=bool)
     used[1, 2] = False
     left_out = repeat_record(W, repeats(np.where(used, rows, 1e9), used))

@@ -1,5 +1,7 @@
 """Records that no sensor made, and single wrong readings; what records say of parameters and inputs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -424,6 +426,9 @@ def test_it_is_asked_what_a_coarse_input_did_between_its_samples(samples, forced
     faults = check_against_model(campaign, CART)
     found = [fault for fault in faults if fault.kind is FaultKind.BETWEEN_SAMPLES]
     assert bool(found) is (samples == 9 and hold is None)
+    loud = tuple(replace(trial, noise_factor=1e4) for trial in campaign.trials)
+    loud = check_against_model(replace(campaign, trials=loud), CART)
+    assert not any(fault.kind is FaultKind.BETWEEN_SAMPLES for fault in loud)
     name, where = ("force", "[[trial]]") if forced else ("motor", "[[input]]")
     for fault in found:
         assert f"straight lines and curves between the samples of {name!r}" in fault.sentence

@@ -109,6 +109,14 @@ def test_a_table_comes_back_from_any_dialect(tmp_path_factory, table, separator,
     assert read == [list(column) for column in zip(*table, strict=True)]
 
 
+def test_a_temperature_in_kelvin_is_not_called_celsius(tmp_path):
+    sheet = sheet_of(tmp_path, b"t [s];plate [K]\n" + b"".join(b"%d;29%d\n" % (k, k) for k in range(9)))
+    understood = Understanding([sheet], {"kind": {"": "driven"}, "column": {"t": "time", "plate": "plate"}})
+    campaign = understood.campaign("plate")
+    assert campaign.channels["plate"].unit == "K"
+    assert campaign.trials[0].values[0, 0] == 290.0
+
+
 def refusal(path):
     """Return what is said of a file that becomes no campaign of a force and outputs."""
     try:

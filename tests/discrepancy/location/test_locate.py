@@ -8,7 +8,7 @@ from scipy.stats import binom
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
-from discrepancy.location.dependence import backbones, modal_motion
+from discrepancy.location.dependence import backbones, modal_motion, predicted_frequencies
 from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
 from discrepancy.location.map import features, residual_map
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
@@ -110,6 +110,14 @@ def test_few_static_readings_do_not_drown_in_many_samples():
     assert variance.rejected
     assert variance.where.startswith("steps, ")
     assert variance.statistic < 1.1
+
+
+def test_modes_are_those_of_records_at_one_rate():
+    """Of a record at half the rate the peaks would be at twice their frequencies."""
+    fast, long = (Bench(count=count).fit(np.random.default_rng(7)).trials[0] for count in (300, 600))
+    wave = {"trial": replace(fast.trial, time=2.0 * fast.trial.time), "prediction": long.prediction[::2]}
+    slow = replace(fast, **wave)
+    assert predicted_frequencies((fast, slow)) == predicted_frequencies((fast,))
 
 
 def test_lines_and_temperature_are_told():

@@ -11,10 +11,11 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.conclusion import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
 from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
+from discrepancy.missing_force.naming import seen
 from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
-from discrepancy.missing_force.windows import residual_windows
+from discrepancy.missing_force.windows import _most_telling, residual_windows
 from discrepancy.models.interface import PortedSystem
 from discrepancy.report.residual_figures import time_line_figure
 from discrepancy.verdict import GapWindow, Moment
@@ -322,6 +323,26 @@ def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
     assert (window.trial, window.channels, window.begin, window.end) == ("release 2", ("g2",), None, None)
     assert window.size > 1.0
     assert when_sentence((window,)) == "The gap is there throughout the records."
+
+
+def test_an_event_on_a_reading_is_looked_for_by_name_in_records_of_other_channels():
+    """Both sensors jump; their only common record has it in another column."""
+    random, jump = np.random.default_rng(4), np.where(np.arange(100) < 60, 0.0, 30.0)
+    time, names = 0.02 * np.arange(100), [("x", "a"), ("a", "x")]
+    residuals = [random.standard_normal((100, 2)) for _ in names]
+    for residual, channels in zip(residuals, names, strict=True):
+        residual[:, channels.index("a")] += jump
+    trials = [trial_of(time, residual) for residual in residuals]
+    system = trials[1].system
+    trials[1] = replace(
+        trials[1], deviation=trials[1].deviation[::-1],
+        system=replace(system, outputs=system.outputs[::-1], through=system.through[:, ::-1]),
+    )  # fmt: skip
+    forced = seen(View(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
+    number, found = _most_telling(0, forced, names)
+    shown = [trial.system.through[0] != 0.0 for trial in found.view.trials]
+    assert number == 0
+    np.testing.assert_array_equal(shown, [[False, True], [True, False]])
 
 
 def test_words_of_windows():

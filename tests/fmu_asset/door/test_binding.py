@@ -14,12 +14,14 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
+from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
-from reporting.units import Meaning, meaning_of
+from reporting import units
+from reporting.units import Meaning, exact_meaning, meaning_of
 from tests.fmu_asset.door.kinds import WING_BINDING
 from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed, tables
@@ -80,6 +82,12 @@ def test_unit_texts_mean_what_is_defined(unit) -> None:
     assert meaning_of(unit["text"]) == Meaning(si(**unit["of"]), factor, unit.get("offset", 0.0))
 
 
+def test_units_that_pint_is_not_asked_for_mean_what_it_says():
+    for unit in units._PLAIN:
+        exponents, factor, offset = exact_meaning(unit)
+        assert meaning_of(unit) == Meaning(exponents, float(factor), float(offset)), unit
+
+
 def test_other_texts_mean_nothing() -> None:
     for text in (*UNITS["nothing"], "(" * 3000 + "m" + ")" * 3000):
         assert meaning_of(text) is None, text
@@ -134,9 +142,10 @@ def test_the_wing_is_drafted_almost_as_it_is_bound(fmu) -> None:
     assert wing.port["tip"].quantities["displacement"].variables == ("tip_displacement",)
     assert "frequency[6]" in wing.record.variables
     assert wing.parameter["damping_alpha"].unit == "1/s"
-    for size in (0.0, -1.0, float("nan")):
-        with pytest.raises(BindingError, match="must be a positive number of seconds"):
-            draft_binding(read_fmu(fmu), step_size=size)
+    for size in (0.0, -1.0, float("nan"), float("inf")):
+        for made in (draft_binding, default_experiment):
+            with pytest.raises(BindingError, match="must be a positive number of seconds"):
+                made(read_fmu(fmu), step_size=size)
 
 
 def test_roles_units_and_step_size_come_from_the_description(foreign_fmu) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import expit, logit
 from scipy.stats import beta, betabinom, norm, t
 
 from tests.twin_master.network.decision_oracles import precise_forward_backward
@@ -17,7 +18,7 @@ from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likeliho
 from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import _noisier
 from twin_master.fleet.plan import Fleet, ensemble
-from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
+from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, population, refined, shared
 from twin_master.fleet.reading import Estimated, Outcomes, attention, leaving, severity
 from twin_master.fleet.report import WORST, fleet_page, write_fleet_report
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
@@ -105,26 +106,6 @@ def grid_of(*counts: tuple[int, int]) -> Grid:
     return refined(lambda points: np.log(points) @ hits + np.log1p(-points) @ misses, len(counts))
 
 
-@pytest.mark.parametrize(
-    "counts",
-    [
-        ((0, 50),),
-        ((2, 0), (400, 3600)),
-        ((0, 200), (7, 60), (90, 270)),
-        ((3, 20), (7, 60), (30, 90), (9, 900)),
-    ],
-)
-def test_a_grid_has_the_moments_of_a_beta(counts):
-    """Between the bounds, which cut some off; of four probabilities with few points for each."""
-    for (a, b), marginal in zip(counts, grid_of(*counts).marginals, strict=True):
-        exact = beta(a + 1, b + 1)
-        low, high = exact.cdf([LOWEST, HIGHEST])
-        draws = exact.ppf(low + (high - low) * (np.arange(20_000) + 0.5) / 20_000)
-        assert marginal.mean == pytest.approx(draws.mean(), abs=0.02 * draws.std())
-        assert marginal.standard_deviation == pytest.approx(draws.std(), rel=2e-2)
-        np.testing.assert_allclose(marginal.interval(), np.quantile(draws, [0.025, 0.975]), rtol=2e-2)
-
-
 SIMILAR, MANY = ((3, 47), (6, 44), (2, 48), (9, 41), (4, 46)), (22_500, 427_500)
 
 
@@ -142,7 +123,7 @@ def test_groups_share_what_a_dense_sum_says(counts, beside, close):
     (found, *_), groups = shared([grid_of(own, *beside) for own in counts])
     low, high = logit(np.array([LOWEST, HIGHEST]))
     m, kappa = np.meshgrid(
-        logistic(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
+        expit(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
         10.0 ** (np.log10(3.0) + (np.arange(120) + 0.5) / 40.0),
         indexing="ij",
     )
@@ -322,6 +303,9 @@ def test_the_report_names_who_needs_attention(grown):
     chance = 1.0 - np.linalg.matrix_power(stays, scenario.mission.prediction_steps - 1).sum(axis=1)
     np.testing.assert_allclose(found[kept], chance, atol=1e-12)
     assert np.ptp(chance) > 0.1
+    section = scenario.planner.model_copy(update={"decide_on": "predicted"})
+    ahead = replace(knowledge, scenario=scenario.model_copy(update={"planner": section}))
+    np.testing.assert_allclose(attention(ahead, belief, 1), model.transition.matrix[1] @ found, atol=1e-12)
 
     # Who gave an alarm comes first, then who leaves soon; with the same percentage by its state.
     beliefs, alarms = group["belief"].values.astype(float), group["notices"].values[:, 0]

@@ -16,7 +16,7 @@ import pytest
 
 from tests.command_line import command, said
 from tests.twin_master.runs import journal, text_of, written
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
+from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, wait_until, write_csv
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving
@@ -330,9 +330,6 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
         ]
         assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
         assert sum(record["alarms"] > 0 for record in records) == alarmed
-    south = '[[group]]\nname = "south"\nscenario = "wing.toml"\nobservations = "none/*.csv"'
-    with pytest.raises(FleetError, match="no recording fits"):
-        fly_fleet(load_fleet(fleet_of(tmp_path, LOGS, south)), tmp_path / "other", Engine(0))
 
 
 def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, alone, tmp_path):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import foldnorm, invgamma, multivariate_normal, multivariate_t, norm
 
+from tests.twin_master.network.decision_oracles import trajectories
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import (
     LearningFilter,
@@ -56,26 +57,16 @@ def run(learner: LearningFilter, seen: Float, controls: list[int]) -> list[Estim
     return estimates
 
 
-def likelihood(sensor: GaussianSensorModel, row: Float, draw: int, state: int, control: int) -> float:
-    residual = (row - sensor.value_per_draw[draw, state, control]) / sensor.standard_deviation
-    density = np.exp(-0.5 * residual**2) / (np.sqrt(2.0 * np.pi) * sensor.standard_deviation)
-    return float(np.prod(density[~np.isnan(row)]))
-
-
 @cache
 def enumerated(turns: int) -> Float:
     """Return p(path, draw, factor, o) over everything: (paths of S^T, E, R), not normalised."""
-    sensor, seen = sensors(), observations()
+    sensor = sensors()
     table = np.zeros((3,) * turns + (DRAWS, len(FACTORS)))
-    for path in product(range(3), repeat=turns):
-        for draw, (place, factor) in product(range(DRAWS), enumerate(FACTORS)):
-            chosen = model(factor)
-            p = chosen.prior[path[0]] * sensor.draw_weight[draw] / len(FACTORS)
-            for t, state in enumerate(path):
-                p *= likelihood(sensor, seen[t], draw, state, CONTROLS[t])
-                if t:
-                    p *= chosen.transition.matrix[CONTROLS[t - 1], path[t - 1], state]
-            table[(*path, draw, place)] = p
+    shown = sensor.value_per_draw[:, :, CONTROLS[:turns]].swapaxes(1, 2)  # (E, T, S, G)
+    density = norm.logpdf(observations()[:turns, None], shown, sensor.standard_deviation)
+    for draw, (place, factor) in product(range(DRAWS), enumerate(FACTORS)):
+        *_, (_, joint) = trajectories(model(factor), CONTROLS, np.nansum(density[draw], axis=-1))
+        table[..., draw, place] = joint * sensor.draw_weight[draw] / len(FACTORS)
     return table
 
 

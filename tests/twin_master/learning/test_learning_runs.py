@@ -216,13 +216,7 @@ def test_a_watch_keeps_the_last_turns_of_what_it_learnt(scenario, folder, learnt
         np.testing.assert_array_equal(watched[name].values, tail.values)
 
 
-TEXT, INPUTS = text_of("level_turns_learning"), Inputs(__file__)
-
-
-@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("learning"))
-def test_what_cannot_be_learnt_or_noticed_is_refused_in_a_sentence(tmp_path, old, new, sentence):
-    with pytest.raises(TwinMasterError, match=sentence):
-        load_scenario(written(tmp_path, TEXT, (old, new)))
+TEXT = text_of("level_turns_learning")
 
 
 def test_more_transitions_than_there_can_be_are_refused(tmp_path):
@@ -264,7 +258,7 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
 
 
 def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_report(tmp_path):
-    faults = ("# What the figures", INPUTS.text("faults.toml") + "# What the figures")
+    faults = ("# What the figures", Inputs(__file__).text("faults.toml") + "# What the figures")
     spoilt, noticed = written(tmp_path, TEXT, *SHORT, faults), tmp_path / "run"
     console = said("run", spoilt, "--out", noticed, "--no-report")
     alarm = next(line for line in console.splitlines() if line.startswith("Turn ") and "gauge 5" in line)

@@ -1,11 +1,9 @@
-"""The mission loop, its truth and its journal: timing, faults, resuming at every turn, what is refused.
+"""The mission loop, its truth and journal: timing, faults, resuming, an FMU that hangs; in gymnasium."""
 
-A run whose FMU hangs or ends stops with one sentence, and goes on when the cause is gone.
-"""
-
+import importlib
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +11,24 @@ import gymnasium
 import numpy as np
 import pytest
 import xarray as xr
+from gymnasium.utils.env_checker import check_env
 
 from fmu_asset.errors import FmuTimeoutError
 from tests.command_line import said
 from tests.kept import ROOT
 from tests.refusals import Inputs
-from tests.twin_master.runs import check_same, flight_of, journal, of_library, table_of, text_of, written
+from tests.twin_master.runs import (
+    changed_scenario,
+    check_same,
+    flight_of,
+    journal,
+    of_library,
+    table_of,
+    text_of,
+    written,
+)
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
+from twin_master.assets.resolution import asset_source
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.fleet.plan import ensemble
@@ -83,7 +92,7 @@ WITHOUT = "import sys; sys.modules['numba'] = None; from uav_twin import cli; cl
 
 def test_a_mission_without_numba_is_the_same(library_file, tmp_path):
     """The same loops as plain Python, and one sentence about it."""
-    short = written(tmp_path, text_of("level_turns", ("steps = 50", "steps = 8")))
+    short = written(tmp_path, text_of("level_turns", ("steps = 50", "steps = 4")))
     words = "run", str(short), "--strain-library", str(library_file), "--no-report", "--out"
     said(*words, tmp_path / "fast")
     line = [sys.executable, "-c", WITHOUT, *words, str(tmp_path / "plain")]
@@ -106,10 +115,12 @@ def test_timing_of_a_turn(paper):
         return inner.step(control, health)
 
     flight = flight_of(*paper, seed=1, asset=StatelessAsset(observe))
-    assert asked[0] == (3.0, 0.0, 0.0)
-    assert asked[5][1:] == (0.0, 0.22)
-    assert asked[30][1:] == (0.6, 0.6)
-    assert [load for load, _, _ in asked] == [(2.0, 3.0)[index] for index in flight.control_index]
+    # Written out from the paper: z1 gains 2 at 10..19 and 20 at 20 and 30, z2 2 at 5..14 and 20 at 5 and 25.
+    z1 = [0] * 10 + list(range(2, 21, 2)) + [40] * 10 + [60] * 20
+    z2 = [0] * 5 + list(range(22, 41, 2)) + [40] * 10 + [60] * 25
+    loads = [(2.0, 3.0)[index] for index in flight.control_index]
+    np.testing.assert_array_equal(asked, np.array([loads, np.array(z1) / 100.0, np.array(z2) / 100.0]).T)
+    assert loads[0] == 3.0
     for step in range(49):  # u_{t+1} is the mode of the policy at the state as observed at t
         assert flight.control_index[step + 1] == np.argmax(flight.filtered[step] @ knowledge.plan.policy)
     residual = flight.observed - flight.observation
@@ -148,15 +159,6 @@ def test_the_policy_on_the_published_library(published_library):
 def truth_of(scenario: Scenario | str, seed: int = 1) -> Truth:
     found = load_scenario(scenario).scenario if isinstance(scenario, str) else scenario
     return Truth(found, build_graphical_model(found), seed)
-
-
-def test_the_papers_history():
-    truth = truth_of("level_turns")
-    history = np.array([truth.state(step, None, None) for step in range(50)])
-    # Written out from the text: z1 gains 2 at 10..19 and 20 at 20 and 30, z2 2 at 5..14 and 20 at 5 and 25.
-    z1 = [0] * 10 + list(range(2, 21, 2)) + [40] * 10 + [60] * 20
-    z2 = [0] * 5 + list(range(22, 41, 2)) + [40] * 10 + [60] * 25
-    np.testing.assert_array_equal(history, np.array([z1, z2]).T / 100.0)
 
 
 def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn():
@@ -205,6 +207,7 @@ def known(request: pytest.FixtureRequest, library_file: Path) -> Known:
 
 
 def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one_refused(known, tmp_path):
+    """Also one that decided otherwise in any turn."""
     part(known, tmp_path)
     path = tmp_path / JOURNAL_NAME
     whole = path.read_bytes()
@@ -231,14 +234,10 @@ def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one
         path.write_bytes(damaged)
         with pytest.raises(NotResumableError, match=rf"line {line} of .*changed or is damaged.*--replace"):
             part(known, tmp_path)
-
-
-def test_a_journal_that_decided_otherwise_in_any_turn_is_refused(known, tmp_path):
-    part(known, tmp_path)
-    lines = (tmp_path / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+    path.write_bytes(whole)
     for turn, record in enumerate(journal(tmp_path)):
         other = line_of(record | {"next_control": 1 - record["next_control"]})
-        (tmp_path / JOURNAL_NAME).write_bytes(b"".join([*lines[: turn + 1], other, *lines[turn + 2 :]]))
+        path.write_bytes(b"".join([*lines[: turn + 1], other, *lines[turn + 2 :]]))
         with pytest.raises(NotResumableError, match=f"decided otherwise after turn {turn} .*--replace"):
             part(known, tmp_path)
 
@@ -340,3 +339,80 @@ def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
     with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
         new_run(three, tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+@pytest.fixture(params=["level_turns", "growing_damage", "failing_gauges"])
+def environment(request: pytest.FixtureRequest, library_file: Path) -> Iterator[ScenarioEnvironment]:
+    made = ScenarioEnvironment(request.param, {"strain_library": library_file})
+    yield made
+    made.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning", "ignore:.*render:UserWarning")
+def test_it_passes_the_checker_of_gymnasium(environment):
+    check_env(environment)
+
+
+def test_our_policy_flies_the_mission_of_the_loop(environment):
+    """To the last bit, with the seed of the mission; rewards by enumeration. Wrong use is refused."""
+    scenario, knowledge = environment.scenario, environment.knowledge
+    flight = flight_of(knowledge, asset_source(scenario))
+    for seed in (4, 3):  # an episode leaves nothing to the next one
+        twin, (observation, info) = knowledge.twin(), environment.reset(seed=seed)
+        observed, controls, rewards, truncated = [info["observed"]], [info["control"]], [], False
+        while not truncated:
+            action = twin.turn(info["observed"], info["control"]).next_control
+            observation, reward, terminated, truncated, info = environment.step(action)
+            assert not terminated
+            np.testing.assert_array_equal(
+                observation, np.where(np.isnan(info["observed"]), 0, info["observed"])
+            )
+            observed.append(info["observed"])
+            controls.append(info["control"])
+            rewards.append(reward)
+    np.testing.assert_array_equal(observed, flight.observed)
+    np.testing.assert_array_equal(controls, flight.control_index)
+    assert info["state"] == dict(zip(scenario.state_names, flight.state[-1], strict=True))
+    section = scenario.rewards
+    worst = (flight.observation / section.health_limit).max(axis=1)
+    worth = np.array([section.control[scenario.control_names[u]] for u in controls])
+    expected = section.health_weight * (1 - worst) + section.control_weight * worth
+    np.testing.assert_allclose(rewards, expected[1:], rtol=1e-14)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        environment.step(0)
+    environment.reset(seed=1)
+    with pytest.raises(gymnasium.error.InvalidAction, match="controls 2g, 3g, got 2"):
+        environment.step(2)
+    environment.close()
+    with pytest.raises(MissionInputError, match="is closed"):
+        environment.reset()
+
+
+def test_an_action_that_ends_the_mission_terminates_the_episode(tmp_path):
+    land = '[[action]]\nname = "land"\ncontrol = "2g"\ncost = 0.0\nends = true\n\n[observation]'
+    text = text_of("inspected_wing", ("[observation]", land), ('policy = "belief"', 'policy = "mode"'))
+    environment = ScenarioEnvironment(written(tmp_path, text), {"in_process": True})
+    environment.reset(seed=1)
+    assert not any(environment.step(0)[2:4])
+    _, reward, terminated, truncated, info = environment.step(5)
+    assert (terminated, truncated, info["ended"]) == (True, False, "the twin decided on `land`.")
+    assert reward != 0.0
+    environment.close()
+
+
+def test_chance_inside_the_asset_begins_with_the_seed_of_the_episode():
+    loaded = changed_scenario("three_fmus", {"mission": {"steps": 3}})
+    environment, other = (ScenarioEnvironment(loaded, {"in_process": True, "seed": seed}) for seed in (1, 5))
+    first, second, again = (environment.reset(seed=seed)[0] for seed in (5, 6, 5))
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(other.reset(seed=5)[0], first)
+    assert not np.array_equal(first, second)
+    environment.close()
+    other.close()
+
+
+def test_without_gymnasium_there_is_a_sentence(monkeypatch):
+    monkeypatch.delitem(sys.modules, "twin_master.environment")
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(MissionInputError, match=r"needs gymnasium: pip install 'uav-twin\[gym\]'\.$"):
+        importlib.import_module("twin_master.environment")

@@ -22,11 +22,9 @@ from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
 from scenarios import structure_files
 from tests.command_line import refused, said
-from tests.refusals import Inputs
-from tests.refusals import refused as in_one_sentence
 from tests.twin_master.runs import edited, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.errors import FleetError, MissionInputError, ScenarioError
+from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission import sensor_design
@@ -104,12 +102,6 @@ def test_an_action_is_a_control_with_a_price_and_a_repair_follows_the_growth_of_
     assert not row[1:].any()
 
 
-@pytest.mark.parametrize(("old", "new", "sentence"), Inputs(__file__).refused("actions"))
-def test_what_is_wrong_with_an_action_is_said_in_one_sentence(old, new, sentence):
-    with in_one_sentence(ScenarioError, sentence):
-        scenario((old, new))
-
-
 def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn():
     known = knowledge()
     row = np.full(26, np.nan)
@@ -152,7 +144,11 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
     path, policy, folder = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz", tmp_path / "run"
     given = BeliefPolicy(np.random.default_rng(0).random((1, 25)), np.array([INSPECT]))
     policy.write_bytes(policy_file(given, knowledge().model))
-    assert "is no policy" in refused("run", path, "--policy", path, "--out", folder)
+    (tmp_path / "empty").touch()
+    for wrong in (path, tmp_path / "empty"):
+        told = refused("run", path, "--policy", wrong, "--out", folder)
+        assert "is no policy" in told
+        assert "pickle" not in told
     said("run", path, "--policy", policy, "--out", folder, "--no-report")
     kept = kept_knowledge(folder, kept_scenario(folder)).plan.on_belief
     assert np.array_equal(kept.vectors, given.vectors)

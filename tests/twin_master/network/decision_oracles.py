@@ -1,6 +1,5 @@
 """Independent answers for tests of inference: enumeration, arbitrary precision, variable elimination."""
 
-import itertools
 import logging
 import warnings
 from decimal import Decimal, localcontext
@@ -27,27 +26,25 @@ def random_model(rng, shape=(2, 2), zeros=0.4, product=False):
     return GraphicalModel(space, ("u0", "u1"), prior / prior.sum(), TransitionModel(tuple(tables)))
 
 
+def trajectories(model, control, log_likelihood):
+    """Yield, for each step, p(path) without and with what it shows: tables (S, ..., S) of every path."""
+    joint = np.ones(())
+    for t, row in enumerate(log_likelihood):
+        joint = joint[..., None] * (model.transition.matrix[control[t - 1]] if t else model.prior)
+        before, joint = joint, joint * np.exp(row)
+        yield before, joint
+
+
 def enumerate_trajectories(model, control, log_likelihood):
     """Filtered, smoothed and log evidence by summing over every joint trajectory."""
-    steps, size = log_likelihood.shape
-    matrix = model.transition.matrix
-    likelihood = np.exp(log_likelihood)
-    filtered, evidence = np.zeros((steps, size)), np.zeros(steps)
-    forecast, smoothed = np.zeros((steps, size)), np.zeros((steps, size))
-    for length in range(1, steps + 1):
-        for path in itertools.product(range(size), repeat=length):
-            joint = model.prior[path[0]]
-            for t in range(1, length):
-                joint *= matrix[control[t - 1], path[t - 1], path[t]]
-            for t in range(length - 1):
-                joint *= likelihood[t, path[t]]
-            forecast[length - 1, path[-1]] += joint
-            joint *= likelihood[length - 1, path[-1]]
-            filtered[length - 1, path[-1]] += joint
-            evidence[length - 1] += joint
-            if length == steps:
-                for t in range(steps):
-                    smoothed[t, path[t]] += joint
+    tables = [*trajectories(model, control, log_likelihood)]
+    forecast, filtered = (
+        np.array([table.sum(axis=tuple(range(t))) for t, table in enumerate(some)])
+        for some in zip(*tables, strict=True)
+    )
+    steps = range(len(tables))
+    smoothed = np.array([tables[-1][1].sum(axis=tuple({*steps} - {t})) for t in steps])
+    evidence = filtered.sum(axis=1)
     forecast /= forecast.sum(axis=1, keepdims=True)
     log_evidence = np.diff(np.log(evidence), prepend=0.0)
     return forecast, filtered / evidence[:, None], smoothed / evidence[-1], log_evidence

@@ -1,6 +1,7 @@
 """Runs of the wing of a strain library as their report reads them, with changes; what a figure shows."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,6 @@ def flown(library: Path, folder: Path, **mission: int) -> Run:
     """Fly the paper's mission, of another length, with the wing of a strain library, and read the run."""
     loaded, given = changed_scenario("paper_level_turns", {"mission": mission}), {"strain_library": library}
     return read_run(fly(loaded, folder, given, report=False).folder)
-
-
-def stored(run: Run, place: Path) -> Path:
-    """Write what a report reads of a run into a folder."""
-    place.mkdir(parents=True)
-    groups = {name: run.tree[name].to_dataset().drop_encoding() for name in run.tree.children}
-    attributes = {name: run.tree.attrs[name] for name in ("seed", "scenario")}
-    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
-    tree.to_netcdf(place / "run.nc", engine="h5netcdf")
-    for name, content in (("config", run.config), ("summary", run.summary)):
-        (place / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
-    return place
 
 
 def altered(run: Run, **values: np.ndarray | None) -> Run:
@@ -85,8 +74,22 @@ def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory, run: Run) -> Path:
-    return stored(run, tmp_path_factory.mktemp("runs") / "run")
+def folder(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a report reads of that run."""
+    place = tmp_path_factory.mktemp("run")
+    groups = {name: run.tree[name].to_dataset().drop_encoding() for name in run.tree.children}
+    attributes = {name: run.tree.attrs[name] for name in ("seed", "scenario")}
+    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
+    tree.to_netcdf(place / "run.nc", engine="h5netcdf")
+    for name, content in (("config", run.config), ("summary", run.summary)):
+        (place / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
+    return place
+
+
+@pytest.fixture
+def hold(monkeypatch: pytest.MonkeyPatch) -> Callable[[Run], None]:
+    """What lets a report find a run that is not written: NetCDF takes a second each way."""
+    return lambda run: monkeypatch.setattr(report, "read_run", lambda _folder: run)
 
 
 @pytest.fixture

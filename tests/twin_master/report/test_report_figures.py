@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
-from tests.twin_master.report.conftest import altered, line, panel, rescripted, stored
+from tests.twin_master.report.conftest import altered, line, panel, rescripted
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
 from twin_master.report.mission import (
@@ -22,6 +22,7 @@ from twin_master.report.mission import (
 from twin_master.report.model import calibration_figure, measured, predictive_check
 from twin_master.report.reading import short_number
 from twin_master.report.structure import planform_figure, planform_of
+from twin_master.scenario.schema import Scenario
 
 
 def test_the_mission_figure_draws_the_stored_arrays(run):
@@ -58,9 +59,7 @@ def test_the_mission_figure_draws_the_stored_arrays(run):
         assert_allclose(heights, run["predicted/control_probability"][18, :, control])
         assert [bar.get_y() for bar in bars] == [control] * 10
         assert axes.get_yticklabels()[control].get_text() == name
-
-
-def test_bands_are_the_stored_intervals(run):
+    # Bands are the stored intervals.
     figure = mission_figure(run, 49, [16])
     band = panel(figure, "Gauge 17").collections[0].get_paths()[0].vertices
     heights = band[band[:, 0] == 20][:, 1]
@@ -68,14 +67,11 @@ def test_bands_are_the_stored_intervals(run):
     assert_allclose([heights.min(), heights.max()], [1e6 * end for end in ends])
     loss = panel(figure, "region 2").collections[0].get_paths()[0].vertices
     assert 0.0 <= loss[:, 1].min() <= loss[:, 1].max() <= 80.0
-
-
-def test_sensors_worth_a_panel_are_the_highest_the_first_and_one_for_each_region(run):
-    # built into the library: 17 is strained most, 5 answers to region 1 and 10 to region 2
+    # Worth a panel; built into the library: 17 is strained most, 5 answers to region 1 and 10 to region 2.
     assert choose_sensors(run) == [16, 0, 4, 9]
 
 
-def test_states_and_sensors_have_units_and_names_of_their_own(run, tmp_path):
+def test_states_and_sensors_have_units_and_names_of_their_own(run, hold, tmp_path):
     observation = {
         "role": "operation", "unit": ["bar", *["L/min"] * 23], "standard_deviation": [2e-4] * 24,
         "titles": ["pressure", *[f"flow {number}" for number in range(2, 25)]],
@@ -85,8 +81,8 @@ def test_states_and_sensors_have_units_and_names_of_their_own(run, tmp_path):
     tree = altered(run).tree
     for name in ("observed", "truth"):
         tree[name] = xr.DataTree(tree[name].to_dataset().rename({"strain": "operation"}))
-    place = stored(replace(other, tree=tree), tmp_path / "run")
-    figures = {figure.name: figure for figure in report.report_figures(place, 20)}
+    hold(replace(other, tree=tree, scenario=Scenario.model_validate(other.config["scenario"])))
+    figures = {figure.name: figure for figure in report.report_figures(tmp_path, 20)}
     now = figures["mission_now"].figure
     axes = panel(now, "Stiffness loss of region 1")
     assert axes.get_ylabel() == "z₁ (m2.K/W)"
@@ -111,7 +107,7 @@ def test_numbers_beside_an_axis_are_short():
     ]  # fmt: skip
 
 
-def test_belief_maps_show_the_joint_belief(run):
+def test_maps_show_the_joint_belief_the_policy_and_its_margin(run):
     figure, turns = belief_figure(run), belief_turns(run)
     assert (turns[0], turns[-1], len(turns)) == (0, 49, 8)
     for axes, turn in zip(figure.axes[:8], turns, strict=True):
@@ -120,6 +116,11 @@ def test_belief_maps_show_the_joint_belief(run):
         assert f"turn {turn}" in axes.get_title(loc="left")
     named = [(bool(axes.get_xlabel()), bool(axes.get_ylabel())) for axes in figure.axes[:8]]
     assert named == [(lowest, first) for lowest in (False, True) for first in (True, *(False,) * 3)]
+    figure = policy_figure(run)
+    value = run["policy/action_value"]
+    chosen, margin = (axes.collections[0].get_array().reshape(5, 5) for axes in figure.axes[:2])
+    assert_array_equal(chosen, run["policy/control_index"].reshape(5, 5).T)
+    assert_array_equal(margin, (value[:, 1] - value[:, 0]).reshape(5, 5).T)
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -139,14 +140,6 @@ def test_states_of_another_number_of_factors_show_their_marginals(run, count):
     first = belief_figure(other).axes[0].collections[0].get_array().reshape(2, 50)
     mean = (probability @ coordinates)[:, 0]
     assert_allclose(first, np.stack([1 - 2 * mean, 2 * mean]), atol=1e-12)
-
-
-def test_policy_maps_show_policy_and_margin(run):
-    figure = policy_figure(run)
-    value = run["policy/action_value"]
-    chosen, margin = (axes.collections[0].get_array().reshape(5, 5) for axes in figure.axes[:2])
-    assert_array_equal(chosen, run["policy/control_index"].reshape(5, 5).T)
-    assert_array_equal(margin, (value[:, 1] - value[:, 0]).reshape(5, 5).T)
 
 
 @pytest.mark.parametrize(
@@ -213,15 +206,14 @@ def test_the_wing_is_coloured_by_belief_and_its_gauges_by_reading_and_residual(r
         assert_allclose(lost.get_offsets(), planform.gauges[[4]])
 
 
-def test_nothing_is_drawn_outside_the_figure(run, tmp_path):
+def test_nothing_is_drawn_outside_the_figure(run, hold, tmp_path):
     """Also with titles that would be broken mathematics."""
     titles = [f"gauge ${number}^" for number in range(1, 25)]
-    odd = rescripted(run, state={"title": r"loss of $\frac{1$"}, observation={"titles": titles})
-    place = stored(odd, tmp_path / "run")
-    (place / DESIGN_COPY).parent.mkdir()
-    shutil.copy(SHIPPED_DESIGN, place / DESIGN_COPY)
+    hold(rescripted(run, state={"title": r"loss of $\frac{1$"}, observation={"titles": titles}))
+    (tmp_path / DESIGN_COPY).parent.mkdir()
+    shutil.copy(SHIPPED_DESIGN, tmp_path / DESIGN_COPY)
     names = []
-    for drawn in report.report_figures(place, 18):
+    for drawn in report.report_figures(tmp_path, 18):
         names.append(drawn.name)
         tight = drawn.figure.get_tightbbox()
         width, height = drawn.figure.get_size_inches()

@@ -1,6 +1,11 @@
-"""The schema of scenario files: what is read, the sentence for whatever is wrong, kinds, and format 1."""
+"""Scenario files: what is read, what is refused, kinds, format 1; what options and files change."""
 
+import itertools
+import json
 import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -8,34 +13,37 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calibration.errors import CalibrationRecordError
+from calibration.result.file import description, plain_record, result_bytes, run_record, save_calibration
+from calibration.result.record import Calibration as Calibrated
+from calibration.result.record import ParameterPrior
+from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
+from fe.wing.design import SHIPPED_DESIGN
+from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import merged, table_of, text_of, written
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset
+from twin_master.assets.parameter import draw_parameter
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.errors import ScenarioError, TwinMasterError
+from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.graphical_model import worsening_table
+from twin_master.run_folder import to_json
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
-from twin_master.scenario.schema import Scenario
+from twin_master.scenario.schema import Calibration, Scenario
 from twin_master.scenario.section import AssetSection
+from uav_twin import fly, load_calibration
 
-TEXT = text_of("level_turns")
-
-
-def test_everything_inside_is_si():
-    scenario = load_scenario("level_turns").scenario
-    assert scenario.state[0].levels == (0.0, 0.2, 0.4, 0.6, 0.8)
-    assert scenario.observation.standard_deviation == 125e-6
-    assert scenario.truth.noise.standard_deviation == 150e-6
-    assert scenario.rewards.health_limit == 2500e-6
-    assert scenario.truth.gains[0].gain == 0.02
-    assert load_scenario("failing_gauges").scenario.truth.sensor_faults[-1].rate == 6e-6
+INPUTS = Inputs(__file__)
+EDITED = ("level_turns", "level_turns_learning", "inspected_wing", "model_mismatch")
 
 
-@pytest.mark.parametrize(("old", "new", "sentence"), Inputs(__file__).refused("scenarios"))
-def test_whatever_is_wrong_is_named_in_one_sentence(old, new, sentence, tmp_path):
-    path = written(tmp_path, TEXT, (old, new))
+@pytest.mark.parametrize(
+    ("name", "old", "new", "sentence"), [(name, *row) for name in EDITED for row in INPUTS.refused(name)]
+)
+def test_whatever_is_wrong_is_named_in_one_sentence(name, old, new, sentence, tmp_path):
+    path = written(tmp_path, text_of(name, (old, new)))
     with refused(ScenarioError, f"^{re.escape(str(path))}: .*{sentence}"):
         load_scenario(path)
 
@@ -57,22 +65,25 @@ def tables(*changed: list[float]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("name", "changes", "words"),
     [
-        ({"mission": {"seed": 10**40}}, r"mission\.seed.*at most 9223372036854775807.*files"),
-        ({"mission": {"seed": 10**5000}}, r"mission\.seed.*thousands of digits"),
-        ({"observation": {"standard_deviation_microstrain": 10**400}},
-         r"observation\.standard_deviation.*finite"),
-        ({"rewards": {"health_weight": 10**5000}}, r"rewards\.health_weight.*thousands of digits"),
-        ({"observation": {"standard_deviation": 1e-4}}, "given with and without its unit"),
-        (tables([0.0, 0.0, 0.0, 0.1, 0.8]), r"2g\.z1.*sum to 1"),
-        (tables([0.0, 1.0]), "5 rows of 5"),
+        *[("level_turns", *row) for row in (
+            ({"mission": {"seed": 10**40}}, r"mission\.seed.*at most 9223372036854775807.*files"),
+            ({"mission": {"seed": 10**5000}}, r"mission\.seed.*thousands of digits"),
+            ({"observation": {"standard_deviation_microstrain": 10**400}},
+             r"observation\.standard_deviation.*finite"),
+            ({"rewards": {"health_weight": 10**5000}}, r"rewards\.health_weight.*thousands of digits"),
+            ({"observation": {"standard_deviation": 1e-4}}, "given with and without its unit"),
+            (tables([0.0, 0.0, 0.0, 0.1, 0.8]), r"2g\.z1.*sum to 1"),
+            (tables([0.0, 1.0]), "5 rows of 5"),
+        )],
+        *INPUTS.refused("tables"),
     ],
-    ids=range(7),
+    ids=itertools.count(),
 )  # fmt: skip
-def test_numbers_that_no_file_or_float_holds_come_twice_or_are_no_table_are_refused(changes, words):
+def test_keys_that_do_not_fit_and_numbers_that_no_file_or_float_holds_are_refused(name, changes, words):
     with refused(ScenarioError, words):
-        parse_scenario(merged(table_of("level_turns"), changes), "mine.toml")
+        parse_scenario(merged(table_of(name), changes), "mine.toml")
 
 
 @settings(max_examples=60, deadline=None)  # the first one loads every source
@@ -98,7 +109,7 @@ def test_no_table_whatsoever_raises_anything_but_a_sentence(table):
 
 # ---------------------------- the kinds, a kind of one's own, and files of format 1
 
-FORMAT_1 = Inputs(__file__).table("format_1.toml")
+FORMAT_1 = INPUTS.table("format_1.toml")
 
 
 def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:
@@ -107,15 +118,11 @@ def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:
     return parse_scenario(table, "old.toml")
 
 
-@pytest.mark.parametrize("name", FORMAT_1["same"])
+@pytest.mark.parametrize("name", [*FORMAT_1["same"], "three_fmus"])
 def test_a_file_of_format_1_means_what_it_meant(name):
-    assert of_format_1(name, FORMAT_1["same"][name]) == parse_scenario(table_of(name), name)
-
-
-def test_all_of_several_fmus_is_read_from_format_1():
-    new = table_of("three_fmus")
-    old = new["asset"] | {"design": "uav_wing", "observation_model": None, "patch": None, "isolated": True}
-    assert of_format_1("three_fmus", old) == parse_scenario(table_of("three_fmus"), "three_fmus")
+    several = {"design": "uav_wing", "observation_model": None, "patch": None, "isolated": True}
+    old = FORMAT_1["same"].get(name, table_of(name)["asset"] | several)
+    assert of_format_1(name, old) == parse_scenario(table_of(name), name)
 
 
 @pytest.mark.parametrize(("asset", "flown", "believed"), FORMAT_1["kinds"]["rows"])
@@ -172,3 +179,164 @@ def test_a_kind_of_one_s_own_is_one_class(tmp_path):
     assert knowledge.sensor_model.mean[0, 1, 0] == pytest.approx(3.0 / 900.0)
     with pytest.raises(ScenarioError, match=r"asset: unknown key `stifness`.*kind, stiffness"):
         parse_scenario(table | {"asset": {"kind": "bellows", "stifness": 1.0}}, "mine.toml")
+
+
+MakeCalibration = Callable[..., Calibrated]
+
+
+@pytest.fixture(scope="module")
+def folder(
+    library_file: Path, make_calibration: MakeCalibration, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """What scenarios and options name: a library, another wing, hidden effects, a calibration, half of it."""
+    place = tmp_path_factory.mktemp("given")
+    shutil.copy(library_file, place / "UAVconfig.json")
+    written(place, SHIPPED_DESIGN.read_text(), ("refinement = 1.0", "refinement = 0.25"), name="other.toml")
+    effects = [{"id": "hidden", "primitives": ModelPatch((LocalStiffnessLoss(0.3, 0.9, 0.3),)).to_list()}]
+    written(place, json.dumps({"schema": SCHEMA, "effects": effects, "channels": {}}), name="p.json")
+    wing = save_calibration(make_calibration(), place / "wing 7.nc")
+    (place / "half.nc").write_bytes(wing.read_bytes()[:9000])
+    return place
+
+
+BOUND, BELIEF = 'binding = "uav_wing"\n', '[belief]\nkind = "design"\ndesign = "uav_wing"\n'
+FLOWN_PATCH, OTHER = (BOUND, f'{BOUND}patch = "p.json"\n'), ('design = "uav_wing"', 'design = "other.toml"')
+OF_CALIBRATION, DRAWN = ('design = "uav_wing"', 'design = "calibration"'), 'source = "static_test"'
+LIBRARY, WING = {"strain_library": "UAVconfig.json"}, {"asset/binding.toml", "asset/flown_design.toml"}
+FILE, TAILORED = {"calibration": "wing 7.nc"}, {"asset/binding.toml", "asset/calibration.nc"}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "given", "kinds", "differ", "kept"),
+    [
+        ("level_turns", (), {}, "design design", False, {*WING, "asset/design.toml"}),
+        ("level_turns", (), LIBRARY, "strain_library asset", False, {"asset/UAVconfig.json"}),
+        ("level_turns", (FLOWN_PATCH, (BELIEF, f'{BELIEF}patch = "p.json"\n')), {}, "design design", True,
+         {*WING, "asset/design.toml", "asset/patch.json", "asset/model_patch.json"}),
+        ("level_turns", ((BELIEF, BELIEF.replace("uav_wing", "other.toml")),), {}, "design design", False,
+         {*WING, "asset/design.toml"}),
+        ("level_turns", ((BELIEF, '[belief]\nkind = "strain_library"\nfile = "UAVconfig.json"\n'),), {},
+         "design strain_library", True, {*WING, "asset/UAVconfig.json"}),
+        ("level_turns", ((DRAWN, 'source = "file"\nfile = "wing 7.nc"'),), {},
+         "calibration calibration", False, TAILORED),
+        ("level_turns", ((DRAWN, 'source = "file"\nfile = "none.nc"'),), FILE,
+         "calibration calibration", False, TAILORED),
+        ("model_mismatch", (), {"strain_library": "."}, "strain_library design", True,
+         {"asset/UAVconfig.json", "asset/design.toml"}),
+        ("model_mismatch", (("# file", "file"),), {}, "strain_library design", True,
+         {"asset/UAVconfig.json", "asset/design.toml"}),
+        ("model_mismatch", (), LIBRARY | FILE, "strain_library calibration", True,
+         {"asset/UAVconfig.json", "asset/calibration.nc"}),
+    ],
+)  # fmt: skip
+def test_what_flies_what_is_believed_and_what_a_run_keeps(folder, name, changes, given, kinds, differ, kept):
+    """Paths start at the scenario, and what is kept leaves no trace of the machine."""
+    loaded = load_scenario(written(folder, text_of(name, *changes)))
+    scenario = resolve_scenario(loaded, {key: folder / file for key, file in given.items()})
+    assert f"{scenario.asset.kind} {scenario.belief.kind}" == kinds
+    source = asset_source(scenario)
+    source.check()
+    files = source.files()
+    assert (source.origin.differ, {*files}) == (differ, kept)
+    content = (folder / "wing 7.nc").read_bytes()
+    assert files.get("asset/calibration.nc", content) == content
+    portable = scenario.portable()
+    assert str(folder) not in json.dumps(portable.to_dict())
+    assert {*re.findall('"/there/(.*?)"', json.dumps(portable.moved(Path("/there")).to_dict()))} <= kept
+
+
+def test_what_options_change_and_what_stays_the_scenarios(folder):
+    loaded, fmu, file = load_scenario("level_turns"), folder / "x.fmu", folder / "wing 7.nc"
+    scenario = resolve_scenario(loaded, Overrides(seed=4, fmu=fmu, in_process=True))
+    assert (scenario.mission.seed, scenario.asset.binding) == (4, "uav_wing")
+    assert (scenario.asset.file, scenario.asset.isolated) == (str(fmu), False)
+    bound = load_scenario(written(folder, text_of("level_turns", ('"uav_wing"\n#', '"mine.toml"\n#'))))
+    assert resolve_scenario(bound, Overrides()).asset.binding == str(folder / "mine.toml")
+    tailored = resolve_scenario(loaded, Overrides(calibration=file))
+    assert (tailored.calibration.file, tailored.calibration.draws) == (str(file), 100)
+    assert tailored.asset.parameters == loaded.scenario.asset.parameters  # the truth stays the scenario's
+    named = '[calibration]\nparameter = "young_modulus_factor"\nmean = 1.0\nstandard_deviation = 0.01\n'
+    learnt = written(folder, f"format = 1\n{named}", name="learnt.toml")
+    tailored = resolve_scenario(loaded, Overrides(calibration=file, learnt=learnt))
+    assert (tailored.asset.kind, tailored.calibration.source) == ("calibration", "normal")
+    asset_source(tailored).check()
+    for changes in ((), (OTHER, OTHER)):  # of component and belief
+        several = load_scenario(written(folder, text_of("three_fmus", *changes)))
+        coupled = resolve_scenario(several, Overrides(calibration=file))
+        assert [component.design for component in coupled.asset.component] == [None, "calibration", None]
+        assert coupled.belief.kind == "calibration"
+        asset_source(coupled).check()
+    pump = load_scenario("pump_wear")
+    of_ssp = resolve_scenario(pump, Overrides(ssp=folder / "pump.ssp")).asset
+    assert (of_ssp.kind, of_ssp.parameters) == ("ssp", pump.scenario.asset.parameters)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "given", "sentence"),
+    [
+        ("level_turns", (), LIBRARY | FILE, "a strain library brings its own samples"),
+        ("level_turns", (OF_CALIBRATION,), {}, "there is no calibration file: give --calibration"),
+        ("three_fmus", (OF_CALIBRATION,), {}, "the design of a calibration is asked for, and there is no"),
+        ("level_turns", (), {"calibration": "half.nc"}, "damaged"),
+        ("level_turns", (), {"calibration": "none.nc"}, "not there"),
+        ("level_turns", (FLOWN_PATCH,), {"fmu": "x.fmu"}, r"`asset\.patch` goes into the FMU"),
+        ("model_mismatch", (), {"fmu": "x.fmu"}, "binding"),
+        ("three_fmus", (), {"fmu": "x.fmu"}, "the scenario couples several"),
+        ("three_fmus", (), {"fmu": "x.fmu", "ssp": "x.ssp"}, "give one of an SSP file"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(folder, name, changes, given, sentence):
+    loaded = load_scenario(written(folder, text_of(name, *changes)))
+    with refused((TwinMasterError, CalibrationRecordError), sentence):
+        asset_source(resolve_scenario(loaded, {key: folder / file for key, file in given.items()})).check()
+
+
+def test_draws_and_records_are_those_of_the_samples(folder, make_calibration):
+    file = folder / "wing 7.nc"
+    result = load_calibration(file)
+
+    def section(parameter: str, draws: int = 20) -> Calibration:
+        table = {"parameter": parameter, "source": "file", "file": str(file), "draws": draws}
+        return Calibration.model_validate(table)
+
+    for name in ("young_modulus_factor", "servo_mass"):
+        draws = draw_parameter(section(name), 3)
+        assert set(draws.values.tolist()) <= set(result.draws_of(name).tolist())
+        assert (draws.name, len(draws.values)) == (name, 20)
+        assert (draws.mean, draws.standard_deviation) == (result.mean(name), result.standard_deviation(name))
+        assert "Wing 7 (é)" in draws.source
+    everything = draw_parameter(section("servo_mass", 40), 3).values
+    np.testing.assert_array_equal(np.sort(everything), np.sort(result.draws_of("servo_mass")))
+    text = to_json(run_record(result, "young_modulus_factor"))
+    assert text == to_json(run_record(load_calibration(file), "young_modulus_factor"))
+    record = json.loads(text)
+    state = record["state"]["servo_mass"]
+    assert state["unit"] == "kg"
+    assert state["standard_deviation"] == pytest.approx(result.standard_deviation("servo_mass"))
+    assert state["interval_95"] == pytest.approx(np.quantile(result.samples[:, 1], [0.025, 0.975]))
+    correlation = np.corrcoef(result.samples[:, :5], rowvar=False)
+    np.testing.assert_allclose(plain_record(result)["correlation"]["matrix"], correlation, atol=1e-12)
+    grid, density = (np.array(record["posterior"][name]) for name in ("grid", "density"))
+    assert np.trapezoid(density, grid) == pytest.approx(1.0, abs=0.05)
+    assert f"servo_mass {result.mean('servo_mass'):.6g} +- " in description(result)
+    single = run_record(make_calibration(count=1), "young_modulus_factor")  # figures that do not vary
+    to_json(single)
+    assert single["posterior"] == {}
+    assert single["correlation"]["matrix"] == np.eye(5).tolist()
+
+
+@pytest.mark.parametrize(("scenario", "means", "words"), Inputs(__file__).refused("campaign"))
+def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario, means, words):
+    values = np.array([*means.values()])
+    samples = values * (1.0 + 0.001 * np.random.default_rng(1).standard_normal((50, len(values))))
+    priors = tuple(
+        ParameterPrior(name, "1", mean, 0.1 * mean, 0.5 * mean, 2.0 * mean, "model.toml")
+        for name, mean in means.items()
+    )
+    heading = ("spring 7", "spring", "0" * 64, "Gaussian")
+    found = Calibrated(*heading, priors, samples, samples, None, (), (), "test", 1, {})
+    (tmp_path / "calibration.nc").write_bytes(result_bytes(found))
+    given = Overrides(calibration=tmp_path / "calibration.nc")
+    with pytest.raises(MissionInputError, match=words):
+        fly(load_scenario(scenario), tmp_path / "run", given, report=False)
+    assert not (tmp_path / "run").exists()

@@ -43,6 +43,7 @@ def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_
         for key, variable in variables.items():
             np.testing.assert_array_equal(node[key], variable.values)
             assert (node[key].dims, node[key].attrs) == (variable.dims, variable.attrs)
+            assert key not in made.variables or (variable.attrs["units"] and variable.attrs["long_name"])
     np.testing.assert_array_equal(read["observed"]["strain"], result.flight.observed)
     (tmp_path / "a/run.nc").write_bytes(first[:1000])
     with pytest.raises(RunFolderError, match="not a whole run"):
@@ -64,6 +65,7 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
     noise = result.knowledge.sensor_model.total_standard_deviation  # with the place between the levels
     np.testing.assert_allclose(filtered["noise_standard_deviation"][0], noise[0, 1])
     assert noise.max() > 1.1 * noise.min()
+    assert filtered["sensors_received"].values[36] == 0
     assert np.isnan(filtered["reward_mean"].sel(reward="error").values[36:38]).all()
     assert np.isnan(predicted["reward_mean"].sel(reward="error")).all()
     assert set(tree["truth"]["sensor_status"].values[8:36, 11]) == {2}  # it drifts
@@ -163,3 +165,9 @@ def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
+    blind = np.full((2, 2, 3), np.nan)  # the asset shows nothing anywhere, or one gauge alone
+    assert "model_misfit_rms" not in [f.key for f in summarise(complete, np.zeros((50, 3)), blind)]
+    blind[:, 1, 2] = 0.3, -0.4
+    found = {f.key: f.value for f in summarise(complete, np.zeros((50, 3)), blind)}
+    assert found["model_misfit_largest"] == pytest.approx(40.0)
+    assert found["model_misfit_rms"] == pytest.approx(100.0 * np.sqrt(0.125))

@@ -23,7 +23,7 @@ from fe.wing.design import SHIPPED_DESIGN
 from reporting.figures import new_figure, to_svg
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
-from tests.twin_master.watch.watches import viewed
+from tests.twin_master.watch.conftest import viewed
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError

@@ -1,25 +1,204 @@
-"""A wing and its watches, made once."""
+"""Watches without a calibration of their own, recordings, and a broker; a wing and its watches, made once."""
 
+import copy
+import json
+import os
 import re
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from paho.mqtt import client as paho
 
+from fe.runtime.patch import ModelPatch, SensorGain
+from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
-from tests.twin_master.runs import flight_of
-from tests.twin_master.watch.watches import begun, ran, watchful, write_csv
+from tests.twin_master.runs import flight_of, text_of
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.loop import BelievedModel
 from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.scenario.tables import Noticing
+from twin_master.viewer.flight import Flight
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
+from twin_master.watch.intake import Counts, Feed
 from twin_master.watch.opening import begun_watch
+
+
+def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:
+    lines = ["turn,control," + ",".join(f"strain_{number}" for number in range(1, 25))]
+    for turn, row in enumerate(observed):
+        cells = ",".join("" if np.isnan(value) else repr(value) for value in row.tolist())
+        lines.append(f"{turn},{('2g', '3g')[controls[turn]]},{cells}")
+        if garbage and turn % 7 == 3:
+            lines.append(f"{turn},4g,what")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def begun(base: Watch, folder: Path) -> Watch:
+    """Return a watch of the same configuration in a folder of its own, without calibrating again."""
+    shutil.copytree(base.folder, folder)
+    watch = copy.copy(base)
+    watch.folder, watch._path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
+    return watch
+
+
+def watchful(base: Watch, folder: Path) -> Watch:
+    watch = begun(base, folder)
+    watch.scenario = watch.scenario.model_copy(update={"notice": Noticing()})
+    watch.models = [BelievedModel(0, replace(base.models[0].knowledge, scenario=watch.scenario))]
+    watch._take_up()
+    return watch
+
+
+def decided(watch: Watch, feed: Feed, between: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+    """Run a watch to the end of its feed; return what was decided."""
+    decisions = list[dict[str, Any]]()
+    watch.run(feed, lambda decision: decisions.append(dict(decision)), between)
+    return decisions
+
+
+def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
+    """Run a watch up to each number of turns (None: to the end); return the last counts."""
+    for turns in stops or (None,):
+        counts = watch.run(feed, lambda _decision: time.sleep(pause), turns=turns)
+    return counts
+
+
+def beliefs_of(watch: Watch, observed: np.ndarray, controls: np.ndarray, first: int) -> list[list[float]]:
+    """Return what a twin believes that has the second model of a watch from a turn on."""
+    twin, beliefs = watch.models[0].knowledge.twin(), []
+    for turn, (row, control) in enumerate(zip(observed, controls.tolist(), strict=True)):
+        if turn == first:
+            state, twin = twin.save_state(), watch.models[1].knowledge.twin()
+            twin.restore_state(state)
+        beliefs.append(twin.turn(row, control).filtered.tolist())
+    return beliefs
+
+
+def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
+    """Run in a process of its own, killed once the journal has a size; return whether it was killed."""
+    journal, child = watch.folder / JOURNAL_NAME, os.fork()
+    if not child:
+        try:
+            run()
+            os._exit(0)
+        finally:
+            os._exit(1)
+    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+        if journal.exists() and journal.stat().st_size >= size:
+            os.kill(child, signal.SIGKILL)
+            ended = os.waitpid(child, 0)
+            break
+        time.sleep(0.0005)
+    assert ended[1] in (0, signal.SIGKILL)
+    return ended[1] == signal.SIGKILL
+
+
+def viewed(folder: Path) -> Flight:
+    """Return a run or watch as viewers see it."""
+    flight = Flight(folder)
+    while flight.update():
+        pass
+    return flight
+
+
+def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
+    """Return a patch in which a gauge shows too much by a share."""
+    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
+    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
+
+
+def of_gauge(path: Path, gain: float, channel: str = "g5") -> Path:
+    """Write such a patch."""
+    path.write_text(json.dumps(patch_of(gain, channel)))
+    return path
+
+
+def wait_until(found: Callable[[], object]) -> None:
+    limit = time.monotonic() + 60.0
+    while not found():
+        assert time.monotonic() < limit
+        time.sleep(0.02)
+
+
+PASSWORD = "a password"
+
+
+class Mosquitto:
+    """A broker on the loopback that wants a user, or TLS, and keeps its sessions when it stops."""
+
+    def __init__(self, folder: Path, *, tls: bool = False) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self.folder, self.tls = folder, tls
+        self.authority = folder / "certificate.pem"
+        self.let_in(PASSWORD)
+        self.further: list[str] = []
+        self.lines = [
+            f"listener {self.port} 127.0.0.1", "allow_anonymous false", f"password_file {folder / 'users'}",
+            "persistence true", f"persistence_location {folder}/", "max_queued_messages 10000", "user root",
+        ]  # fmt: skip
+        if tls:
+            words = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2"
+            words += " -addext subjectAltName=DNS:localhost,IP:127.0.0.1 -subj /CN=localhost"
+            files = ["-keyout", str(folder / "key.pem"), "-out", str(self.authority)]
+            subprocess.run([*words.split(), *files], check=True, capture_output=True)
+            self.lines += [f"certfile {self.authority}", f"keyfile {folder / 'key.pem'}"]
+        self.start()
+
+    def let_in(self, password: str) -> None:
+        """Let in who knows a password, from the next start on."""
+        users = ["mosquitto_passwd", "-b", "-c", str(self.folder / "users"), "wing", password]
+        subprocess.run(users, check=True, capture_output=True)
+
+    def start(self) -> None:
+        config = self.folder / "mosquitto.conf"
+        config.write_text("\n".join([*self.lines, *self.further, ""]))
+        self.process = subprocess.Popen(["mosquitto", "-c", str(config)], stderr=subprocess.DEVNULL)
+        for _ in range(400):
+            try:
+                socket.create_connection(("127.0.0.1", self.port), 1.0).close()
+                return
+            except OSError:
+                time.sleep(0.02)
+
+    def stop(self) -> None:
+        self.process.terminate()
+        self.process.wait(20)
+
+    def again(self) -> None:
+        self.stop()
+        self.start()
+
+    def client(self, name: str, heard: list[Any] | None = None) -> Any:
+        """Return a client whose session lasts, and that hears what its topics say."""
+        client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name, clean_session=False)
+        client.username_pw_set("wing", PASSWORD)
+        if heard is not None:
+            client.on_message = lambda _client, _data, told: heard.append(json.loads(told.payload))
+        if self.tls:
+            client.tls_set(ca_certs=str(self.authority))
+        client.connect("localhost" if self.tls else "127.0.0.1", self.port)
+        client.loop_start()
+        return client
 
 
 @pytest.fixture(scope="session")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
-    """`paper_level_turns` of a real wing: without what flies and what really happens."""
-    text = load_scenario("paper_level_turns").path.read_text(encoding="utf-8")
+    """`paper_level_turns` of a real wing: without what flies and what really happens; with fewer draws."""
+    text = text_of("paper_level_turns", ("draws = 100", "draws = 20"))
     tables = re.compile(r"^\[+(asset|truth|reference)\b.*?(?=^\[|\Z)", re.MULTILINE | re.DOTALL)
     path = tmp_path_factory.mktemp("scenario") / "my_wing.toml"
     path.write_text(f"{tables.sub('', text)}\n[watch]\nlag = 12\n", encoding="utf-8")

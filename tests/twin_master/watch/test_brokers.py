@@ -12,18 +12,16 @@ from typing import Any
 
 import pytest
 
-from reporting.progress import SilentProgress
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
+from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed, Topic
-from twin_master.watch.opening import flown
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 TOPIC, DECISION = "wing/7", "wing/7/decision"
@@ -127,6 +125,7 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
 
 @pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
 def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(watch, broker, kills):
+    """Of each kill the broker tells that the watch was lost."""
     turns, chance, where = 60 * kills, random.Random(kills), where_of(broker)
     listener, heard = heard_at(broker, "listener")
 
@@ -146,6 +145,10 @@ def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_kil
 
     while killed_at(watch, next_end(), lambda: run(turns)):
         met += 1
+        asker, states = heard_at(broker, "asker", f"{TOPIC}/heartbeat")
+        wait_until(lambda states=states: states and states[-1]["state"] == "lost")
+        asker.disconnect()
+        asker.loop_stop()
     assert met == kills
     listener = broker.client("listener", heard)
     wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
@@ -202,6 +205,8 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     watched(watch, 7)  # nothing more is wanted, and what was not published is
     wait_until(lambda: len([one for one in heard if "control" in one]) >= 7)
     assert {one["turn"] for one in heard if one.get("told_again")} == {*range(7)}
+    wait_until(lambda: heard[-1].get("state") == "ended")
+    assert [heard[-1][key] for key in ("turn", "lag", "received", "refused")] == [6, 0, 6, 0]
     feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 7))
     with pytest.raises(ZeroDivisionError), closing(feed):
         watch.run(feed, lambda decision: decision["turn"] // 0)
@@ -280,39 +285,6 @@ def test_a_subscription_that_is_refused(watch, broker, tmp_path):
     feed = MqttFeed(broker_of(f"mqtt://127.0.0.1:{broker.port}/{TOPIC}"), watch, str)
     with pytest.raises(MissionInputError, match=r"does not let the twin read wing/7: Not authorized"):
         watch.run(feed, str)
-
-
-def test_a_watch_says_that_it_hears_nothing_that_it_ends_and_that_it_was_killed(hasty, broker, monkeypatch):
-    monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.1)
-    client, heard = heard_at(broker, "client", f"{TOPIC}/+")
-
-    def has(turn: int, kind: str) -> bool:
-        told = [one for one in heard if one.get("turn") == turn]
-        return any(notice["kind"] == kind for one in told for notice in one.get("notices", ()))
-
-    def is_said(state: str) -> None:
-        wait_until(lambda: [one["state"] for one in heard if "state" in one][-1:] == [state])
-
-    def run() -> None:
-        hasty.run(MqttFeed(where_of(broker), hasty, str), str)
-
-    with watching(where_of(broker), hasty, 2):
-        wait_until(lambda: has(-1, "quiet"))
-        is_said("quiet")
-        client.publish(TOPIC, b"garbage", qos=1)
-        publish(client, 0)
-        wait_until(lambda: has(0, "heard") and has(0, "quiet"))
-        is_said("quiet")
-        beat = [one for one in heard if "state" in one][-1]
-        assert [beat[key] for key in ("turn", "lag", "received", "refused")] == [0, 0, 2, 1]
-        publish(client, 1)
-    is_said("ended")
-    assert killed_at(hasty, (hasty.folder / JOURNAL_NAME).stat().st_size + 1, run)
-    is_said("lost")
-    client.disconnect()
-    assert [notice.kind for _, notice in hasty.told(-1)] == ["quiet", "heard", "quiet", "heard", "quiet"]
-    with flown(hasty.folder, None, None, SilentProgress()) as copy:
-        assert "see whether logger and broker are there" in (copy / "summary.json").read_text()
 
 
 @pytest.mark.parametrize(("wrong", "sentence"), Inputs(__file__).refused("addresses"))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.watches import ran
+from tests.twin_master.watch.conftest import ran
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.message import Message, Refused

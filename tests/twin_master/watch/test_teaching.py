@@ -13,7 +13,7 @@ import pytest
 
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal
-from tests.twin_master.watch.watches import (
+from tests.twin_master.watch.conftest import (
     beliefs_of,
     decided,
     of_gauge,
@@ -128,8 +128,15 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     while flight.update():
         pass
     assert flight.number > number  # what a view has told is void
-    shown = flight.believed(flight.seen(0, 5)).expected.mean
-    np.testing.assert_allclose(shown[:, 4], 0.7 * before[:, 4], rtol=1e-9)
+    seen = flight.seen(0, 25)
+    shown = flight.believed(seen)
+    np.testing.assert_array_equal(shown.expected.mean[:5], before)  # as it was told
+    controls = [turn["control_index"] for turn in seen]
+    for part, model in zip((slice(20), slice(20, None)), noticing.models, strict=True):
+        joint = known_control(shown.probability[part], controls[part], 2)
+        expected, _ = model.knowledge.sensor_model.moments(joint)
+        np.testing.assert_allclose(shown.expected.mean[part], expected, rtol=1e-12)
+    np.testing.assert_array_equal(viewed(noticing.folder).believed(seen).expected.mean, shown.expected.mean)
     (picture,) = flight.pictures
     teller = Teller(flight)
     assert b"<svg" in picture.drawing.read_bytes()
@@ -230,7 +237,8 @@ def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_pat
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
-    return {"turn": number, "notices": list(alarms), "suspicion": {"log_evidence_none": evidence}}
+    told = {"suspicion": {"log_evidence_none": evidence}, "filtered": [1.0]}
+    return {"turn": number, "notices": list(alarms), **told}
 
 
 def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():

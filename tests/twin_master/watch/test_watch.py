@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 import uav_twin
+from reporting.netcdf import Group, Variable, write_groups
 from reporting.progress import SilentProgress
 from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
-from tests.twin_master.watch.watches import (
+from tests.twin_master.watch.conftest import (
     begun,
     decided,
     killed_at,
@@ -55,7 +56,7 @@ def journalled(watch: Watch, folder: Path | None = None) -> list[Any]:
 
 
 def belief_of(watch: Watch) -> object:
-    return json.loads(last_line(watch.folder))["filtered"]
+    return [line["filtered"] for line in journal(watch.folder) if "filtered" in line][-1]
 
 
 def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tmp_path):
@@ -158,6 +159,27 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
         assert last["filtered"] == found.filtered.tolist()
 
 
+def test_what_inspections_read_is_read_back_from_a_run(tmp_path):
+    scenario = load_scenario("inspected_wing").scenario
+    names, strain = [name for *_, name, _ in scenario.readings], 1e-4 * np.ones((2, 24))
+    read = np.array([[np.nan] * len(names), 0.1 + 0.2 * np.arange(len(names))])
+    found = {name: Variable(("step",), own, {}) for name, own in zip(names, read.T, strict=True)}
+    found |= {"strain": Variable(("step", "sensor"), strain, {})}
+    steps = {"step": Variable(("step",), np.array([3, 4]), {})}
+    write_groups(tmp_path / "run.nc", {"observed": Group(found, steps)}, {})
+    messages = [message for message, _ in file_feed(tmp_path / "run.nc", scenario).messages(None)]
+    np.testing.assert_array_equal([message.observed for message in messages], np.hstack((strain, read)))
+
+
+def test_what_came_behind_the_last_turn_of_a_live_watch_stays_counted(watch, mission):
+    told = {"turn": 0, "control": watch.scenario.control_names[mission.control_index[0]]}
+    line = json.dumps(told | {"strain": mission.observed[0].tolist()}).encode() + b"\n"
+    for lines, received in ((3 * line, 3), (b"", 3), (line, 4)):
+        counts = ran(watch, json_lines(watch.scenario, io.BytesIO(lines)))
+        assert (counts.received, counts.duplicates) == (received, received - 1)
+    assert [decision["turn"] for decision in journalled(watch) if decision] == [0]
+
+
 def test_another_file_is_read_from_its_beginning(watch, mission, plain, tmp_path):
     """A logger that begins a file each day; and the first of them once more, which says nothing new."""
     header, *rows = plain.read_text().splitlines()
@@ -171,7 +193,7 @@ def test_another_file_is_read_from_its_beginning(watch, mission, plain, tmp_path
     counts = ran(watch, CsvFeed(tmp_path / "1.csv", watch.scenario))
     assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 8, 2 + 1 + 7)
     counts = ran(watch, CsvFeed(plain, watch.scenario))
-    assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 13, 2 + 1 + 7 + 37)
+    assert (counts.missing, counts.late, counts.duplicates, counts.rejected) == (0, 0, 8 + 13, 2 + 1 + 7 + 37)
     assert belief_of(watch) == mission.filtered[-1].tolist()
 
 
@@ -270,6 +292,7 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
 
     assert kinds(1) == [(-1, ["quiet"])]  # nobody has decided anything yet
     assert "control" not in told[0]
+    assert "see whether logger and broker are there" in told[0]["notices"][0]["sentence"]
     os.write(write, texts[0].encode())
     assert kinds(3)[1:] == [(0, ["heard"]), (0, ["quiet"])]
     assert told[2] == told[1] | {"notices": told[2]["notices"], "told_again": True}

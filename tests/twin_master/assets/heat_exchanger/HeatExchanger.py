@@ -15,11 +15,10 @@ class HeatExchanger(Fmi2Slave):
         self.wall_temperature = 80.0
         self.conductance = 6000.0
         self.specific_heat = 4186.0
-        self.misbehaviour = 0.0
         self.outlet = 20.0
         self.middle = 20.0
         self.heat = 0.0
-        for name in ("mass_flow", "fouling", "wall_temperature", "misbehaviour"):
+        for name in ("mass_flow", "fouling", "wall_temperature"):
             self.register_variable(Real(name, causality=Fmi2Causality.input))
         for name in ("conductance", "specific_heat"):
             self.register_variable(
@@ -36,6 +35,4 @@ class HeatExchanger(Fmi2Slave):
         self.middle = 20.0 + rise * (1.0 - math.exp(-0.5 * exponent))
         self.outlet = 20.0 + rise * (1.0 - math.exp(-exponent))
         self.heat = self.specific_heat * self.mass_flow * (self.outlet - 20.0)
-        if self.misbehaviour and self.fouling > 1.5e-4:
-            self.outlet = math.nan
         return True

@@ -1,0 +1,383 @@
+"""Likelihoods of sensors against integrals; rewards and plans against sums, solvers and enumeration."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, norm
+
+from benchmarks.study_planning import PROBLEMS, tiger
+from twin_master.errors import InvalidModelError, InvalidObservationError, PlanningError
+from twin_master.network import belief_planning
+from twin_master.network.belief_planning import (
+    DecisionProblem,
+    leaving_probability,
+    plan_on_belief,
+    simulated_returns,
+)
+from twin_master.network.identified import IdentifiedSensorModel
+from twin_master.network.inference import known_control
+from twin_master.network.planner import BeliefPolicy, given_policy, value_iteration
+from twin_master.network.quantity import QuantityModel, RewardModel
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.transition import TransitionModel
+
+SEEDS = st.integers(0, 2**32 - 1)
+DRAWS, STATES, CONTROLS, SENSORS = 5, 4, 2, 6
+
+
+def random_sensors(seed, spread=1.0):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(DRAWS, STATES, CONTROLS, SENSORS)) * spread
+    weight = rng.dirichlet(np.ones(DRAWS))
+    deviation = rng.uniform(0.5, 2.0, SENSORS)
+    observation = rng.normal(size=SENSORS) * spread
+    return rng, values, weight, deviation, observation
+
+
+@settings(deadline=None)
+@given(
+    seed=SEEDS,
+    spread=st.sampled_from([1.0, 50.0, 1e4]),
+    relative=st.sampled_from([0.0, 0.5]),
+    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS),
+    control=st.integers(0, CONTROLS - 1),
+)
+def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, relative, lost, control):
+    """With a model error, which widens each density by a share of the prediction, and without."""
+    rng, values, weight, deviation, observation = random_sensors(seed, spread)
+    observation[lost] = np.nan
+    error = relative * rng.uniform(0.0, 1.0, SENSORS)
+    mean = np.einsum("e,esug->sug", weight, values)
+    total = np.sqrt(deviation**2 + (error * mean) ** 2)
+    seen = ~np.isnan(observation)
+    density = norm.logpdf(observation, values[:, :, control], total[:, control])[..., seen]  # (E, S, G)
+    expected = {
+        "outside": logsumexp(density.sum(axis=2), b=weight[:, None], axis=0),
+        "inside": logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1),
+    }
+    far = np.nanmax(np.abs((observation - values[:, :, control]) / total[:, control]), initial=1.0)
+    rounding = 1e-12 + 4.0 * np.finfo(np.float64).eps * far**2  # squares of deviations are taken apart
+    for average, wanted in expected.items():
+        model = GaussianSensorModel(values, deviation, weight, average, model_error=error)
+        np.testing.assert_allclose(model.total_standard_deviation, total, rtol=1e-13)
+        wanted = wanted if seen.any() else np.zeros(STATES)
+        likelihood = model.log_likelihood(observation, control)
+        np.testing.assert_allclose(likelihood, wanted, rtol=1e-12, atol=rounding)
+        assert np.all(np.isneginf(model.log_likelihood(np.full(SENSORS, 1e200), control)))  # no overflow
+        # Nor does it depend on what the model was asked before.
+        turns = [(np.nan * observation, 0), (-observation, 1), (observation, control)]
+        rows = model.log_likelihood_sequence(*zip(*turns, strict=True))
+        np.testing.assert_array_equal(rows, [model.log_likelihood(*turn) for turn in turns])
+    joint = rng.dirichlet(np.ones(STATES * CONTROLS), 3).reshape(3, STATES, CONTROLS)
+    noise = np.sqrt(np.einsum("bsu,sug->bg", joint, total**2))
+    np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
+
+
+@settings(deadline=None)
+@given(
+    seed=SEEDS,
+    factors=st.integers(0, 3),
+    size=st.sampled_from([0.0, 0.3, 3.0, 1e3]),
+    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS).filter(lambda lost: not all(lost)),
+)
+def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
+    """Against densities with the whole covariance; a place in the interval and the rest make the same."""
+    rng, values, weight, deviation, observation = random_sensors(seed)
+    observation[lost] = np.nan
+    seen = ~np.isnan(observation)
+    interval = size * rng.normal(size=(STATES, CONTROLS, SENSORS, factors))
+    covariance = interval @ interval.swapaxes(-1, -2) + np.diag(deviation**2)
+    part = covariance[:, 1][:, seen][:, :, seen]
+    each = np.array(
+        [
+            [
+                multivariate_normal.logpdf(observation[seen], values[e, s, 1, seen], part[s])
+                for e in range(DRAWS)
+            ]
+            for s in range(STATES)
+        ]
+    )
+    expected = logsumexp(each, b=weight, axis=1)
+    close = {"rtol": 1e-7, "atol": 1e-7}  # the covariance has a condition of up to 1e7
+    model = GaussianSensorModel(values, deviation, weight, interval=interval)
+    np.testing.assert_allclose(model.log_likelihood(observation, 1), expected, **close)
+    np.testing.assert_allclose(model.log_density_of_draws(observation[None], [1])[0], each, **close)
+    assert np.all(np.isneginf(model.log_likelihood(np.full(SENSORS, 1e200), 1)))
+    identified = IdentifiedSensorModel(values, deviation, weight, interval=interval)
+    np.testing.assert_allclose(identified.log_likelihood(observation, 1), expected, **close)
+    np.testing.assert_allclose(identified.log_density_of_draws(observation[None], [1])[0], each, **close)
+    total = np.sqrt(np.einsum("sugg->sug", covariance))
+    np.testing.assert_allclose(model.total_standard_deviation, total)
+    printed = GaussianSensorModel(values, deviation, weight, "inside", interval=interval)
+    density = norm.logpdf(observation, values[:, :, 1], total[:, 1])[..., seen]
+    apart = logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1)
+    np.testing.assert_allclose(printed.log_likelihood(observation, 1), apart, **close)
+
+    near = model.nearest(observation, 1, values[:, :, 1])
+    rest = norm.logpdf(observation, near.value, deviation)[..., seen].sum(axis=-1)
+    np.testing.assert_allclose((rest + near.log_density).T, each, **close)
+    sensor = int(np.flatnonzero(seen)[0])
+    others = np.flatnonzero(seen)[1:]
+    for s in range(STATES if size < 100.0 else 0):  # of one sensor given the others; needs the condition
+        gain = np.linalg.solve(covariance[s, 1][np.ix_(others, others)], covariance[s, 1][others, sensor])
+        mean = values[:, s, 1, sensor] + (observation[others] - values[:, s, 1, others]) @ gain
+        variance = covariance[s, 1, sensor, sensor] - gain @ covariance[s, 1][others, sensor]
+        np.testing.assert_allclose(near.alone[:, s, sensor], mean, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(deviation[sensor] ** 2 / near.left[s, sensor], variance, rtol=1e-5)
+
+
+def random_values(seed, ties=False):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(4, 3, 2, 5))
+    if ties:
+        values = np.round(values)
+    weight = rng.dirichlet(np.ones(4))
+    joint = rng.dirichlet(np.ones(6), size=7).reshape(7, 3, 2)
+    joint[0] = 0.0
+    joint[0, 1, 1] = 1.0
+    return values, weight, joint
+
+
+def points(values, weight, joint, sensor):
+    """Every value of one sensor with its probability, under one joint belief."""
+    probability = weight[:, None, None] * joint
+    return values[..., sensor].ravel(), probability.ravel()
+
+
+@settings(deadline=None)
+@given(SEEDS, st.booleans())
+def test_moments_and_quantiles_are_those_of_the_mixture(seed, ties):
+    """The smallest value whose cumulative probability reaches the level; ties and zero weights included."""
+    values, weight, joint = random_values(seed, ties)
+    levels, model = [0.025, 0.3, 0.5, 0.975, 1.0], QuantityModel(values, weight)
+    (mean, deviation), result = model.moments(joint), model.quantiles(joint, levels)
+    assert result.shape == (7, 5, 5)
+    nested = joint[:6].reshape(2, 3, 3, 2)
+    np.testing.assert_array_equal(model.moments(nested)[1].reshape(6, 5), deviation[:6])
+    assert model.quantiles(nested, levels).shape == (2, 3, 5, 5)
+    for b in range(7):
+        for g in range(5):
+            x, p = points(values, weight, joint[b], g)
+            assert mean[b, g] == pytest.approx(p @ x, abs=1e-13)
+            assert deviation[b, g] == pytest.approx(np.sqrt(p @ (x - p @ x) ** 2), abs=1e-13)
+            x, p = x[p > 0], p[p > 0]
+            order = np.argsort(x)
+            cumulative = np.cumsum(p[order])
+            for i, level in enumerate(levels):
+                expected = x[order][np.argmax(cumulative >= level - 1e-12)] if level < 1 else x.max()
+                assert result[b, i, g] == expected
+
+
+LIMIT, LOAD = 2500e-6, (2.0, 3.0)
+SETTINGS = LIMIT, (-0.1, 0.1), 125e-6, LOAD
+
+
+def strains(seed):
+    rng = np.random.default_rng(seed)
+    quantity = QuantityModel(rng.uniform(500e-6, 4000e-6, size=(4, 3, 2, 5)), rng.dirichlet(np.ones(4)))
+    return rng, quantity, rng.dirichlet(np.ones(6)).reshape(3, 2)
+
+
+@given(SEEDS)
+def test_rewards_are_sums_over_states_controls_and_draws(seed):
+    rng, quantity, joint = strains(seed)
+    observation = rng.uniform(500e-6, 4000e-6, 5)
+    observation[rng.integers(5)] = np.nan
+    probability, value = quantity.draw_weight[:, None, None] * joint, quantity.value_per_draw
+    rewards = [
+        1.0 - value.max(axis=3) / LIMIT,
+        np.broadcast_to([-0.1, 0.1], probability.shape),
+        -np.nanmean(np.abs(observation - value), axis=3) / 125e-6 / LOAD,
+    ]
+    model = RewardModel(quantity, *SETTINGS)
+    means, spreads = model.expectation(joint, observation)
+    for i, reward in enumerate(rewards):
+        mean = (probability * reward).sum()
+        spread = np.sqrt((probability * (reward - mean) ** 2).sum())
+        assert means[i] == pytest.approx(mean, abs=1e-12)
+        assert spreads[i] == pytest.approx(spread, abs=1e-7)
+    # A known control has no spread, and without an observation there is no error.
+    mean, spread = model.expectation(known_control(np.full((2, 3), 1 / 3), np.array([0, 1]), 2))
+    np.testing.assert_allclose(mean[:, 1], [-0.1, 0.1], rtol=1e-14)
+    np.testing.assert_allclose(spread[:, 1], 0.0, atol=1e-15)
+    lost, _ = model.expectation(joint, np.full(5, np.nan))
+    assert np.isnan([*mean[:, 2], *spread[:, 2], lost[2]]).all()
+    health = np.tensordot(quantity.draw_weight, 1.0 - value.max(axis=3) / LIMIT, axes=1)
+    np.testing.assert_allclose(model.planning_reward(1.0, 2.5), health + np.array([-0.25, 0.25]), rtol=1e-13)
+
+
+def random_problem(seed, states=7, controls=3):
+    rng = np.random.default_rng(seed)
+    transition = rng.dirichlet(np.full(states, 0.3), (controls, states))
+    transition /= transition.sum(axis=2, keepdims=True)
+    return transition, rng.normal(size=(states, controls))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS, discount=st.sampled_from([0.0, 0.6, 0.9, 0.99]), product=st.booleans())
+def test_the_value_is_optimal_and_that_of_its_policy(seed, discount, product):
+    transition, reward = random_problem(seed, 6)
+    model = TransitionModel((transition,))
+    if product:
+        model = TransitionModel(tuple(random_problem(seed, states)[0] for states in (2, 3)))
+        transition = model.matrix
+    plan = value_iteration(model, reward, discount)
+    scale = np.abs(reward).max() / (1.0 - discount)
+    for policy in (np.random.default_rng(seed).dirichlet(np.ones(3), 6), plan.policy):
+        closed_loop = discount * np.einsum("su,ust->st", policy, transition)
+        exact = np.linalg.solve(np.eye(6) - closed_loop, (policy * reward).sum(axis=1))
+        found = given_policy(model, reward, discount, policy)
+        np.testing.assert_allclose(found.value, exact, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(plan.value, exact, rtol=0, atol=1e-11 * scale)
+    action_value = reward + discount * np.einsum("ust,t->su", transition, plan.value)
+    np.testing.assert_allclose(plan.action_value, action_value, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(plan.value, action_value.max(axis=1), rtol=0, atol=1e-11 * scale)
+    np.testing.assert_array_equal(plan.policy.argmax(axis=1), plan.control_index)
+
+
+def test_ties_go_to_the_first_control():
+    transition, reward = random_problem(0)
+    doubled = TransitionModel((np.concatenate([transition, transition]),))
+    plan = value_iteration(doubled, np.concatenate([reward, reward + 1e-15], axis=1), 0.9)
+    assert np.all(plan.control_index < 3)
+    assert np.all(value_iteration(TransitionModel((transition,)), np.zeros((7, 3)), 0.9).control_index == 0)
+
+
+TABLE, REWARD = random_problem(0)
+MOVES = TransitionModel((TABLE,))
+VALUES, WEIGHT, JOINT = random_values(0)
+HOLED = np.where(np.arange(VALUES.size).reshape(VALUES.shape) == 12, np.nan, VALUES)  # at (0, 1, 0, 2)
+QUANTITY = QuantityModel(VALUES, WEIGHT)
+REWARDS = RewardModel(QUANTITY, 1.0, (0.0, 1.0), 1.0)
+_, SHOWN, SHARE, DEVIATION, OBSERVATION = random_sensors(7)
+HOLDING = GaussianSensorModel(SHOWN, DEVIATION, SHARE)
+REFUSED = [
+    *((lambda bad=bad: GaussianSensorModel(SHOWN, bad, SHARE), "positive noise standard deviation")
+      for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[DEVIATION[:-1], np.inf])),
+    *((lambda bad=bad: GaussianSensorModel(SHOWN, 1.0, SHARE, model_error=bad), "relative model error")
+      for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1))),
+    (lambda: GaussianSensorModel(SHOWN, DEVIATION, SHARE, average="both"), "'outside' or 'inside'"),
+    (lambda: GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=np.ones((2, 1, 1))),
+     r"intervals of shape \(2, 1, 1, factors\), got \(2, 1, 1\)"),
+    (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), rf"sensor values of shape \({SENSORS},\)"),
+    (lambda: HOLDING.log_likelihood(np.r_[OBSERVATION[:3], -np.inf, 0.0, 0.0], 0), r"\(3,\) is infinite"),
+    (lambda: HOLDING.log_likelihood(OBSERVATION, 2), "control indices between 0 and 1"),
+    (lambda: HOLDING.log_likelihood_sequence(OBSERVATION[None], [0, 1]), r"observations of shape \(2, 6\)"),
+    (lambda: QuantityModel(VALUES[0]), r"\(draws, states, controls, sensors\)"),
+    (lambda: QuantityModel(HOLED), r"\(0, 1, 0, 2\) is nan"),
+    (lambda: QuantityModel(VALUES, WEIGHT * 2), "draw weights"),
+    (lambda: QUANTITY.moments(JOINT[:, :, 0]), "known_control"),
+    *((lambda bad=bad: QUANTITY.quantiles(JOINT, bad), "increasing quantile levels")
+      for bad in ([0.9, 0.1], [0.0], [1.1], 0.5, [np.nan])),
+    (lambda: REWARDS.expectation(JOINT[1, 0]), "joint belief"),
+    (lambda: value_iteration(MOVES, REWARD.T, 0.6), "rewards of shape"),
+    *((lambda bad=bad: value_iteration(MOVES, REWARD, bad), r"discount factor in \[0, 1\)")
+      for bad in (1.0, -0.1, np.nan)),
+    (lambda: value_iteration(MOVES, REWARD, 0.9, max_iterations=3), "after 3 sweeps"),
+    (lambda: value_iteration(TABLE * 0.95, REWARD, 0.6), "does not sum to one"),
+    (lambda: value_iteration(MOVES, np.full((7, 3), np.nan), 0.6), r"\(0, 0\) is nan"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "sentence"), REFUSED)
+def test_what_does_not_fit_is_refused(make, sentence):
+    with pytest.raises((InvalidModelError, InvalidObservationError, PlanningError), match=sentence):
+        make()
+
+
+def drawn(seed: int, states: int, moves_first: bool, discount: float = 0.8) -> DecisionProblem:
+    rng = np.random.default_rng(seed)
+    moves = rng.dirichlet(np.ones(states), (3, states))
+    seen = tuple(rng.dirichlet(np.full(3, 0.4), states).T for _ in range(3))
+    factors = np.array([discount, discount, 0.0 if seed % 2 else discount])
+    return DecisionProblem(
+        TransitionModel((moves,)), rng.normal(size=(states, 3)), factors, seen,
+        rng.dirichlet(np.ones(states)), moves_first,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("problem", "below", "above", "gap"),
+    [  # as published, and by Storm 2.0, see `benchmarks.study_planning`: 200,000 beliefs, grids of 400 and 24
+        (tiger(0.75), 1.933 - 5e-4, 1.933 + 5e-4, 1e-4),
+        (tiger(0.95), 19.3711, 19.3716, 1e-4),
+        (PROBLEMS["maze of 4 x 3"](), 1.8490, 1.9066, 1e-2),
+    ],
+)
+def test_the_value_is_what_was_published_and_what_an_independent_solver_finds(problem, below, above, gap):
+    plan = plan_on_belief(problem, gap=gap, most_beliefs=5000)
+    assert plan.lower <= above
+    assert plan.upper >= below
+    assert plan.upper - plan.lower <= gap * plan.upper
+
+
+@pytest.mark.parametrize("moves_first", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed, moves_first):
+    """Also under a control that is given for the first turn."""
+    problem = drawn(seed, 2, moves_first)
+    grid = np.linspace(0.0, 1.0, 2001)
+    beliefs = np.column_stack((1.0 - grid, grid))
+    value, first = np.zeros_like(grid), np.empty((3, len(grid)))
+    for _ in range(120):  # straight lines between the points of a convex function lie above it
+        for control, seen in enumerate(problem.likelihood):
+            first[control], moves = beliefs @ problem.reward[:, control], problem.transition.matrix[control]
+            for shown in seen:
+                after = (beliefs @ moves) * shown if moves_first else (beliefs * shown) @ moves
+                weight = after.sum(axis=1)
+                later = weight * np.interp(after[:, 1] / weight, grid, value)
+                first[control] += problem.discount[control] * later
+        value = first.max(axis=0)
+    for control, values in ((None, value), (1, first[1])):
+        exact, plan = (
+            np.interp(problem.prior[1], grid, values),
+            plan_on_belief(problem, first=control, gap=1e-4),
+        )
+        assert plan.lower <= exact + 1e-6
+        assert plan.upper >= exact - 1e-4
+        assert plan.upper - plan.lower <= 1e-3
+
+
+@pytest.mark.parametrize(("moves_first", "worth"), [(False, 0.92), (True, 0.37)])
+def test_simulated_missions_bring_what_the_plan_promises(moves_first, worth):
+    """And the difference of two rules varies little from mission to mission."""
+    problem = drawn(6, 4, moves_first)
+    plan = plan_on_belief(problem, gap=1e-3)
+    rng = np.random.default_rng(0)
+    total = simulated_returns(problem, lambda belief, *_: plan.policy.decide(belief), 4000, 40, rng)
+    error = 4.0 * total.std() / np.sqrt(len(total))
+    assert plan.lower - error <= total.mean() <= plan.upper + error
+    known = value_iteration(problem.transition, problem.reward, problem.discount)
+    assert plan.upper <= problem.prior @ known.value + 1e-9
+
+    def returns(values: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(0)
+        return simulated_returns(
+            problem, lambda belief, *_: np.argmax(belief @ values, axis=1), 1000, 20, rng
+        )
+
+    first, second = (returns(known.action_value + more) for more in (0.0, np.array([0.3, 0.0, 0.0])))
+    assert first.mean() - second.mean() == pytest.approx(worth, abs=0.05)
+    assert (first - second).std() < 0.4  # rewards that are drawn with the states differ by 1.4
+
+
+def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypatch):
+    monkeypatch.setattr(belief_planning, "LIVES", 4000)
+    problem, rng = drawn(8, 4, moves_first=False), np.random.default_rng(1)
+    policy = BeliefPolicy(
+        0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]]), np.array([1, 0, 2])
+    )
+
+    def leaves(belief: np.ndarray, turns: int) -> float:
+        if policy.decide(belief) != 1:
+            return 1.0
+        after = problem.following(belief, 1) if turns > 1 else np.zeros((0, 4))
+        return float(sum(row.sum() * leaves(row / row.sum(), turns - 1) for row in after))
+
+    beliefs = rng.dirichlet(np.ones(4), 5)
+    exact = [leaves(belief, 4) for belief in beliefs]
+    found = leaving_probability(problem, policy, beliefs, 1, 4, rng)
+    np.testing.assert_allclose(found, exact, atol=0.03)
+    assert sum(0.05 < value < 0.95 for value in exact) > 1
