@@ -100,12 +100,6 @@ def frame(*, skin: float = 1.0, patch: float = 1.0) -> Deck:
     return _deck(nodes, elements, "B32", rest, [nodes[0.0, 0.0, 0.0], nodes[600.0, 0.0, 0.0]])
 
 
-def store(deck: Deck, folder: Path, name: str) -> None:
-    """Let CalculiX write `NAME.sti`, `NAME.mas` and `NAME.dof`."""
-    step = ["*STEP", "*FREQUENCY, SOLVER=MATRIXSTORAGE", "*END STEP"]
-    run_calculix("\n".join([*deck.lines, *step]) + "\n", folder, name)
-
-
 def solved(deck: Deck, folder: Path, forces: Iterable[tuple[int, Point]]) -> list[dict[int, FloatArray]]:
     """Displacements (3,) [mm] of all nodes under a force [N] at each of some nodes, by CalculiX."""
     lines = list(deck.lines)
@@ -117,10 +111,10 @@ def solved(deck: Deck, folder: Path, forces: Iterable[tuple[int, Point]]) -> lis
     return [{int(row[0]): row[1:] for row in rows} for rows in tables["NALL"]]
 
 
-def frequencies(deck: Deck, folder: Path, count: int = 6) -> FloatArray:
-    """Lowest frequencies [Hz] by CalculiX."""
-    step = ["*STEP", "*FREQUENCY", str(count), "*END STEP"]
-    return read_frequencies(run_calculix("\n".join([*deck.lines, *step]) + "\n", folder, "modes"))[:count]
+def frequencies(deck: Deck, folder: Path) -> FloatArray:
+    """Lowest six frequencies [Hz] by CalculiX."""
+    text = "\n".join([*deck.lines, "*STEP", "*FREQUENCY", "6", "*END STEP"]) + "\n"
+    return read_frequencies(run_calculix(text, folder, "modes"))[:6]
 
 
 def write_structure(folder: Path, build: Callable[..., Deck], tables: str) -> Path:
@@ -130,7 +124,8 @@ def write_structure(folder: Path, build: Callable[..., Deck], tables: str) -> Pa
     reads it.
     """
     for name, factors in (("whole", {}), ("skin_half", {"skin": 0.5}), ("patch_half", {"patch": 0.5})):
-        store(build(**factors), folder, name)
+        step = ["*STEP", "*FREQUENCY, SOLVER=MATRIXSTORAGE", "*END STEP"]
+        run_calculix("\n".join([*build(**factors).lines, *step]) + "\n", folder, name)
     file = folder / "structure.toml"
     file.write_text(Inputs(__file__).text("stored.toml") + tables, encoding="utf-8")
     return file

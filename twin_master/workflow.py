@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.progress import Progress, SilentProgress
+from twin_master import run_folder
 from twin_master.assets.asset_source import AssetSource, calibrated_with, shown_without_noise
 from twin_master.assets.resolution import (
     Overrides,
@@ -32,15 +33,6 @@ from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_k
 from twin_master.mission.turns import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
-from twin_master.run_folder import (
-    begun_folder,
-    check_versions,
-    restore,
-    resumed_folder,
-    tidy,
-    to_json,
-    with_inputs,
-)
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import WATCHED_KIND, Scenario
 from twin_master.store.mission_result import MissionResult
@@ -106,10 +98,10 @@ def fly(
         files[POLICY_NAME] = policy_file(given, model)
     if loaded.remark:
         progress.note(loaded.remark)
-    restore(folder, progress)
+    run_folder.restore(folder, progress)
     source = asset_source(resolved)
     source.check()  # what is not there costs the user no folder
-    opened = begun_folder(resolved, loaded.file, folder, source.files() | files, replace=replace)
+    opened = run_folder.begun_folder(resolved, loaded.file, folder, source.files() | files, replace=replace)
     with opened as (config, located):
         return _run(folder, config, located, progress, begun, report=report)
 
@@ -143,13 +135,13 @@ def resume(
         The folder holds no run, or one of another scenario or another version.
     """
     folder, progress = Path(folder), progress or SilentProgress()
-    restore(folder, progress)
-    with resumed_folder(folder, loaded) as (config, scenario):
+    run_folder.restore(folder, progress)
+    with run_folder.resumed_folder(folder, loaded) as (config, scenario):
         finished = finished_run(folder)
         if finished is not None and (finished.report or not report):
             progress.note(f"The run in {folder} is finished: nothing is flown again.")
             return finished
-        check_versions(folder, config, scenario.mission.seed)
+        run_folder.check_versions(folder, config, scenario.mission.seed)
         return _run(folder, config, scenario, progress, begun, report=report)
 
 
@@ -162,7 +154,7 @@ def _run(
     *,
     report: bool,
 ) -> RunOutcome:
-    tidy(folder)
+    run_folder.tidy(folder)
     if begun is not None:
         begun(folder)
     start, stages = time.perf_counter(), dict[str, float]()
@@ -180,7 +172,7 @@ def _run(
         if given.is_file():
             hashes["policy"] = hash_file(given)
             policy = read_policy(given, build_graphical_model(scenario))
-    config = with_inputs(folder, config, hashes)
+    config = run_folder.with_inputs(folder, config, hashes)
     with timed("calibration"), progress.stage("Calibrating and planning"):
         knowledge = _known(folder, config, scenario, source, policy, progress)
     with timed("mission"):
@@ -196,7 +188,8 @@ def _run(
         with timed("report"), progress.stage("Writing the report"):
             _report(folder)
     timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
-    atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
+    # The only file with figures of a clock.
+    atomic_write_text(folder / TIMING_NAME, run_folder.to_json(timing))
     return read_outcome(folder)
 
 

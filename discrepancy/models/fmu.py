@@ -155,6 +155,8 @@ class FmuModel(DescribedModel):
         At samples that are so many times as dense as those of the trial.
         """
         laws, times = self._laws(patch), divided(conditions.stamps(trial.time), parts)
+        if trial.kind is not TrialKind.RINGDOWN and trial.time[0] < 0.0:  # an FMU begins at zero
+            trial, times = replace(trial, time=trial.time - trial.time[0]), times - trial.time[0]
         case = self._case(trial, conditions, patch, laws)
         return self.fmu.motion(case, trial, times, laws, columns, orders, conditions.refinement)
 

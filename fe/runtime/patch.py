@@ -241,7 +241,7 @@ class ThermalStrain(Sensor):
 class HighPass(Sensor):
     """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
 
-    They had settled at the value before the record's first sample.
+    They had settled before the record's first sample, see `fe.runtime.sensors.held_before`.
     """
 
     channel: str

@@ -158,6 +158,16 @@ def columns_of(item: Primitive, channels: Sequence[tuple[str, str]]) -> NDArray[
     return np.array(chosen, dtype=np.intp)
 
 
+RATES = frozenset({"velocity", "acceleration", "angular_velocity", "angular_acceleration"})
+"""Quantities that are zero at rest."""
+
+
+def held_before(item: HighPass, record: SensorRecord, first: FloatArray) -> FloatArray:
+    """Return what the columns (C,) of a filter had been for ever before the `first` row: at rest there."""
+    rates = [record.channels[column][1] in RATES for column in columns_of(item, record.channels)]
+    return np.where(rates, 0.0, first)
+
+
 LARGEST_ORDER = 4
 """Most stages of a high-pass."""
 
@@ -168,7 +178,7 @@ class FilterMemory:
     Parameters
     ----------
     before : sequence of float or None
-        `after` of the row before; None: the signals had settled at the values of this row for ever.
+        `after` of the row before; None: the signals had settled for ever, see `held_before`.
     duration : float
         Time since the row before [s].
 
@@ -192,8 +202,8 @@ class FilterMemory:
                 f"{LARGEST_ORDER} stages, but {item} was given."
             )
         shown, order = [], int(item.order)
-        for signal in row[0].tolist():
-            states = np.zeros(order)
+        for signal, held in zip(row[0].tolist(), held_before(item, record, row[0]).tolist(), strict=True):
+            states = np.full(order, signal - held)
             if self._before is not None:
                 last, *kept = islice(self._before, 1 + order)
                 states = high_pass_step(np.array(kept), signal - last, self._duration / item.time_constant)

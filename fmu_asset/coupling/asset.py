@@ -177,7 +177,7 @@ class CoupledFmus(Housing):
 
     # ------------------------------------------------------------------ what an asset asks
 
-    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
         """Initialise the components in their order; each takes the initial outputs of those before it.
 
         An input whose source comes later starts at the FMU's own start value.

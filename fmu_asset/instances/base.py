@@ -190,7 +190,7 @@ class FmuInstance(Instance):
 
     # ------------------------------------------------------------------ what the twin asks; see `Instance`
 
-    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and go to the first communication point."""
         errors = self._errors
         if self._lines is not None:

@@ -275,7 +275,7 @@ class Instance(Protocol):
         self.reply = (ctypes.c_double * max(sum(group.count for group in plan.outputs), 1))()
         self.lost = False
 
-    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and go to the first communication point.
 
         Parameters

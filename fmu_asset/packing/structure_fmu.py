@@ -36,22 +36,12 @@ from fmu_asset.compiled.package import (
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError, said
 from fmu_asset.instances.plan import Interface
+from fmu_asset.packing import contents
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.files import hash_members
 from reporting.progress import Progress
 
-from .contents import (
-    FmuInfo,
-    check_start,
-    checked_target,
-    exchanged,
-    guid_of,
-    python_members,
-    room_members,
-    sealed,
-    write_fmu,
-)
 from .patch_file import PatchFile
 
 FmuKind = Literal["python", "compiled", "source"]
@@ -85,7 +75,7 @@ class FmuOptions(TypedDict, total=False):
 
 def build_fmu(
     model: ReducedModel, path: str | os.PathLike[str], *, replace: bool = False, **options: Unpack[FmuOptions]
-) -> FmuInfo:
+) -> contents.FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
 
     Parameters
@@ -131,7 +121,7 @@ def build_fmu(
     PatchFileError
         If the FMU cannot carry an effect of the patch.
     """
-    target = checked_target(path, replace=replace)
+    target = contents.checked_target(path, replace=replace)
     kind, fmi = options.get("kind", "python"), options.get("fmi", 2)
     interface, platforms = options.get("interface", "co-simulation"), options.get("platforms", (PLATFORM,))
     patch, state = options.get("patch"), options.get("state")
@@ -148,7 +138,7 @@ def build_fmu(
         values |= {switch_of(effect): float(options.get("activate", False)) for effect in effects}
         table += effect_rows(effects, len(table), values)
         kept = _patched_members(model, effects, options.get("arrays"))
-    check_start(table)
+    contents.check_start(table)
     description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
     declared = Declaration(name, f"{description} {options.get('note', '')}".strip(), table)
     if kind == "python":
@@ -157,8 +147,10 @@ def build_fmu(
             "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),
         }
         imports = "from .slaves.behaviour import load_contents\n"
-        template = kept | python_members(declared, "Structure_", imports=imports, resources=resources)
-        template |= room_members("fe.runtime", f"resources/{declared.identifier}_runtime/fe")
+        template = kept | contents.python_members(
+            declared, "Structure_", imports=imports, resources=resources
+        )
+        template |= contents.room_members("fe.runtime", f"resources/{declared.identifier}_runtime/fe")
     else:
         template = compiled_members(model, declared, roles, fmi=fmi, interface=interface)
     template[f"resources/{DESIGN_RECORD}"] = design_record(model.design_hash)
@@ -170,7 +162,9 @@ def build_fmu(
     def binaries(members: dict[str, bytes], tag: str) -> dict[str, bytes]:
         return binaries_of(members, f"{name}_{tag}", fmi, platforms)
 
-    return write_fmu(target, sealed(template, binaries if kind == "compiled" else None), model.design_hash)
+    return contents.write_fmu(
+        target, contents.sealed(template, binaries if kind == "compiled" else None), model.design_hash
+    )
 
 
 def _patched_members(
@@ -283,7 +277,9 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
     found = re.search(r'(?:guid|instantiationToken)="([^"]*)"', root)
     declared = "" if found is None else found[1]
-    return declared, guid_of(hash_members(exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER))))
+    return declared, contents.guid_of(
+        hash_members(contents.exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER)))
+    )
 
 
 def pack_wing(
@@ -293,7 +289,7 @@ def pack_wing(
     replace: bool = False,
     progress: Progress | None = None,
     **options: Unpack[FmuOptions],
-) -> FmuInfo:
+) -> contents.FmuInfo:
     """Reduce a wing design and pack it as an FMU; equal input gives equal bytes.
 
     Parameters

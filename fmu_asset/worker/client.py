@@ -123,7 +123,7 @@ class WorkerInstance(Instance):
             self.close()
             raise
 
-    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
         """Set parameters and inputs and initialise."""
         self._call("initialise", start_time, parameters, with_inputs)
 

@@ -159,8 +159,6 @@ def _called(
         _run(instance, arguments[0], answer)
     elif name == "take_log":
         return joined(*(f"{status} {text}" for status, text in instance.take_log()))
-    elif name == "initialise":
-        instance.initialise(*arguments[:2], with_inputs=arguments[2])
     elif name != "open":
         return getattr(instance, name)(*arguments) or b""
     return b""

@@ -8,7 +8,6 @@ import signal
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
 from tests.twin_master.runs import check_same, cut_off_after, noted, written
 from twin_master import workflow
-from twin_master.assets.resolution import Overrides
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.run_folder import (
     FIELD_NAME,
@@ -36,16 +34,8 @@ pytestmark = pytest.mark.usefixtures("no_report")
 SAME = ("run.nc", "config.json", "summary.json", "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
 
 
-def fly(
-    folder: Path,
-    library: Path,
-    scenario: str | Path = "failing_gauges",
-    *,
-    replace: bool = False,
-    **options: Any,
-) -> RunOutcome:
-    overrides = Overrides(strain_library=library, **options)
-    return new_run(load_scenario(scenario), folder, overrides, replace=replace)
+def fly(folder: Path, library: Path) -> RunOutcome:
+    return new_run(load_scenario("failing_gauges"), folder, {"strain_library": library})
 
 
 @pytest.fixture(scope="module")

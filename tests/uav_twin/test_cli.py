@@ -190,8 +190,9 @@ def test_every_check_of_a_coarse_wing_is_kept_and_convergence_names_every_gauge(
 
 INPUTS = Inputs(__file__)
 RIG = "--model single_mass_rig"
-ROWS = [row for name in INPUTS.table("refused.toml") for row in INPUTS.refused(name)]
-ROWS += [(f"{line} --in-process", *rest) for line, *rest in INPUTS.refused("structural")]
+STRUCTURAL = INPUTS.refused("structural")
+ROWS = [row for name in INPUTS.table("refused.toml") if name != "structural" for row in INPUTS.refused(name)]
+ROWS += [*STRUCTURAL[::7], *((f"{line} --in-process", *rest) for line, *rest in STRUCTURAL)]
 TOLD = INPUTS.table("told.toml")["rows"]
 
 

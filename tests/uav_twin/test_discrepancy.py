@@ -5,7 +5,6 @@ import itertools
 import json
 import re
 import shlex
-import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from decimal import Decimal
@@ -33,12 +32,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def call(*words: object) -> subprocess.CompletedProcess[str]:
-    return command("discrepancy", "import", *words)
-
-
-def taken(*words: object) -> str:
-    return said("discrepancy", "import", *words)
+IMPORT = ("discrepancy", "import")
 
 
 def laboratory(folder: Path) -> Campaign:
@@ -69,7 +63,9 @@ def test_a_folder_of_files_becomes_the_campaign():
     releases = [f"{t.name}.csv={1e3 * t.release.displacement!r}mm" for t in campaign.trials if t.release]
     options = [word for kind in kinds for word in ("--kind", kind)]
     options += [word for release in releases for word in ("--release", release)]
-    done = call(*files, *options, *COLUMNS, "--out", "lab", "--load-place", "mass", "--model", MODEL)
+    done = command(
+        *IMPORT, *files, *options, *COLUMNS, "--out", "lab", "--load-place", "mass", "--model", MODEL
+    )
     assert (done.returncode, done.stderr) == (0, "")
     read = read_campaign("lab")
     assert [trial.name for trial in read.trials] == [trial.name for trial in campaign.trials]
@@ -95,7 +91,7 @@ TWO = {
 def test_everything_that_is_not_said_is_named_at_once():
     for name, content in TWO.items():
         Path(name).write_bytes(content)
-    sentence = refused("discrepancy", "import", *TWO, "--kind", "swing.csv=ringdown")
+    sentence = refused(*IMPORT, *TWO, "--kind", "swing.csv=ringdown")
     for part in (
         "13 answers are missing, and nothing was written",
         "--decimal NAME=... for 'pull.csv' (. or ,: '1,234' in line 2 can be read as both)",
@@ -117,10 +113,10 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
         "--kind", "noise", "--kind", "push.csv=driven", "--column", "x=displacement", "--column",
         "pull=input:pull", "--reference-temperature", "20", "--model", MODEL, "--out", "lab",
     )  # fmt: skip
-    done = call("push.csv", "n1.csv", "n2.csv", *given)
+    done = command(*IMPORT, "push.csv", "n1.csv", "n2.csv", *given)
     assert done.returncode == 1
     assert done.stderr.strip() == "Noise is read from one file, and n1.csv and n2.csv came: give one of them."
-    taken("push.csv", "n1.csv", *given)
+    said(*IMPORT, "push.csv", "n1.csv", *given)
     toml = Path("lab/campaign.toml").read_text("utf-8")
     assert "begins" not in toml
     assert toml.count("Imported from") == toml.split("]\n\n[")[0].count('",\n') == 2
@@ -138,7 +134,7 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
     Path("lab/campaign.toml").write_text(toml.replace('"driven"', '"driven"\nbegins = "still"'), "utf-8")
     assert "assumed" not in " ".join(read_campaign("lab").remarks)
     Path("turn.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
-    taken("turn.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
+    said(*IMPORT, "turn.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
     assert read_campaign("turn").trials[0].load_factor.tolist() == [1.0, 2.5]
 
 
@@ -146,7 +142,7 @@ def test_the_force_of_a_ring_down_is_none_though_a_column_gives_it():
     rows = "".join(f"{k / 100},{k % 5},{k},7\n" for k in range(16))
     Path("push.csv").write_text(f"time [s],force [N],x [in],q\n{rows}", "utf-8")
     given = ("--kind", "ringdown", "--column", "x=x", "--column", "q=-", "--release", "-0.5in")
-    taken("push.csv", *given, "--out", "b")
+    said(*IMPORT, "push.csv", *given, "--out", "b")
     (trial,) = read_campaign("b").trials
     assert (trial.force.tolist(), trial.values.shape) == ([0.0] * 16, (16, 1))
     assert (trial.values[1, 0], trial.release.displacement) == (0.0254, -0.0127)
@@ -184,7 +180,7 @@ def in_a_terminal(answers: list[str], *words: object) -> tuple[int, str]:
     screen = Terminal()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(screen), redirect_stderr(screen):
         patch.setattr(sys, "stdin", Terminal("\n".join([*answers, ""])))
-        code = command_line.call(patch, "discrepancy", "import", *words)
+        code = command_line.call(patch, *IMPORT, *words)
     return code, screen.getvalue()
 
 

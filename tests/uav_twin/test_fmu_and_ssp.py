@@ -22,7 +22,6 @@ from tests.command_line import command, refused, said
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
-HISTORIES = INPUTS.table("histories.toml")["refused"]
 ROOM = INPUTS.folder / "room.toml"
 
 
@@ -123,7 +122,7 @@ def test_structural_parameters_of_a_binding(foreign_fmu):
         FmiAsset(exchange, default_experiment(read_fmu(exchange), values={"n": 3.0}).binding)
 
 
-@pytest.mark.parametrize(("content", "sentence"), HISTORIES)
+@pytest.mark.parametrize(("content", "sentence"), INPUTS.table("histories.toml")["refused"])
 def test_files_that_are_refused(tmp_path, content, sentence):
     given = tmp_path / "inputs.csv"
     given.write_text(content, encoding="utf-8")

@@ -21,6 +21,7 @@ from reporting.files import (
 from reporting.folders import held
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
+from twin_master import run_folder
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError, said
@@ -30,13 +31,6 @@ from twin_master.fleet.store import STORE_NAME, check_installed, create_store, s
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
-from twin_master.run_folder import (
-    check_versions,
-    create_run_folder,
-    folder_config,
-    lock_run_folder,
-    to_json,
-)
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 
@@ -124,7 +118,7 @@ def fly_fleet(
             shards, flown = _fly(fleet, folder, engine, journal, progress)
         told = told_of(folder)
         result = fleet.head.model_dump(exclude={"shard"}) | {"twins": fleet.size}
-        atomic_write_text(folder / RESULT_NAME, to_json(result | told))
+        atomic_write_text(folder / RESULT_NAME, run_folder.to_json(result | told))
     seconds = time.perf_counter() - begin
     return FleetOutcome(folder, fleet.size, told["failures"], told["ended"], seconds, flown, shards - flown)
 
@@ -166,19 +160,19 @@ def held_fleet(
         It was begun by another version.
     """
     config = {"kind": kind, "format": 1, "fleet": record}
-    found = None if replace_old else folder_config(folder, kind)
+    found = None if replace_old else run_folder.folder_config(folder, kind)
     if found is None:
         ready()
         provenance = collect_provenance(record["seed"]).as_dict()
-        with create_run_folder(folder, {**config, "provenance": provenance}, replace=replace_old):
+        with run_folder.create_run_folder(folder, {**config, "provenance": provenance}, replace=replace_old):
             yield config
         return
-    if {key: found.get(key) for key in config} != json.loads(to_json(config)):
+    if {key: found.get(key) for key in config} != json.loads(run_folder.to_json(config)):
         otherwise = ", or give --replace" if kind == KIND else ""
         raise RunFolderError(said("fleet.another", folder=folder, otherwise=otherwise))
-    check_versions(folder, found, record["seed"])
+    run_folder.check_versions(folder, found, record["seed"])
     ready()
-    with held(lock_run_folder(folder)):
+    with held(run_folder.lock_run_folder(folder)):
         yield config
 
 
@@ -190,7 +184,7 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
     RunFolderError
         It holds no fleet.
     """
-    found = folder_config(folder, *(kinds or (KIND,)))
+    found = run_folder.folder_config(folder, *(kinds or (KIND,)))
     if found is None or "fleet" not in found:
         raise RunFolderError(
             f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."

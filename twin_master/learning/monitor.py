@@ -20,21 +20,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from twin_master.errors import InvalidModelError, said
-from twin_master.learning.rivals import (
-    ENDS,
-    GAUGES,
-    MENDED,
-    NONE,
-    Shown,
-    at_first,
-    beliefs_of,
-    hypotheses,
-    mix_onset,
-    one_turn_later,
-    weigh_gauges,
-    weigh_model,
-    weigh_none,
-)
+from twin_master.learning import rivals
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion, Words
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -155,9 +141,9 @@ class WatchfulEstimator:
         suspicion = self._suspicion(own)
         notices += self._alarms(own, suspicion, turn)
         believed = own["share"], estimate.filtered, own["mended"], own["gauge"]
-        found = hypotheses(*believed, self._names)
+        found = rivals.hypotheses(*believed, self._names)
         notices += self._leading(own, found, turn)
-        own["belief"], own["rivals"], right = beliefs_of(*believed)
+        own["belief"], own["rivals"], right = rivals.beliefs_of(*believed)
         own["right"] = np.array([right])
         return replace(
             estimate,
@@ -191,7 +177,7 @@ class WatchfulEstimator:
             "gauge": np.broadcast_to(model, self._shape).astype(np.float32, order="C"),
             "none": model[None].astype(np.float32),
             "mended": model.copy(),
-            "share": at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
+            "share": rivals.at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
             "leading": np.zeros(1),
             "log_gauge": np.full((sensors, gains), weight - np.log(gains)),
             "log_none": np.full(1, weight),
@@ -219,12 +205,12 @@ class WatchfulEstimator:
         inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
         gauges = own["gauge"].reshape(-1, *self._shape[2:])
         weight, onset = own["log_gauge"].reshape(-1), own["gauge_onset"].reshape(-1)
-        keep = mix_onset(own["model"], gauges, weight, inflow - np.log(self._shape[1]), turn, onset)
+        keep = rivals.mix_onset(own["model"], gauges, weight, inflow - np.log(self._shape[1]), turn, onset)
         keep = keep.reshape(self._shape[:2])
         fading = np.exp(-1.0 / self._settings.memory_turns)
         own["gauge_sums"] *= fading * keep[..., None]
         own["gauge_squares"] = keep * own["gauge_squares"] + (1.0 - keep) * own["model_squares"][:, None]
-        kept = mix_onset(own["model"], own["none"], own["log_none"], inflow, turn, own["none_onset"])
+        kept = rivals.mix_onset(own["model"], own["none"], own["log_none"], inflow, turn, own["none_onset"])
         statistics, fresh = own["none_statistics"], 1.0 - kept[0]
         statistics[:, 0] += fresh * (_FREE - statistics[:, 0])
         statistics[:, [1, 4]] += fresh * (own["model_squares"][:, None] - statistics[:, [1, 4]])
@@ -236,9 +222,9 @@ class WatchfulEstimator:
         """Let faults begin and end; "mended" takes over beliefs and sums of squares of those that ended."""
         twice = 2.0 * self._settings.prior
         hazard = np.log(twice) + inflow - np.log1p(twice * (self._to_begin(turn - 1.0) - 1.0))
-        before = own["share"][MENDED]
-        own["share"], ended = one_turn_later(own["share"], hazard, self._begins)
-        fresh = max(0.0, -np.expm1(before + np.log1p(-ENDS) - own["share"][MENDED]))
+        before = own["share"][rivals.MENDED]
+        own["share"], ended = rivals.one_turn_later(own["share"], hazard, self._begins)
+        fresh = max(0.0, -np.expm1(before + np.log1p(-rivals.ENDS) - own["share"][rivals.MENDED]))
         weight = np.exp(ended)
         of_gauge = weight[1:].reshape(self._shape[:2])
         belief = weight[1:].astype(np.float32) @ own["gauge"].reshape(len(weight) - 1, -1)
@@ -282,27 +268,31 @@ class WatchfulEstimator:
         inverse, there = np.where(np.isnan(seen), 0.0, self._inverse[control_index]), ~np.isnan(seen)
         size = (near.value * inverse).reshape(-1, len(seen))
         residual = (np.where(there, seen - near.value, 0.0) * inverse).reshape(size.shape)
-        shown = Shown(there, residual, size, 0.5 * (degrees + count + 1.0), degrees)
+        shown = rivals.Shown(there, residual, size, 0.5 * (degrees + count + 1.0), degrees)
         prior = near.log_density + told + np.log(inverse[:, there]).sum(axis=1)
         before, mended = own["model_squares"].copy(), own["mended_squares"].copy()
-        log_mended, _ = weigh_model(shown, own["mended_squares"], own["mended"].reshape(-1), prior.flatten())
+        log_mended, _ = rivals.weigh_model(
+            shown, own["mended_squares"], own["mended"].reshape(-1), prior.flatten()
+        )
         log_mended += 0.5 * np.sum(np.log((degrees + before) / (degrees + mended)), where=there)
         log_likelihood = prior.flatten()
-        log_model, known = weigh_model(shown, own["model_squares"], own["model"].reshape(-1), log_likelihood)
+        log_model, known = rivals.weigh_model(
+            shown, own["model_squares"], own["model"].reshape(-1), log_likelihood
+        )
         of_model = before, known, log_likelihood
         gauges = own["gauge"].reshape(-1, len(size))
         with np.errstate(divide="ignore"):  # what is ruled out has the logarithm minus infinity
-            log_gauges = weigh_gauges(
+            log_gauges = rivals.weigh_gauges(
                 shown, self._gains, self._reach, *of_model, gauges, own["gauge_squares"], own["gauge_sums"]
             )
-            log_none = weigh_none(
+            log_none = rivals.weigh_none(
                 shown, self._settings.all_gain, *of_model, own["none"].reshape(-1), own["none_statistics"]
             )
         own["log_gauge"] += log_gauges - log_model
         own["log_none"] += log_none - log_model
         ratio = np.zeros_like(own["share"])
-        ratio[MENDED], ratio[NONE] = log_mended - log_model, log_none - log_model
-        ratio[GAUGES:] = (log_gauges - log_model).ravel()
+        ratio[rivals.MENDED], ratio[rivals.NONE] = log_mended - log_model, log_none - log_model
+        ratio[rivals.GAUGES :] = (log_gauges - log_model).ravel()
         own["share"] += ratio
         own["share"] -= np.logaddexp.reduce(own["share"])
         count += ~np.isnan(seen)
@@ -315,8 +305,8 @@ class WatchfulEstimator:
         none = float(own["log_none"][0])
         share = np.exp(own["share"])
         return Suspicion(
-            none_of_these=float(share[NONE]),
-            gauge_off=float(share[GAUGES:].sum()),
+            none_of_these=float(share[rivals.NONE]),
+            gauge_off=float(share[rivals.GAUGES :].sum()),
             log_evidence_none=float(np.logaddexp(none, to_begin)),
             log_evidence_any_gauge=float(np.logaddexp.reduce(log_gauge + self._log_prior)),
             log_evidence_gauge=log_gauge,

@@ -193,9 +193,6 @@ def separations(
     return found
 
 
-__all__ = ["with_candidates"]
-
-
 def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
     """Return a scenario whose structure has more gauges, which are sensors.
 

@@ -23,7 +23,7 @@ from twin_master.report import mission as course
 from twin_master.report import model as tailored
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
-from twin_master.store.summary import Fallback, another_truth, control_changes, find_fallback
+from twin_master.store.summary import another_truth, control_changes, find_fallback
 from twin_master.store.writing import REPORT_NAME
 
 WORDS = Words("twin_master.report")
@@ -44,7 +44,9 @@ def opening_sentences(run: Run) -> tuple[str, ...]:
 def _decision(run: Run) -> str:
     """Return how the control went, and by how much it followed the damage that calls for another."""
     first, controls, index = int(run.control_index[0]), run.controls, run.control_index
-    changes, fallback = int(np.count_nonzero(np.diff(index))), _fallback(run)
+    changes, policy = int(np.count_nonzero(np.diff(index))), run["policy/control_index"].astype(np.int64)
+    known = run.model.states, policy, int(index[0]), index
+    fallback = None if run.truth is None else find_fallback(*known, run.truth)
     fell = None if fallback is None or fallback.early_step is not None else fallback.fallback_step
     switch: dict[str, object] = {"what": "", "level": "", "everywhere": False}
     if fallback is not None and fallback.switch_state is not None and fallback.switch_level is not None:
@@ -68,14 +70,6 @@ def _decision(run: Run) -> str:
         now=controls[int(index[fell or 0])],
         delay=fallback and fallback.delay and _count(fallback.delay, run.step),
     )  # fmt: skip
-
-
-def _fallback(run: Run) -> Fallback | None:
-    """Return how the control fell back; None where the truth is unknown."""
-    if run.truth is None:
-        return None
-    policy = run["policy/control_index"].astype(np.int64)
-    return find_fallback(run.model.states, policy, int(run.control_index[0]), run.control_index, run.truth)
 
 
 def _belief(run: Run) -> str:

@@ -64,12 +64,6 @@ def _in_si(value: object, divisor: float) -> object:
         return float("inf")  # which no key takes
 
 
-def _check_percent(key: object, value: object) -> None:
-    for item in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(item, int | float) and not isinstance(item, bool) and not -100 <= item <= 100:
-            raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
-
-
 def one_or_each(key: str, value: object, count: int) -> Fault:
     """Return the fault that what may be given for each sensor is given neither once nor `count` times."""
     came = len(value) if isinstance(value, tuple) else count
@@ -98,8 +92,10 @@ class Section(toml_file.Section):
                 raise ValueError(f"unknown key `{key}`; the keys known there are {', '.join(known.values())}")
             if base in converted:
                 raise ValueError(f"`{base}` was given with and without its unit: keep one of them")
-            if unit == "percent":
-                _check_percent(key, value)
+            for item in value if isinstance(value, list | tuple) else [value]:
+                number = isinstance(item, int | float) and not isinstance(item, bool)
+                if unit == "percent" and number and not -100 <= item <= 100:
+                    raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
             converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
         for name in cls.units:
             if cls.model_fields[name].is_required() and name not in converted:

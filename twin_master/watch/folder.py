@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import takewhile
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from reporting.arrays import Float
+from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
 from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
@@ -181,7 +182,8 @@ class Watch:
                 self._patch(*patched)
             yield
             if self.intake.state()["counts"] != self._told["counts"]:  # of messages behind the last turn
-                self.write()
+                with suppress(FileNotWrittenError):  # which is no loss of what was observed
+                    self.write()
 
     def decisions(self) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until no more comes."""

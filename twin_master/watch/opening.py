@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
+from twin_master import run_folder
 from twin_master.assets.resolution import (
     Overrides,
     believed_source,
@@ -19,15 +20,6 @@ from twin_master.assets.resolution import (
 )
 from twin_master.errors import MissionInputError, NotResumableError, said
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
-from twin_master.run_folder import (
-    CONFIG_NAME,
-    begun_folder,
-    check_versions,
-    folder_config,
-    kept_scenario,
-    read_config,
-    resumed_folder,
-)
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import SUMMARY_NAME
@@ -57,7 +49,7 @@ def begun_watch(
     source = believed_source(resolved)
     source.check()
     files = source.files() | files
-    opened = begun_folder(resolved, file, folder, files, replace=replace_run, watched=True)
+    opened = run_folder.begun_folder(resolved, file, folder, files, replace=replace_run, watched=True)
     with opened as (config, located):
         yield Watch(folder, config, located, progress, like)
 
@@ -73,11 +65,11 @@ def resumed_watch(
     NotResumableError
         The folder holds no watch, or one of another scenario or version.
     """
-    if not read_config(folder).get("watched"):
+    if not run_folder.read_config(folder).get("watched"):
         raise NotResumableError(said("watch.run", folder=folder))
-    with resumed_folder(folder, loaded) as (config, scenario):
+    with run_folder.resumed_folder(folder, loaded) as (config, scenario):
         try:
-            check_versions(folder, config, scenario.mission.seed)
+            run_folder.check_versions(folder, config, scenario.mission.seed)
             watched = Watch(folder, config, scenario, progress, like)
         except NotResumableError as error:
             error.add_note(said("watch.another", folder=folder))
@@ -117,11 +109,13 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
     with TemporaryDirectory(prefix="uav_twin_") as place:
         copy = Path(place) / folder.resolve().name
         copy.mkdir()
-        shutil.copy(folder / CONFIG_NAME, copy)
+        shutil.copy(folder / run_folder.CONFIG_NAME, copy)
         shutil.copytree(folder / "asset", copy / "asset")
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
-        Watch(copy, config, kept_scenario(folder).moved(copy), progress).store(Counts(), report=False)
+        Watch(copy, config, run_folder.kept_scenario(folder).moved(copy), progress).store(
+            Counts(), report=False
+        )
         yield copy
 
 
@@ -161,7 +155,7 @@ def stored(folder: Path) -> bool:
 
 def _config(folder: Path) -> dict[str, Any] | None:
     """Return the configuration of a watch; None where the folder holds something else."""
-    config = folder_config(folder)
+    config = run_folder.folder_config(folder)
     return config if config is not None and config.get("watched") else None
 
 
@@ -293,7 +287,7 @@ def _read(
     """Return the folder of a watch, and the scenario by which observations are read."""
     if loaded is None:
         folder = Path(str(folder))
-        scenario = kept_scenario(folder).moved(folder)
+        scenario = run_folder.kept_scenario(folder).moved(folder)
     else:
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.moved(loaded.path.parent)

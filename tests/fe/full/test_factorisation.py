@@ -9,11 +9,10 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
-from fe.full import factorisation, subspace
+from fe.full import factorisation
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
-from fe.full.subspace import OrthonormalBasis, ProjectedBasis, solved_near
+from fe.full.subspace import OrthonormalBasis
 from fe.runtime.errors import SolutionError
-from fe.structure.affine import affine_sum
 
 
 def grid(*counts: int) -> sparse.csr_array:
@@ -23,15 +22,6 @@ def grid(*counts: int) -> sparse.csr_array:
         path = sparse.csr_array(2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
         total = sparse.kronsum(path, total, format="csr")
     return sparse.csr_array(total + sparse.eye_array(total.shape[0]))
-
-
-def random_matrix(seed: int, size: int, share: float, copies: int = 1) -> sparse.csr_array:
-    """Diagonally dominant matrix of a random, perhaps disconnected graph, each vertex `copies` unknowns."""
-    random = np.random.default_rng(seed)
-    half = sparse.random_array((size, size), density=share, rng=random)
-    block = random.standard_normal((copies, copies))
-    matrix = sparse.kron(half + half.T + sparse.eye_array(size), block + block.T + 10.0 * np.eye(copies))
-    return sparse.csr_array(matrix + sparse.diags_array(np.asarray(abs(matrix).sum(axis=1)) + 1e-3))
 
 
 @settings(max_examples=50, deadline=None)
@@ -44,7 +34,12 @@ def random_matrix(seed: int, size: int, share: float, copies: int = 1) -> sparse
     columns=st.integers(0, 4),
 )
 def test_solutions_are_those_of_a_general_solver(leaf, seed, size, share, copies, columns):
-    matrix = random_matrix(seed, size, share, copies)
+    """Of a random, perhaps disconnected graph, dominant on its diagonal, each vertex `copies` unknowns."""
+    random = np.random.default_rng(seed)
+    half = sparse.random_array((size, size), density=share, rng=random)
+    block = random.standard_normal((copies, copies))
+    whole = sparse.kron(half + half.T + sparse.eye_array(size), block + block.T + 10.0 * np.eye(copies))
+    matrix = sparse.csr_array(whole + sparse.diags_array(np.asarray(abs(whole).sum(axis=1)) + 1e-3))
     shape = (matrix.shape[0], columns) if columns else (matrix.shape[0],)
     right = np.random.default_rng(seed).standard_normal(shape)
     given_side = right.copy()
@@ -104,41 +99,6 @@ def test_a_pattern_met_before_comes_with_other_values_and_may_change_in_place():
     assert second @ Factorisation(second).riesz(right) == pytest.approx(right, abs=1e-10)
 
 
-# ---------------------------------------------------------------- several at once
-
-SIZE = 60
-
-
-def _terms() -> tuple[sparse.csr_array, ...]:
-    """Positive semi-definite terms of different patterns, one of them with entries that stand twice."""
-    rng, places = np.random.default_rng(3), np.repeat(np.arange(SIZE), 2)
-    springs = [
-        sparse.csr_array(rng.normal(size=(20, SIZE)) * (rng.random((20, SIZE)) < 0.2)) for _ in range(2)
-    ]
-    starts = np.arange(0, 2 * SIZE + 1, 2)
-    doubled = sparse.csr_array((np.full(2 * SIZE, 0.5), places, starts), shape=(SIZE, SIZE))
-    return (*(sparse.csr_array(part.T @ part) for part in springs), doubled)
-
-
-TERMS = _terms()
-WHOLE = affine_sum((1.0, 1.0, 1.0), TERMS)
-
-
-def test_several_systems_are_solved_at_once_near_a_factorised_one_or_given_up(monkeypatch):
-    factors, coefficients = (
-        Factorisation(WHOLE),
-        np.array([(1.0, 1.0, 0.3), (1.0, 1.0, 2.0), (1.0, 1.0, 1.0)]),
-    )
-    right = np.random.default_rng(4).normal(size=(SIZE, 3)) * [1.0, 0.0, 1e3]
-    given = (factors, TERMS, coefficients, factors.whitened(right), np.zeros_like(right))
-    found = factors.unwhitened(solved_near(*given, tolerance=1e-12))
-    for column, own, wanted in zip(found.T, coefficients.T, right.T, strict=True):
-        np.testing.assert_allclose(affine_sum(own, TERMS) @ column, wanted, rtol=1e-9, atol=1e-9)
-    monkeypatch.setattr(subspace, "MOST_ITERATIONS", 2)
-    with pytest.raises(SolutionError, match="Conjugate gradients did not reach"):
-        solved_near(*given, tolerance=1e-12)
-
-
 def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_none():
     stiffness, mass = DENSE @ DENSE.T + np.eye(30), np.diag(np.linspace(1.0, 2.0, 30))
     values, shapes = lowest_eigenpairs(sparse.csr_array(stiffness), sparse.csr_array(mass), 4)
@@ -150,37 +110,13 @@ def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_no
         lowest_eigenpairs(loose, sparse.eye_array(20).tocsr(), 3)
 
 
-def test_a_basis_holds_what_it_was_given_and_says_what_it_dropped():
-    """Blocks with copies, zeros and directions of all sizes: orthonormal in energy, with its terms projected.
-
-    The rest is below the bound; a load and its answer are whitened alike.
-    """
-    random, factors = np.random.default_rng(5), Factorisation(WHOLE)
-    plain, basis = OrthonormalBasis(SIZE, drop=1e-8), ProjectedBasis(factors, TERMS, (WHOLE,), drop=1e-8)
-    assert plain.extend(np.zeros((SIZE, 3))).shape == (0, 3)
-    assert (plain.vectors.shape, plain.dropped_square) == ((SIZE, 0), 0.0)
-    own = random.normal(size=(SIZE, 12))
-    whitened = factors.whitened(WHOLE @ own)
-    np.testing.assert_allclose(factors.unwhitened(whitened), own, rtol=1e-9, atol=1e-9)
-    blocks = [
-        own[:, :4],
-        np.column_stack((own[:, :4] @ random.normal(size=(4, 3)), own[:, 4:8], np.zeros(SIZE))),
-        own[:, :8] @ random.normal(size=(8, 5)) + 10.0 ** -np.arange(1.0, 14.0, 2.6) * own[:, 7:12],
-    ]
-    left = []
-    for block in blocks:
-        known = basis.vectors.shape[1]
-        images, _ = basis.add(block)
-        np.testing.assert_array_equal(images[0], TERMS[0] @ basis.displacements[:, known:])
-        coordinates = plain.extend(block)
-        left.append(block - plain.vectors @ coordinates)
-    np.testing.assert_array_equal(basis.vectors, plain.vectors)
-    missing = np.linalg.norm(np.concatenate(left, axis=1), axis=0)
-    assert 8 < basis.vectors.shape[1] < 12
-    assert 0.0 < missing.max() <= np.sqrt(basis.dropped_square) * (1.0 + 1e-6) + 1e-12
-    assert np.sqrt(basis.dropped_square) < 1e-6
-    vectors, (inner, whole) = basis.displacements, basis.inner
-    for found in (vectors.T @ WHOLE @ vectors, whole[0], basis.vectors.T @ basis.vectors):
-        np.testing.assert_allclose(found, np.eye(len(found)), atol=1e-7)
-    for term, projected in zip(TERMS, inner, strict=True):
-        np.testing.assert_allclose(projected, vectors.T @ term @ vectors, atol=1e-9)
+def test_a_basis_bounds_what_it_drops():
+    """Of vectors that it knows but for a little: it is orthonormal, and the rest is below its bound."""
+    random, basis = np.random.default_rng(5), OrthonormalBasis(60, drop=1e-8)
+    known = random.normal(size=(60, 4))
+    copies = known + 10.0 ** -np.arange(6.0, 12.0, 1.5) * random.normal(size=(60, 4))
+    for block in (known, copies):
+        coordinates = basis.extend(block)
+        left = np.linalg.norm(block - basis.vectors @ coordinates, axis=0)
+    np.testing.assert_allclose(basis.vectors.T @ basis.vectors, np.eye(6), atol=1e-13)
+    assert 0.0 < left.max() <= np.sqrt(basis.dropped_square) < 1e-6

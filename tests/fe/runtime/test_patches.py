@@ -221,8 +221,16 @@ def test_rates_through_the_high_pass(order):
     item = HighPass("*", 0.4, order)
     values, rates = shown(item)
     assert rates[1:-1] == pytest.approx((values[2:] - values[:-2]) / 0.02, abs=2e-3 if order != 1.5 else 2e-2)
-    assert shown(item, record=FORCED)[0][0] == pytest.approx(VALUES[0])  # from rest: a step
     assert values[0] == pytest.approx(0.0, abs=1e-12)  # released: it had been held
+    # settled under what acts at the first sample
+    np.testing.assert_array_equal(shown(item, record=FORCED)[0], values)
+    quick = tuple((name, "acceleration") for name, _ in CHANNELS)  # which is none at rest: a step
+    for record in (RECORD, FORCED):
+        assert shown(item, record=replace(record, channels=quick))[0][0] == pytest.approx(VALUES[0])
+        before = FilterMemory(None, 0.0).filtered(
+            HighPass("*", 0.4), replace(record, channels=quick), VALUES[:1], RATES
+        )
+        assert before[0] == pytest.approx(VALUES[:1])
     settled, _ = applied(ModelPatch((item,)), replace(RECORD, kind="flight"), VALUES, None)
     assert np.array_equal(settled, VALUES)
 

@@ -106,7 +106,7 @@ def gauges(ours: OurFmus) -> Callable[..., Callable[[float], list[float]]]:
     return begun
 
 
-def test_a_gauge_reads_gain_offset_and_drift(gauges) -> None:
+def test_a_gauge_reads_gain_offset_and_drift_and_is_lost_for_a_while(gauges) -> None:
     changes = {"gain[1]": 1.02, "offset[2]": 5e-6, "drift_rate[3]": 2e-6, "drift_start[3]": 4.0}
     at = gauges([1e-3, -2e-3, 0.5e-3], **changes)
     assert at(-1) == [1.02e-3, -2e-3 + 5e-6, 0.5e-3, 1.0, 1.0, 1.0]
@@ -114,9 +114,6 @@ def test_a_gauge_reads_gain_offset_and_drift(gauges) -> None:
         # As the drift of a scenario that begins at step 4.
         expected = 0.5e-3 + 2e-6 * max(0.0, step - 4 + 1.0)
         assert at(step)[:3] == pytest.approx([1.02e-3, -2e-3 + 5e-6, expected], rel=1e-14)
-
-
-def test_dropouts_and_blackouts(gauges) -> None:
     changes = {"dropout_start[2]": 3.0, "dropout_end[2]": 6.0, "blackout.start": 8.0, "blackout.end": 9.0}
     at = gauges([1e-3] * 3, **changes)
     rows = [at(step) for step in range(12)]
@@ -126,7 +123,7 @@ def test_dropouts_and_blackouts(gauges) -> None:
         assert row[:3] == [0.0 if gauge in gone else 1e-3 for gauge in range(3)]
 
 
-def test_noise_is_gaussian_and_repeats(gauges) -> None:
+def test_noise_is_gaussian_and_repeats_and_gauges_are_lost_by_chance(gauges) -> None:
     at = gauges([0.0] * 24, noise=150e-6, seed=3.0)
     noise = np.array([at(step)[:24] for step in range(500)])
     standard = noise.ravel() / 150e-6
@@ -136,9 +133,6 @@ def test_noise_is_gaussian_and_repeats(gauges) -> None:
     assert abs((standard**4).mean() - 3.0) < 4.0 * math.sqrt(96.0 / count)
     assert abs(np.corrcoef(standard[:-1], standard[1:])[0, 1]) < 4.0 / math.sqrt(count)
     assert gauges([0.0] * 24, noise=150e-6, seed=3.0)(0)[:24] == noise[0].tolist()
-
-
-def test_lost_by_chance(gauges) -> None:
     at = gauges([1e-3] * 24, dropout_probability=0.1, seed=3.0)
     received = [at(step)[24:] for step in range(400)]
     assert abs(np.mean(received) - 0.9) < 4.0 * math.sqrt(0.09 / (400 * 24))

@@ -1,6 +1,5 @@
 """Systems of FMUs: order, loops and wiring by enumeration; solved and flown as their recursion says."""
 
-from collections.abc import Mapping, Set
 from dataclasses import replace
 from itertools import pairwise, permutations
 from typing import Any
@@ -146,11 +145,6 @@ def circle(fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps:
     return SystemStructure("circle", (first, second), (), joined)
 
 
-def watched(step: float, kind: str) -> Any:
-    """Return a binding of both states."""
-    return watch("first.x", "second.x", step_size=step, interpolation=kind, tolerance=1e-10)
-
-
 COUPLED = [({}, {}), ({"exchange": True}, {}), ({"substeps": 3}, {}), ({"delayed": True}, {}), ({}, JACOBI),
            ({"exchange": True, "substeps": 3}, JACOBI), ({}, {"iterations": 50})]  # fmt: skip
 
@@ -162,7 +156,8 @@ def test_the_error_of_a_system_falls_with_the_square_of_the_step(
     structure, apart = circle(foreign_fmu("follow2"), **system_options), {}
     for kind in ("zero-order", "linear"):
         for steps in (20, 40):
-            binding = watched(END / steps, kind)
+            header = {"step_size": END / steps, "interpolation": kind, "tolerance": 1e-10}
+            binding = watch("first.x", "second.x", **header)
             with CoupledAsset(structure, binding, isolated=False, **asset_options) as asset:
                 seen = asset.simulate(steps=steps).values[-1]
             apart[kind, steps] = np.abs(seen - EXACT).max()
@@ -259,13 +254,6 @@ def test_bindings_that_do_not_fit(base) -> None:
 NAMES = "abcd"
 
 
-def analysed(graph: Mapping[Any, Set[Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the label of each node's strong component, and the lengths of the shortest ways."""
-    joined = np.array([[int(other in successors) for other in graph] for successors in graph.values()])
-    _, labels = connected_components(joined, connection="strong")
-    return labels, shortest_path(joined, unweighted=True)
-
-
 links_strategy = st.lists(
     st.tuples(st.sampled_from(NAMES), st.sampled_from("xy"), st.sampled_from(NAMES), st.sampled_from("uv")),
     max_size=6,
@@ -311,7 +299,9 @@ def test_algebraic_loops_by_enumeration(pairs, feedthrough) -> None:
         for output, inputs in outputs.items():
             for variable in inputs:
                 graph[Endpoint(name, variable)].add(Endpoint(name, output))
-    labels, ways = analysed(graph)
+    joined = np.array([[int(other in successors) for other in graph] for successors in graph.values()])
+    _, labels = connected_components(joined, connection="strong")
+    ways = shortest_path(joined, unweighted=True)
     nodes = list(graph)
     shortest: dict[int, float] = {}
     for node, successors in graph.items():

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
@@ -169,6 +169,7 @@ def variable(name: str, causality: str, about: str = "", unit: str | None = None
     return VariableInfo(name, 0, causality=causality, description=about, unit=unit, start="0")
 
 
+@settings(max_examples=40)
 @given(
     st.lists(st.text(st.characters(codec="utf-8"), min_size=1), min_size=1, max_size=6, unique=True),
     st.text(st.characters(codec="utf-8")),

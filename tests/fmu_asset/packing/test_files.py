@@ -254,14 +254,6 @@ def test_the_sources_alone_are_the_same_fmu_without_a_binary(ours, model, tmp_pa
         FmiAsset(sources.path, WING_BINDING)
 
 
-def test_a_damaged_data_file_is_refused_with_a_sentence(ours, tmp_path, isolated) -> None:
-    contents = members(ours("compiled"))
-    name = "resources/reduced_model.bin"
-    contents[name] = contents[name][:999] + bytes([contents[name][999] ^ 4]) + contents[name][1000:]
-    with pytest.raises(errors.FmuCallError, match="checksum is wrong"):
-        FmiAsset(archive_of(tmp_path / "damaged.fmu", contents), WING_BINDING, isolated=isolated).step()
-
-
 @pytest.mark.long
 def test_fmpy_compiles_the_sources(ours, tmp_path) -> None:
     """As a user of another platform does: the sources alone, through fmpy's own CMake project."""

@@ -41,6 +41,7 @@ from twin_master.workflow import check_scenario
 from uav_twin import fly as new_run
 from uav_twin import load_scenario, open_run
 
+pytestmark = pytest.mark.xdist_group("wing")
 TEXT = text_of("model_mismatch")
 
 
@@ -164,7 +165,6 @@ def test_a_model_error_reaches_the_twin(library_file, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("wing")
 def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(wing, tmp_path):
     """A region that is not named is healthy, for the twin, the FMU that flies and the field."""
     strains = '[observation.strain]\nvariables = "strain[{1..24}]"\nunit = "1"'
@@ -274,7 +274,6 @@ def mission(tmp_path: Path, no_report: None) -> Callable[..., Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("wing")
 def test_a_mission_with_a_hidden_drift(mission, tmp_path):
     write_patch(tmp_path, *DRIFT)
     folder = mission("hidden", FILE)
@@ -295,7 +294,6 @@ def test_a_mission_with_a_hidden_drift(mission, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.xdist_group("wing")
 def test_a_twin_that_knows_the_effect_has_no_misfit(mission, tmp_path):
     write_patch(tmp_path, *STRUCTURE)
     ways = {"ignorant": (FILE, ""), "knowing": (FILE, FILE), "mistaken": ("", FILE)}
@@ -309,7 +307,6 @@ def test_a_twin_that_knows_the_effect_has_no_misfit(mission, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("wing")
 def test_the_asset_with_its_effects_can_be_exported(tmp_path):
     write_patch(tmp_path, *DRIFT)
     loaded = load_scenario(scenario_of(tmp_path, FILE, '"effect.hidden.gain" = 0.2'))

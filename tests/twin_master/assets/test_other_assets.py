@@ -48,10 +48,8 @@ from twin_master.watch.message import MessageReader
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, load_scenario, open_run, resume, structure_files
 
-pytestmark = pytest.mark.usefixtures("no_report")
+pytestmark = [pytest.mark.usefixtures("no_report"), pytest.mark.xdist_group("wing")]
 INPUTS = Inputs(__file__)
-WING = pytest.mark.xdist_group("wing")
-BOTH = pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +82,7 @@ def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
-@BOTH
+@pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
 def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
     """Also of a system of that FMU. It cannot save its state: its inputs are replayed.
 
@@ -102,9 +100,6 @@ def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, di
     assert rows(resume(flown).folder) == rows(direct[name])
 
 
-ANY = TwinMasterError, FmuError, SspError
-
-
 @pytest.mark.parametrize(
     ("name", "old", "new", "sentence"),
     [("coupled_fouling", *row) for row in INPUTS.refused("coupled") + INPUTS.refused("exchanger")]
@@ -112,22 +107,12 @@ ANY = TwinMasterError, FmuError, SspError
 )
 def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, name, old, new, sentence):
     text = (folder / f"{name}.toml").read_text(encoding="utf-8")
-    with refused(ANY, sentence):
+    with refused((TwinMasterError, FmuError, SspError), sentence):
         new_run(load_scenario(written(folder, text, (old, new), name="wrong.toml")), tmp_path / "run")
     assert not [*tmp_path.iterdir()]
 
 
-def test_files_that_cannot_be_flown_are_refused_before_a_folder_is_made(folder, tmp_path):
-    for file in ("broken.fmu", "broken.ssp"):
-        (folder / file).write_bytes(b"PK no archive")
-    for name, file, words in (
-        ("fouling", "none.fmu", r"none\.fmu cannot be read"),
-        ("fouling", "broken.fmu", r"broken\.fmu"),
-        ("coupled_fouling", "none.ssp", r"none\.ssp cannot be read"),
-        ("coupled_fouling", "broken.ssp", "not a sound SSP archive"),
-    ):
-        with refused(ANY, words):
-            new_run(load_scenario(folder / f"{name}.toml"), tmp_path / "run", {file[-3:]: folder / file})
+def test_damage_that_the_asset_lives_by_itself_needs_a_model_for_the_twin(folder, tmp_path):
     text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
     own = '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
     path = written(folder, text[: text.index("[truth]")] + own, name="own.toml")
@@ -157,7 +142,6 @@ def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
 
 
 @pytest.mark.slow
-@WING
 def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
     quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
@@ -185,7 +169,6 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-@WING
 def test_the_papers_policy_and_its_reliability():
     """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
     knowledge, source = of_wing("paper_level_turns", 0)
@@ -200,7 +183,6 @@ def test_the_papers_policy_and_its_reliability():
 
 
 @pytest.mark.long
-@WING
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(tmp_path):
     trees = []

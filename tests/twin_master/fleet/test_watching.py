@@ -4,8 +4,6 @@ import json
 import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import closing
-from http.client import HTTPConnection
 from pathlib import Path
 from queue import Queue
 from threading import Event, Thread
@@ -16,7 +14,7 @@ import pytest
 
 from tests.command_line import command, said
 from tests.twin_master.runs import journal, text_of, written
-from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, wait_until, write_csv
+from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, served, wait_until, write_csv
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving
@@ -352,14 +350,8 @@ def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, al
     serving.start()
     port = int(address.get(timeout=20).rstrip("/").rpartition(":")[2])
 
-    def served(path: str, host: str = "localhost") -> tuple[int, str]:
-        connection = HTTPConnection("127.0.0.1", port, timeout=20)
-        connection.request("GET", path, headers={"Host": host})
-        with closing(connection), connection.getresponse() as answer:
-            return answer.status, answer.read().decode()
-
     try:
-        status, page = served("/")
+        status, page = served(port)
         assert status == 200
         for words in (
             "wing-1",
@@ -369,14 +361,14 @@ def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, al
             "<strong>1</strong><span>messages refused",
         ):
             assert words in page
-        assert served("/version") == (200, "0")
-        assert served("/", "evil.example")[0] == 404
+        assert served(port, "/version") == (200, "0")
+        assert served(port, host="evil.example")[0] == 404
         state = json.loads(file.read_text())
         asset = state["assets"]["north/wing-1"]
         asset["alarms"] = 1234
         file.write_text(json.dumps(state))
-        wait_until(lambda: served("/version") == (200, "1"))
-        assert "1234" in served("/")[1]
+        wait_until(lambda: served(port, "/version") == (200, "1"))
+        assert "1234" in served(port)[1]
     finally:
         ended.set()
         serving.join()

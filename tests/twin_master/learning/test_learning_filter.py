@@ -11,11 +11,7 @@ from scipy.stats import foldnorm, invgamma, multivariate_normal, multivariate_t,
 
 from tests.twin_master.network.decision_oracles import trajectories
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import (
-    LearningFilter,
-    posterior_of_draws,
-    quantiles_of,
-)
+from twin_master.learning.learning_filter import LearningFilter, posterior_of_draws, quantiles_of
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
@@ -36,9 +32,9 @@ def model(factor: float = 1.0, levels: int = 3) -> GraphicalModel:
     return GraphicalModel.from_tables({"z": range(levels)}, tables, {"z": first})
 
 
-def sensors(levels: int = 3, average: str = "outside") -> GaussianSensorModel:
-    value = np.random.default_rng(1).normal(size=(DRAWS, levels, 2, GAUGES))
-    return GaussianSensorModel(value, [0.7, 1.1], [0.2, 0.5, 0.3], average=average)  # type: ignore[arg-type]
+def sensors() -> GaussianSensorModel:
+    value = np.random.default_rng(1).normal(size=(DRAWS, 3, 2, GAUGES))
+    return GaussianSensorModel(value, [0.7, 1.1], [0.2, 0.5, 0.3])
 
 
 def observations() -> Float:

@@ -68,11 +68,7 @@ FOUR_STATES = 2 * ((FIVE_LEVELS, "levels_percent = [0, 40]\nprior = [1, 0]"),)
 
 @cache
 def knowledge(*changes: tuple[str, str]) -> Knowledge:
-    return known_of(scenario(*changes, policy="mode"))
-
-
-def known_of(written: Scenario) -> Knowledge:
-    return of_wing(written)[0]
+    return of_wing(scenario(*changes, policy="mode"))[0]
 
 
 def following(known: Knowledge, policy: BeliefPolicy, written: Scenario | None = None) -> Knowledge:
@@ -167,7 +163,7 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
 
 def test_an_action_that_ends_ends_the_mission():
     written = scenario(('repairs = ["z2"]', "ends = true"), ("cost = 3.0\nrepairs", "cost = 0.0\nrepairs"))
-    known = known_of(written)
+    known = of_wing(written)[0]
     stop = following(known, BeliefPolicy(np.ones((1, 25)), np.array([4])))
     flown = fly(written, stop.twin(), stop.plant(stop.truth(1), asset_of(stop)))
     assert flown.control_index.tolist() == [1, 4]
@@ -206,7 +202,7 @@ def test_flown_missions_bring_the_return_that_was_promised():
 def test_simpler_rules_bring_what_is_said_of_them(decide_on, monkeypatch):
     monkeypatch.setattr("twin_master.mission.planning.PERIODS", ())
     for policy in ("mode", "qmdp"):
-        known = known_of(scenario(*FOUR_STATES, policy=policy, decide_on=decide_on))
+        known = of_wing(scenario(*FOUR_STATES, policy=policy, decide_on=decide_on))[0]
         flown_and(known, compared(known.scenario, planned()[0])[policy == "qmdp"])
 
 
@@ -220,7 +216,8 @@ def test_a_limit_is_kept_by_the_plan():
     assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
 
 
-def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
+def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path, monkeypatch):
+    monkeypatch.setattr("twin_master.mission.planning.PERIODS", (5,))
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
     worse = 2 * (("[0, 40]", "[0, 80]"),)
     words = ("plan", written(tmp_path, TEXT, *FOUR_STATES, *worse), "--value-of")
@@ -271,7 +268,7 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
     text = text_of("inspected_wing", *FOUR_STATES)
     flown = text[text.index("# What flies.") : text.index("# What the twin believes")]
     path = written(tmp_path, text[: text.index("[truth]")], (flown, ""))
-    known = known_of(scenario(*FOUR_STATES))
+    known = of_wing(scenario(*FOUR_STATES))[0]
     flown = fly(known.scenario, known.twin(), known.plant(known.truth(2), asset_of(known)))
     names = known.scenario.control_names
 

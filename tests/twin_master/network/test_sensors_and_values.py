@@ -174,15 +174,11 @@ LIMIT, LOAD = 2500e-6, (2.0, 3.0)
 SETTINGS = LIMIT, (-0.1, 0.1), 125e-6, LOAD
 
 
-def strains(seed):
-    rng = np.random.default_rng(seed)
-    quantity = QuantityModel(rng.uniform(500e-6, 4000e-6, size=(4, 3, 2, 5)), rng.dirichlet(np.ones(4)))
-    return rng, quantity, rng.dirichlet(np.ones(6)).reshape(3, 2)
-
-
 @given(SEEDS)
 def test_rewards_are_sums_over_states_controls_and_draws(seed):
-    rng, quantity, joint = strains(seed)
+    rng = np.random.default_rng(seed)
+    quantity = QuantityModel(rng.uniform(500e-6, 4000e-6, size=(4, 3, 2, 5)), rng.dirichlet(np.ones(4)))
+    joint = rng.dirichlet(np.ones(6)).reshape(3, 2)
     observation = rng.uniform(500e-6, 4000e-6, 5)
     observation[rng.integers(5)] = np.nan
     probability, value = quantity.draw_weight[:, None, None] * joint, quantity.value_per_draw

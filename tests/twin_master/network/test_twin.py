@@ -123,19 +123,6 @@ def test_a_twin_has_no_last_turn_and_smooths_over_its_lag(knowledge, seen):
     assert knowledge.twin(lag=0).turn(seen[0]).control_index == 1  # the first control of the scenario
 
 
-@pytest.mark.parametrize("late", [0, 30, 34, 39])
-def test_what_comes_late_is_put_in_its_place(knowledge, seen, late):
-    lag = None if late == 0 else 9
-    clean, twin = knowledge.twin(lag=lag), knowledge.twin(lag=lag)
-    for turn, row in enumerate(seen):
-        last = clean.turn(row, 1)
-        twin.turn(np.full(24, np.nan) if turn == late else row, 1)
-    assert told(twin.revise(late, seen[late])) == told(last)
-    np.testing.assert_array_equal(twin.smoothed(), clean.smoothed())
-    np.testing.assert_array_equal(twin.observed(late), seen[late])
-    np.testing.assert_array_equal(twin.turn(seen[0], 0).filtered, clean.turn(seen[0], 0).filtered)
-
-
 def test_a_twin_is_kept_and_goes_on_to_the_last_bit(knowledge, seen):
     """Of turns from before its lag nothing can be revised; what is refused or damaged leaves it as it was."""
     twin, other = knowledge.twin(lag=4), knowledge.twin(lag=4)

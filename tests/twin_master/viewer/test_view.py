@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from fe.wing.design import SHIPPED_DESIGN
 from reporting.figures import new_figure, to_svg
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
-from tests.twin_master.watch.conftest import viewed
+from tests.twin_master.watch.conftest import served, viewed
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
@@ -188,7 +187,7 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[str]:
+def opened(folder: Path) -> Iterator[str]:
     """Run `uav-twin view` as a user does, and end it with Ctrl-C."""
     process = subprocess.Popen(
         [sys.executable, "-m", "uav_twin", "view", str(folder)], stdout=subprocess.PIPE, text=True
@@ -207,13 +206,10 @@ def served(folder: Path) -> Iterator[str]:
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 def test_the_page_in_a_browser(begun, lines, tmp_path):
     add(begun, *lines[:31])
-    with open_browser() as browser, served(begun) as address:
+    with open_browser() as browser, opened(begun) as address:
         port = int(address.rstrip("/").rpartition(":")[2])
         for host, status in ((f"127.0.0.1:{port}", 200), (f"localhost:{port}", 200), ("evil.example", 404)):
-            connection = HTTPConnection("127.0.0.1", port)
-            connection.request("GET", "/", headers={"Host": host})
-            assert connection.getresponse().status == status
-            connection.close()
+            assert served(port, host=host)[0] == status
         own = socket.gethostbyname(socket.gethostname())
         if not own.startswith("127."):  # only this machine is served
             with pytest.raises(OSError, match="refused"):

@@ -10,7 +10,9 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +132,14 @@ def wait_until(found: Callable[[], object]) -> None:
     while not found():
         assert time.monotonic() < limit
         time.sleep(0.02)
+
+
+def served(port: int, path: str = "/", host: str = "localhost") -> tuple[int, str]:
+    """Return what a page of this machine answers to who calls it by a name."""
+    connection = HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("GET", path, headers={"Host": host})
+    with closing(connection), connection.getresponse() as answer:
+        return answer.status, answer.read().decode()
 
 
 PASSWORD = "a password"
