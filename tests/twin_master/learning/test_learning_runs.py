@@ -16,8 +16,6 @@ from tests.command_line import said
 from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
 from twin_master.errors import TwinMasterError
-from twin_master.mission.loop import gap_of
-from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.model import learnt_figure, sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
@@ -182,20 +180,6 @@ def test_the_view_shows_what_was_learnt(folder, run):
     learnt = off()
     flight.knowledge.__dict__["expectation"] = None
     assert learnt < 0.06 < 0.3 < off()  # as calibrated
-
-
-def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario, run):
-    knowledge = prepare_twin(str(scenario))
-    history = History(twin := knowledge.twin(), 24)
-    observed, coming = run["observed"].to_dataset(), run["predicted"]["control_probability"].values
-    rows = zip(observed["strain"].values, observed["control_index"].values, coming, strict=True)
-    for row, control, stored in rows:
-        concluded = twin.turn(row, int(control))
-        np.testing.assert_allclose(stored, concluded.prediction.control_probability, atol=1e-12)
-        history.add(Turn(Reading(row), concluded))
-    gap = gap_of(history, 4, knowledge)
-    residual = run["filtered"]["residual"].values[4:]
-    assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))
 
 
 def test_a_watch_keeps_the_last_turns_of_what_it_learnt(scenario, folder, learnt):

@@ -16,7 +16,7 @@ from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Reference
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of, tables_of
-from twin_master.store.summary import filtered_rms_error, find_fallback, of_fallback, summarise
+from twin_master.store.summary import find_fallback, of_fallback, summarise
 from twin_master.store.writing import open_run, write_run
 
 
@@ -140,13 +140,6 @@ def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
         model.states.index((0.3 * unit, 0.0))
 
 
-def test_rms_error_of_a_certain_belief():
-    belief = np.tile(MODEL.states.certain((0.2, 0.4)), (50, 1))
-    error = filtered_rms_error(MODEL, belief, TRUTH)
-    expected = np.sqrt([np.mean((0.2 - TRUTH[:, 0]) ** 2), 0.4**2])
-    np.testing.assert_allclose(error, expected)
-
-
 @pytest.mark.parametrize("name", ["level_turns", "failing_gauges", "growing_damage"])
 def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name, library_file):
     each = flown(name, library_file)
@@ -162,6 +155,10 @@ def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name
     complete = replace(each, scenario=scenario, flight=replace(each.flight, turns=turns))
     figures = [*summarise(complete, np.zeros((50, 3)))]
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
+    value, flight = {figure.key: figure.value for figure in figures}, each.flight
+    error = 100.0 * (flight.filtered @ each.knowledge.model.states.coordinates - flight.state)
+    rms = [value[f"filtered_rms_error_{name}"] for name in each.scenario.state_names]
+    np.testing.assert_allclose(rms, np.sqrt(np.mean(error**2, axis=0)))
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
     blind = np.full((2, 2, 3), np.nan)  # the asset shows nothing anywhere, or one gauge alone

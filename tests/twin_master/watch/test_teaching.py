@@ -119,7 +119,9 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     noticing.store(counts, report=False)
     run = open_run(noticing.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
-    assert {"gap_after_patch_15", "gap_before_patch_15"} <= {*figures_of(noticing.folder)}
+    figures, residual = figures_of(noticing.folder), run["filtered"]["residual"].values
+    assert figures["gap_after_patch_15"] == pytest.approx(np.sqrt(np.nanmean(residual[15:20] ** 2)))
+    assert "gap_before_patch_15" in figures
     believed, controls = run["filtered"]["probability"].values, run["observed"]["control_index"].values
     for part, model in zip((slice(15), slice(15, None)), noticing.models, strict=True):
         expected, _ = model.knowledge.sensor_model.moments(known_control(believed[part], controls[part], 2))
