@@ -68,11 +68,9 @@ class Wing:
         self.conditions = Conditions(self.means)
         self.tip = self.wing.force_row("tip_load")
 
-    def respond(self, what: Trial, *items: Any, **given: Any) -> Any:
-        return self.model.respond(what, OUTPUTS, ModelPatch(items), replace(self.conditions, **given))
-
     def seen(self, what: Trial, *items: Any, **given: Any) -> FloatArray:
-        return self.respond(what, *items, **given).values
+        conditions = replace(self.conditions, **given)
+        return self.model.respond(what, OUTPUTS, ModelPatch(items), conditions).values
 
     def matrices(self, *items: Any, loss: Any = (0.0, 0.0), warm: float = 1.0) -> tuple[Any, Any, Any]:
         """Stiffness, mass and damping."""
