@@ -43,8 +43,10 @@ class Course:
     hold: Hold | None = None
     motion: int | None = None
 
-    edges: ClassVar[tuple[float, ...]] = ()
-    """Moments at which it jumps between the stamps: none."""
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Moments at which it jumps, or is no curve [s]."""
+        return () if self.hold is Hold.SMOOTH else tuple(self.time.tolist())
 
     @cached_property
     def _spline(self) -> PPoly:
@@ -146,6 +148,11 @@ class Acting:
     begins: Start = Start.SETTLED
     initial: FloatArray = field(default_factory=lambda: np.zeros(0))
     release: tuple[FloatArray, Release] | None = None
+
+    @property
+    def edges(self) -> list[float]:
+        """Moments at which a load jumps, begins or ends [s]."""
+        return [moment for load in self.loads for moment in load.course.edges]
 
     @property
     def levels(self) -> tuple[FloatArray, FloatArray]:

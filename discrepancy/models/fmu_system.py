@@ -111,7 +111,8 @@ def state_motion(
     """
     acts, modal, law = _with_ports(system, laws.ports, tuple(columns.tolist()), tuple(numbers.tolist()))
     smooth = any(course.hold is Hold.SMOOTH for _, course, _ in acting.loads)
-    boundaries = substeps(modal, laws, acting.sampled, refinement, SMOOTH_PARTS if smooth else 1)
+    least = SMOOTH_PARTS if smooth else 1
+    boundaries = substeps(modal, laws, acting.sampled, refinement, least, acting.edges)
     begin, end = straight(lambda time: acting.load_at(time, acts.T), boundaries.time)
     feed, seen = acting.load_at(boundaries.time, system.direct[columns].T), system.outputs[columns[law]]
     first = Begin(

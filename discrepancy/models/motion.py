@@ -252,8 +252,8 @@ def _followed(
         none = np.zeros((len(stamps), 0))
         return ModalMotion(*free, none, none, laws.memory())
     smooth |= any(load.course.hold is Hold.SMOOTH for load in acting.loads)
-    edges = (*laws.edges, *(moment for load in acting.loads for moment in load.course.edges))
-    boundaries = substeps(modal, laws, times, refinement, SMOOTH_PARTS if smooth else 1, edges)
+    edges, least = (*laws.edges, *acting.edges), SMOOTH_PARTS if smooth else 1
+    boundaries = substeps(modal, laws, times, refinement, least, edges)
     feed = np.zeros((len(boundaries.time), len(laws)))
     if system.truncated and len(laws) and acting.loads:
         feed = acting.load_at(boundaries.time, system.residual(system.port_rows(laws).T))

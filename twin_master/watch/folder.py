@@ -24,12 +24,7 @@ from twin_master.mission.journal import (
     records_backwards,
 )
 from twin_master.mission.loop import BelievedModel, journalled_decision, operate, replay
-from twin_master.mission.preparation import (
-    EARLIER_KNOWLEDGE,
-    keep_knowledge,
-    prepare_knowledge,
-    share_knowledge,
-)
+from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
 from twin_master.mission.turns import Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
@@ -101,7 +96,7 @@ class Watch:
         else:
             keep_knowledge(folder, self.models[-1].knowledge)
         for number, model in enumerate(self.models[:-1]):
-            keep_knowledge(folder, model.knowledge, EARLIER_KNOWLEDGE.format(number))
+            keep_knowledge(folder, model.knowledge, number)
 
     def _prepared(self) -> BelievedModel:
         """Calibrate and plan."""
@@ -290,8 +285,7 @@ class Watch:
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
         # Before viewers read the line; they show earlier turns as they were told.
-        before = EARLIER_KNOWLEDGE.format(len(self.models) - 2)
-        keep_knowledge(self.folder, self.models[-2].knowledge, before)
+        keep_knowledge(self.folder, self.models[-2].knowledge, len(self.models) - 2)
         keep_knowledge(self.folder, outcome.model.knowledge)
         self.write(model=model)
         gaps = [

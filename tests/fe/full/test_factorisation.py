@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from fe.full import factorisation
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
+from fe.full.subspace import OrthonormalBasis
 from fe.runtime.errors import SolutionError
 
 
@@ -107,3 +108,15 @@ def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_no
     loose = sparse.csr_array(np.diag([0.0, *np.arange(1.0, 20.0)]))
     with pytest.raises(SolutionError, match="not held"):
         lowest_eigenpairs(loose, sparse.eye_array(20).tocsr(), 3)
+
+
+def test_a_basis_bounds_what_it_drops():
+    """Of vectors that it knows but for a little: it is orthonormal, and the rest is below its bound."""
+    random, basis = np.random.default_rng(5), OrthonormalBasis(60, drop=1e-8)
+    known = random.normal(size=(60, 4))
+    copies = known + 10.0 ** -np.arange(6.0, 12.0, 1.5) * random.normal(size=(60, 4))
+    for block in (known, copies):
+        coordinates = basis.extend(block)
+        left = np.linalg.norm(block - basis.vectors @ coordinates, axis=0)
+    np.testing.assert_allclose(basis.vectors.T @ basis.vectors, np.eye(6), atol=1e-13)
+    assert 0.0 < left.max() <= np.sqrt(basis.dropped_square) < 1e-6

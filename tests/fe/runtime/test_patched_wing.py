@@ -26,7 +26,7 @@ from fe.wing.operators import (
     upward,
 )  # fmt: skip
 from fe.wing.parts import DISTRIBUTIONS
-from tests.fe.runtime.stepping import exact, second_order
+from tests.fe.runtime.stepping import second_order
 from tests.refusals import Inputs, refused
 from tests.wings import wing_integrator
 
@@ -181,21 +181,6 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, st
     assert found - 1.0 == pytest.approx(effect - 1.0, rel=0.05)
 
 
-def test_strips_make_the_skin_and_losses_that_overlap_multiply(both):
-    everywhere = both.structure(LocalStiffnessLoss(0.25, 0.0, both.wing.span), state=SOUND).stiffness
-    skin = np.tensordot((0.75, 0.75, 0.75, 1.0), both.arrays.stiffness, 1)
-    assert np.abs(everywhere - skin).max() < 1e-6 * np.abs(skin).max()
-    start, end = both.arrays.strip_lines[[4, 6]]
-    once, as_one = (LocalStiffnessLoss(loss, start, end - start) for loss in (0.3, 0.51))
-    assert np.abs(both.structure(once, once).stiffness - both.structure(as_one).stiffness).max() < 1e-12
-    beyond, within = (LocalStiffnessLoss(0.3, start, end - start) for start in (-0.2, 0.0))
-    assert np.array_equal(both.structure(beyond).stiffness, both.structure(within).stiffness)
-    # strains need no factor where a box ends at strips
-    assert both.wing.strain_factors(ModelPatch((once,))) == pytest.approx(1.0, abs=1e-12)
-    nothing = ModelPatch((PointMass(0.1, 1.0), LocalStiffnessLoss(0.0, 0.1, 0.2)))
-    assert both.wing.strain_factors(nothing) is None
-
-
 # ---------------------------------------------------------------- loads
 
 
@@ -309,25 +294,6 @@ HEALTHY = {"servo_mass": 0.169, "pitot_mass": 0.134, "damping_alpha": ALPHA, "da
 @pytest.fixture(scope="module")
 def integrator(model: ReducedModel) -> ModalIntegrator:
     return wing_integrator(model, **HEALTHY)
-
-
-@pytest.mark.parametrize("beta", [0.0, BETA, 0.05])  # with 0.05 s all but the first mode are overdamped
-def test_loads_that_are_held_are_integrated_exactly(model, beta):
-    integrator = wing_integrator(model, **{**HEALTHY, "damping_beta": beta})
-    assert (integrator.damping_ratio[1:] > 1).all() == (beta == 0.05)
-    omega = 2.0 * np.pi * integrator.modes.frequency
-    matrix = second_order(np.diag(omega**2), np.diag(2.0 * integrator.damping_ratio * omega))
-    into = np.concatenate((0.0 * integrator.modes.participation.T, integrator.modes.participation.T))
-    time = np.array((0.0, 0.05, 0.3, 0.31, 0.6))
-    loads = np.array(((3.0, 0.0), (2.0, 5.0), (2.0, -5.0), (2.5, 0.0), (0.0, 0.0)))
-    state = integrator.at_rest((1.0, 0.0))
-    first = np.concatenate((state.displacement, state.velocity))
-    wanted = exact(matrix, into, time, loads, held=True, first=first)
-    for k, duration in enumerate(np.diff(time)):
-        state = integrator.advance(state, duration, loads[k])
-        found, y = np.concatenate((state.displacement, state.velocity / omega)), wanted[k + 1]
-        y[model.mode_count :] /= omega
-        np.testing.assert_allclose(found, y, atol=1e-9 * np.abs(y).max())
 
 
 @pytest.mark.parametrize("kind", ["wing", "beam"])

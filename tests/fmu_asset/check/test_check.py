@@ -4,9 +4,8 @@ import pytest
 
 from fmu_asset.archive.fmu_file import inspect_fmu
 from fmu_asset.check import FmuCheck, check_file, check_fmu
-from tests.fmu_asset.door.kinds import BINDINGS
 from tests.fmu_asset.foreign.workshop import MODELS
-from tests.fmu_asset.making import bound, changed, tables
+from tests.fmu_asset.making import bound, tables
 
 FAULTS = tables(__file__, "faults")
 QUICK = ("array3", "ball2")
@@ -65,19 +64,6 @@ def test_step_sizes_and_units_that_contradict(foreign_fmu) -> None:
         assert sentence in (of_file or texts(check_fmu(path, **options), check))
     broken = foreign_fmu.changed("fixed2", "schema", ('<Real start="0"/>', "<Real/>"))
     assert any("start value" in text for _, _, text in check_file(inspect_fmu(broken)[0]))
-
-
-def test_a_binding_of_ones_own(foreign_fmu) -> None:
-    check = check_fmu(foreign_fmu("room2"), BINDINGS["room2"])
-    assert check.passed
-    assert texts(check, "binding") == "room2 fits."
-    assert texts(check, "range edges") == "6 ends of ranges give finite outputs."
-    wrong = changed(BINDINGS["room2"], observation={"room": {"variables": ["room.T"], "unit": "m"}})
-    sentence = (
-        "observation.room is in 'm', but the FMU has 'room.T' in 'K', and there is no conversion between "
-        "the two; state the value in 'K'."
-    )
-    assert check_fmu(foreign_fmu("room2"), wrong).problems == (sentence,)
 
 
 def test_a_range_that_the_fmu_does_not_keep(foreign_fmu) -> None:

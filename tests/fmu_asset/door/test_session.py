@@ -126,17 +126,6 @@ def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu, state, isolated
 # ---------------------------------------------------------------------- starts
 
 
-def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu) -> None:
-    """The first flight stays where it began; the second one moves, and what follows it starts anew."""
-    with FmiAsset(foreign_fmu("lag1"), BINDINGS["lag1"]) as asset:
-        for speed in (0.0, 0.0, 1.0):
-            asset.reset()
-            seen = asset.step({"speed": speed}).values[0]
-        asset.reset()
-        assert asset.reset_trial.works is True
-        assert asset.step({"speed": 1.0}).values[0] == seen != 0.0
-
-
 FLIGHTS = [(False, (3, 7, 7)), (True, (4, 1, 7, 1)), (False, (1,) * 7)]
 """Whether the steps are made in one go, and how many there are in each flight."""
 CLOCKS = [("INSTANCE_CLOCK", True), ("INSTANCE_CLOCK", False), ("process_clock", True)]
