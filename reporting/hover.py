@@ -21,6 +21,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
+from reporting.table_file import is_number
+
 _POINTS_PER_INCH = 72.0
 _MOST_CELLS = 5000
 """Cells of a map whose values a page holds."""
@@ -178,14 +180,6 @@ def _scale(axis: Axis, limits: tuple[float, float], kind: str, name: str) -> dic
     texts = axis.get_major_formatter().format_ticks(places)
     if not name and not any(texts):
         found["unsaid"] = True
-    if any(text and not _is_number(text) for text in texts):
+    if any(text and not is_number(text.replace("\N{MINUS SIGN}", "-")) for text in texts):
         found["texts"] = [[place, " ".join(text.split())] for place, text in zip(places, texts, strict=True)]
     return found
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace("\N{MINUS SIGN}", "-"))
-    except ValueError:
-        return False
-    return True

@@ -182,7 +182,7 @@ def parse_table(
         raise errors.layout(f"{name} has {'a header line but ' if header is None else ''}no rows.")
     for line, row in found:
         if len(row) != len(columns):
-            comma = separator and len(row) > len(columns) and all(map(_is_number, row))
+            comma = separator and len(row) > len(columns) and all(map(is_number, row))
             came, wanted = counted(len(row), "cell"), counted(len(columns), "column")
             listed = f"{wanted} ({', '.join(columns)}) are expected"
             of = {"came": came, "expected": f"the header has {wanted}" if header is None else listed}
@@ -192,7 +192,8 @@ def parse_table(
     return TextTable(name, dict(zip(columns, cells, strict=True)), tuple(line for line, _ in found), errors)
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Return whether a text is a number, see `plain_number`."""
     try:
         plain_number(cell)
     except ValueError:

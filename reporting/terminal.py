@@ -276,19 +276,17 @@ def _common_options(
 def _extend(command: Any, options: Sequence[Any]) -> None:
     command.params.extend(options)
     if command.callback is not None:
-        command.callback = _interruptible(command.callback)
+        command.callback = _narrated()(command.callback)
     for inner in getattr(command, "commands", {}).values():
         _extend(inner, options)
 
 
-def _interruptible(call: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(call)
-    def guarded(*arguments: Any, **options: Any) -> Any:
-        before, reporting.progress.narrator = reporting.progress.narrator, functools.cache(progress)
-        try:
-            with interruptible():
-                return call(*arguments, **options)
-        finally:
-            reporting.progress.narrator = before
-
-    return guarded
+@contextmanager
+def _narrated() -> Iterator[None]:
+    """Show the stages of a command, and end it alike after Ctrl-C."""
+    before, reporting.progress.narrator = reporting.progress.narrator, functools.cache(progress)
+    try:
+        with interruptible():
+            yield
+    finally:
+        reporting.progress.narrator = before

@@ -169,7 +169,8 @@ def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str]
     return None
 
 
-def synthetic_library() -> dict[str, object]:
+@pytest.fixture(scope="session")
+def library_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A strain library in the published format, of a wing that never was: 24 gauges, 5 draws of e."""
     row = np.linspace(2910.0, 450.0, 16)
     healthy = np.concatenate([row, 1.06 * row[4:12] + 400.0])
@@ -188,20 +189,15 @@ def synthetic_library() -> dict[str, object]:
                 draws |= {str(e): (load / 3.0 * strain / e**0.85).tolist() for e in factors}
                 entry[control] = draws
             observations[str(z1)][str(z2)] = entry  # type: ignore[index]
-    return {
+    library = {
         "states": [list(LEVELS), list(LEVELS)],
         "controls": ["2g", "3g"],
         "gamma": 0.6,
         "transition_probabilities": {"2g": 0.05, "3g": 0.1},
         "observations": observations,
     }
-
-
-@pytest.fixture(scope="session")
-def library_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Path of a synthetic strain library."""
     path = tmp_path_factory.mktemp("library") / "UAVconfig.json"
-    path.write_text(json.dumps(synthetic_library()), encoding="utf-8")
+    path.write_text(json.dumps(library), encoding="utf-8")
     return path
 
 

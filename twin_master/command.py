@@ -77,13 +77,12 @@ def run(
         hint = f"continue with `uav-twin run --resume {folder}`" if begun else "no run was begun"
         return f"nothing is lost: {hint}"
 
-    with shown(view) as begun:
+    with shown(view) as begun, terminal.interruptible(kept):
         told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report, "begun": begun}
-        with terminal.interruptible(kept):
-            if loaded is None or resume is not None:
-                outcome = parts.resume(folder, loaded, **told)
-            else:
-                outcome = parts.fly(loaded, folder, overrides, policy=policy, replace=replace, **told)
+        if loaded is None or resume is not None:
+            outcome = parts.resume(folder, loaded, **told)
+        else:
+            outcome = parts.fly(loaded, folder, overrides, policy=policy, replace=replace, **told)
         if json:
             terminal.print_json(_record(outcome))
         else:

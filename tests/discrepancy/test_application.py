@@ -300,10 +300,6 @@ def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     assert uav_twin.load_model(tmp_path / "both.json").parameters == uav_twin.load_model(second).parameters
 
 
-def rig_conditions(model, *values):
-    return Conditions(np.array(values or np.ones(len(model.parameters))), np.zeros((1, 2)))
-
-
 def test_a_built_in_sensor_is_that_of_its_channel():
     """Of two channels that measure one output, the one that the effect was found on."""
     model = uav_twin.load_model("single_mass_rig")
@@ -312,8 +308,8 @@ def test_a_built_in_sensor_is_that_of_its_channel():
         Channel(name, Quantity.DISPLACEMENT, "displacement", noise) for name in ("laser", "transducer")
     )
     campaign = example_campaign(model, "static", 0, replace(plan_of(model), channels=channels))
-    patched = model.patched(ModelPatch((SensorGain("laser", 0.1),)))
-    seen = observe(patched, campaign, campaign.trials[0], ModelPatch(), rig_conditions(model)).values
+    patched, given = model.patched(ModelPatch((SensorGain("laser", 0.1),))), Conditions(np.ones(2))
+    seen = observe(patched, campaign, campaign.trials[0], ModelPatch(), given).values
     np.testing.assert_allclose(seen[:, 0], 1.1 * seen[:, 1], rtol=1e-12)
     assert np.abs(seen[:, 1]).max() > 0.0
 

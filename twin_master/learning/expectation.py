@@ -5,7 +5,7 @@ of the damage in common stays in it. Moments are exact; quantiles take what a se
 the state.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -87,13 +87,14 @@ class LearntExpectation:
             What the sensors say, SI.
         """
         rows = zip(carried, beliefs, observed, strict=True)
-        return stacked(self._known(self.learning.hypotheses(turn), turn, *row) for turn, *row in rows)
+        known = (self._known(self.learning.hypotheses(turn), turn, *row) for turn, *row in rows)
+        return joined(known, np.array)
 
     def smoothed(self, carried: Sequence[Carried], beliefs: Float, observed: Float) -> Expected:
         """Return what is expected of T turns given all observations, see `filtered`."""
         rows, own = zip(carried, beliefs, observed, strict=True), self.learning.smoothed_hypotheses(carried)
         last = (self.learning.hypotheses(carried[-1], weight) for weight in own)
-        return stacked(self._known(found, *row) for found, row in zip(last, rows, strict=True))
+        return joined((self._known(found, *row) for found, row in zip(last, rows, strict=True)), np.array)
 
     def predicted(self, carried: Sequence[Carried], beliefs: Float, asked: Float, horizon: int) -> Expected:
         """Return what is expected after each of T turns of given filtered beliefs, of the H to come.
@@ -101,7 +102,7 @@ class LearntExpectation:
         Controls are asked for with the probabilities p(U | D) (T, S, U).
         """
         rows = zip(carried, beliefs, asked, strict=True)
-        return stacked(self._ahead(*row, horizon) for row in rows)
+        return joined((self._ahead(*row, horizon) for row in rows), np.array)
 
     def of_marginals(
         self, learnt: Mapping[str, Learnt], joint: Float, controls: slice, seen: Float | None
@@ -211,14 +212,7 @@ def _believing(weight: Float, belief: Float) -> Float:
     return np.asarray(belief * np.divide(weight, own, out=apart, where=own > 0.0))
 
 
-def joined(parts: Sequence[Expected]) -> Expected:
-    """Return what is expected of turns one after the other."""
-    return Expected(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
-    )
-
-
-def stacked(parts: Iterable[Expected]) -> Expected:
-    """Return what is expected of several turns, which become the leading axis."""
+def joined(parts: Iterable[Expected], by: Callable[[list[Float]], Float] = np.concatenate) -> Expected:
+    """Return what is expected of turns one after the other; by `np.array` each is a row of a leading axis."""
     found = [vars(part) for part in parts]
-    return Expected(**{name: np.array([part[name] for part in found]) for name in found[0]})
+    return Expected(**{name: by([part[name] for part in found]) for name in found[0]})

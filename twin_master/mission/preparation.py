@@ -345,7 +345,7 @@ EARLIER_KNOWLEDGE = "twin_{}.npz"
 """Of the models that a watch believed before its last one, by their numbers from 0."""
 
 
-def keep_knowledge(folder: Path, knowledge: Knowledge, name: str = KNOWLEDGE_NAME) -> None:
+def keep_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None) -> None:
     """Write what a twin knows before its flight; the bytes depend on nothing else.
 
     The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); where it is decided by the
@@ -366,6 +366,7 @@ def keep_knowledge(folder: Path, knowledge: Knowledge, name: str = KNOWLEDGE_NAM
     if knowledge.plan.on_belief is not None:
         arrays |= {f"belief_{name}": array for name, array in vars(knowledge.plan.on_belief).items()}
     np.savez(content, **arrays | ({} if true is None else {"true": true}))
+    name = KNOWLEDGE_NAME if number is None else EARLIER_KNOWLEDGE.format(number)
     atomic_write_bytes(folder / name, content.getvalue())
     if knowledge.draws.record is not None:
         text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
@@ -382,7 +383,7 @@ def share_knowledge(folder: Path, other: Path) -> None:
         atomic_write_bytes(other / KNOWLEDGE_NAME, (folder / KNOWLEDGE_NAME).read_bytes())
 
 
-def kept_knowledge(folder: Path, scenario: Scenario, name: str = KNOWLEDGE_NAME) -> Knowledge:
+def kept_knowledge(folder: Path, scenario: Scenario, number: int | None = None) -> Knowledge:
     """Return what the twin of a run knew before its flight.
 
     Parameters
@@ -391,15 +392,16 @@ def kept_knowledge(folder: Path, scenario: Scenario, name: str = KNOWLEDGE_NAME)
         The run folder.
     scenario : Scenario
         Of its `config.json`.
-    name : str
-        Of the file.
+    number : int, optional
+        Of an earlier model of a watch, from 0; the last one where there is no such file.
 
     Raises
     ------
     RunFolderError
         The file is missing or damaged, or belongs to another scenario.
     """
-    path = folder / name
+    earlier = folder / EARLIER_KNOWLEDGE.format(number)
+    path = earlier if earlier.is_file() else folder / KNOWLEDGE_NAME
     try:
         with np.load(path, allow_pickle=False) as kept:
             predicted, draws, policy = (

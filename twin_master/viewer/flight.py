@@ -29,7 +29,7 @@ from reporting.json_file import plain, read_json
 from twin_master.errors import RunFolderError, TwinMasterError, said
 from twin_master.learning.expectation import Expected, expected_of, joined
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
-from twin_master.mission.preparation import EARLIER_KNOWLEDGE, KNOWLEDGE_NAME, Knowledge, kept_knowledge
+from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt
 from twin_master.network.inference import known_control, predict
 from twin_master.report.reading import NORMAL_95, printed_factors, printed_sensors
@@ -120,9 +120,7 @@ class Flight:
 
     def _believe(self, place: int) -> None:
         """Take in the next model that is believed, from so many bytes on."""
-        name = EARLIER_KNOWLEDGE.format(len(self._models))
-        name = name if (self.folder / name).is_file() else KNOWLEDGE_NAME
-        self._models.append((place, kept_knowledge(self.folder, self.scenario, name)))
+        self._models.append((place, kept_knowledge(self.folder, self.scenario, len(self._models))))
 
     @property
     def knowledge(self) -> Knowledge:

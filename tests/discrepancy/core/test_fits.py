@@ -126,6 +126,7 @@ def test_a_signal_of_unknown_scale_is_fitted_as_one_whose_scale_is_known(kinds, 
     assert found.converged
     assert -1.0 < known.chi_square - found.chi_square < 12.0
     np.testing.assert_allclose(found.point.shared[:2], known.point.shared[:2], atol=0.3)
+    assert abs(found.point.shared[2]) < 0.7  # the scale is that of the start but for noise and zeros
 
 
 # ---------------------------------------------------------------- evidence and posterior

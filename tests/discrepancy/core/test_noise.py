@@ -100,7 +100,7 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients):
 
 @pytest.mark.parametrize("count", [64, 301])
 def test_p_values_of_serial_tests_are_uniform_under_white_noise(count):
-    noise = np.random.default_rng(count).standard_normal((400, count))
+    noise = np.random.default_rng(count).standard_normal((800, count))
     for test in (ljung_box, cumulative_periodogram, fisher_g):
         p = np.array([test(row)[1] for row in noise])
         for level in (0.2, 0.05, 0.01, 0.0025):

@@ -5,12 +5,19 @@ from math import inf, sin
 
 import numpy as np
 import pytest
-from scipy.stats import binom, kstest
+from scipy.stats import binom, chi2, kstest
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
+from discrepancy.fits.gates import (
+    ABSOLUTE_LEVEL,
+    SHAPE_GAIN,
+    absolute_gate,
+    absolute_tests,
+    prior_tests,
+    shape_gate,
+)
 from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.conclusion import named_effects
@@ -155,6 +162,21 @@ def test_shape_gate_compares_evidence():
         assert gate.passed is passes
         assert gate.statistic == pytest.approx(gain)
     assert shape_gate(found, None).passed is True
+
+
+def test_unknowns_are_judged_beside_their_priors():
+    effect = kit.offset_effect()
+    shape = replace(effect, parameters=(replace(effect.parameters[0], magnitude=False),))
+    problem = kit.closed_problem(seed=1, gain_deviation=0.1)
+    found = kit.fitted(problem, Term(shape, "y1"))
+    far = replace(found.point, shared=np.array([3.0, 1.0, 2.0, 0.0, 2.0]), effect=np.array([4.0]))
+    told = dict(prior_tests(problem, replace(found, point=far)))
+    wanted = {
+        "calibrated parameters beside their priors": chi2.sf(10.0, 2),
+        "gains beside their priors": chi2.sf(8.0, 3),
+        "size of offset beside its prior": chi2.sf(16.0, 1),
+    }
+    assert told == pytest.approx(wanted)
 
 
 # ---------------------------------------------------------------- draws, and predictions of held-out trials

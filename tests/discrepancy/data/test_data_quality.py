@@ -74,28 +74,26 @@ def kinds_of(faults):
     return {(fault.kind, fault.channel) for fault in faults}
 
 
-@pytest.fixture(scope="module")
-def cantilever():
-    """It flies, is pulled and is let go."""
-    return Cantilever()
+CANTILEVER = Cantilever()
+"""It flies, is pulled and is let go."""
 
 
 @pytest.fixture(scope="module")
-def campaign(cantilever):
-    return example_campaign(cantilever, "complete", 7, PLAN)
+def campaign():
+    return example_campaign(CANTILEVER, "complete", 7, PLAN)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sound_data_have_no_fault(cantilever, seed):
+def test_sound_data_have_no_fault(seed):
     for patch in (
         ModelPatch(),
         ModelPatch((SensorGain("g0", 0.15), SensorDrift("g1", 2e-5, 5000.0))),
         ModelPatch((SensorGain("*", -0.2, "strain"), HighPass("x", 2.0))),
     ):
-        campaign = example_campaign(cantilever, "complete", seed, PLAN, patch)
+        campaign = example_campaign(CANTILEVER, "complete", seed, PLAN, patch)
         assert campaign.channels["g0"].noise.degrees_of_freedom == 399
         assert check_data(campaign) == ()
-        assert check_against_model(campaign, cantilever) == ()
+        assert check_against_model(campaign, CANTILEVER) == ()
         marked = mark_outliers(campaign)
         assert all(trial.used.mean() > 0.999 for trial in marked.trials)
 
@@ -133,7 +131,7 @@ def test_an_example_of_an_output_that_is_none_is_refused():
 
 
 @pytest.mark.parametrize(("name", "factor", "guess"), Inputs(__file__).table("faults.toml")["scaled"])
-def test_unit_slips(cantilever, campaign, name, factor, guess):
+def test_unit_slips(campaign, name, factor, guess):
     """The noise record slips with the channel, or stays in the right unit."""
     slipped = scaled(campaign, name, factor)
     channel = slipped.channels[name]
@@ -141,68 +139,68 @@ def test_unit_slips(cantilever, campaign, name, factor, guess):
     # where the unit is too small what is left is below the noise, and says nothing
     for record in (noise, channel.noise) if abs(factor) > 1.0 else (noise,):
         channels = {**slipped.channels, name: replace(channel, noise=record)}
-        faults = check_against_model(replace(slipped, channels=channels), cantilever)
+        faults = check_against_model(replace(slipped, channels=channels), CANTILEVER)
         assert (FaultKind.UNIT_SLIP, name) in kinds_of(faults)
         assert {fault.channel for fault in faults} == {name}
         assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
     if abs(factor) > 1.0:  # at one load factor, too
         flown = every(slipped, lambda trial: trial.rows(slice(2, 3)), TrialKind.FLIGHT)
-        assert (FaultKind.UNIT_SLIP, name) in kinds_of(check_against_model(flown, cantilever))
+        assert (FaultKind.UNIT_SLIP, name) in kinds_of(check_against_model(flown, CANTILEVER))
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 9.80665, 30.0])
-def test_other_factors_are_no_unit_slips(cantilever, campaign, factor):
+def test_other_factors_are_no_unit_slips(campaign, factor):
     """Strain that is 9.81 times too large is no strain in g, and beside ring-downs alone no fault at all."""
-    faults = kinds_of(check_against_model(scaled(campaign, "g0", factor), cantilever))
+    faults = kinds_of(check_against_model(scaled(campaign, "g0", factor), CANTILEVER))
     assert FaultKind.UNIT_SLIP not in {kind for kind, _ in faults}
     if factor == 9.80665:
         released = scaled(campaign, "g0", factor, TrialKind.RINGDOWN)
-        assert not kinds_of(check_against_model(released, cantilever))
+        assert not kinds_of(check_against_model(released, CANTILEVER))
 
 
-def test_slips_of_inputs(cantilever, campaign):
+def test_slips_of_inputs(campaign):
     """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
 
     def over(size):
         return lambda trial: replace(trial, force=trial.force / size)
 
-    (fault,) = check_against_model(every(campaign, over(1e3), name="loading"), cantilever)
+    (fault,) = check_against_model(every(campaign, over(1e3), name="loading"), CANTILEVER)
     assert (fault.kind, fault.trial) == (FaultKind.INPUT_SLIP, "loading")
     assert "about 1000 times" in fault.sentence
-    (fault,) = check_against_model(every(campaign, over(1e3), TrialKind.STATIC), cantilever)
+    (fault,) = check_against_model(every(campaign, over(1e3), TrialKind.STATIC), CANTILEVER)
     assert fault.kind is FaultKind.INPUT_SLIP
     assert "check the units of forces" in fault.sentence
     static = [trial.name for trial in campaign.trials if trial.kind is TrialKind.STATIC]
     for size, kind, unit in (
         (9.80665, FaultKind.INPUT_SLIP, "kgf"), (4.448, FaultKind.UNIT_DOUBT, "lbf"),
     ):  # fmt: skip
-        faults = check_against_model(every(campaign, over(size), kind=TrialKind.STATIC), cantilever)
+        faults = check_against_model(every(campaign, over(size), kind=TrialKind.STATIC), CANTILEVER)
         assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
         assert f"({unit} given as N?)" in faults[0].sentence
         assert faults[0].fatal is (unit == "kgf")
     stated = {**campaign.channels, "x": replace(campaign.channels["x"], unit="mm")}
     inches = replace(scaled(campaign, "x", 1.0 / 25.4), channels=stated)
-    (fault,) = check_against_model(inches, cantilever)
+    (fault,) = check_against_model(inches, CANTILEVER)
     assert "'x' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
     assert fault.fatal
 
     def in_millimetres(trial):
         return replace(trial, release=replace(trial.release, displacement=1e3 * trial.release.displacement))
 
-    faults = check_against_model(every(campaign, in_millimetres, kind=TrialKind.RINGDOWN), cantilever)
+    faults = check_against_model(every(campaign, in_millimetres, kind=TrialKind.RINGDOWN), CANTILEVER)
     assert {fault.kind for fault in faults} == {FaultKind.INPUT_SLIP}
     assert {fault.trial for fault in faults} == {f"release {number}" for number in range(1, 5)}
     assert all("about 0.001 times" in fault.sentence for fault in faults)
 
 
-def test_signs(cantilever, campaign):
+def test_signs(campaign):
     """A temperature that falls while the load factor rises turns the slope, not the readings."""
     turned = {(FaultKind.SIGN, "g1")}
     for kinds in ((), (TrialKind.FLIGHT,)):
-        faults = check_against_model(scaled(campaign, "g1", -1.0, *kinds), cantilever)
+        faults = check_against_model(scaled(campaign, "g1", -1.0, *kinds), CANTILEVER)
         assert kinds_of(faults) == turned
     backwards = every(campaign, lambda t: replace(t, force=-t.force), TrialKind.STATIC)
-    (fault,) = check_against_model(backwards, cantilever)
+    (fault,) = check_against_model(backwards, CANTILEVER)
     assert "sign of the forces" in fault.sentence
 
     def cool(trial, values):
@@ -210,7 +208,7 @@ def test_signs(cantilever, campaign):
         values[:, column] = 2.0 * np.sum(values[[0, -1], column]) - values[:, column]
         return values
 
-    assert not check_against_model(shown(campaign, cool, TrialKind.FLIGHT), cantilever)
+    assert not check_against_model(shown(campaign, cool, TrialKind.FLIGHT), CANTILEVER)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -222,7 +220,7 @@ def test_a_reading_that_passes_zero_at_once_has_a_sign(sign):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_tells_no_scale_and_no_sign_is_no_fault(cantilever, campaign, seed):
+def test_what_tells_no_scale_and_no_sign_is_no_fault(campaign, seed):
     """Noise over the little by which turns and loads differ, about a free zero; what begins with a zero."""
     rng = np.random.default_rng(seed)
 
@@ -250,36 +248,36 @@ def test_what_tells_no_scale_and_no_sign_is_no_fault(cantilever, campaign, seed)
         *(replace(loose, trials=(near(loading, spread),)) for spread in (0.02, 0.21)),
         every(campaign, late, TrialKind.RINGDOWN),
     ):
-        assert not check_against_model(sound, cantilever)
+        assert not check_against_model(sound, CANTILEVER)
 
 
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
 @pytest.mark.parametrize("pair", [("g0", "g1"), ("g1", "g2")])
-def test_swapped_channels(cantilever, campaign, kind, pair):
+def test_swapped_channels(campaign, kind, pair):
     def swap(trial, values):
         columns = [trial.channels.index(name) for name in pair]
         values[:, columns] = values[:, columns[::-1]]
         return values
 
-    faults = check_against_model(shown(campaign, swap, *([kind] if kind else [])), cantilever)
+    faults = check_against_model(shown(campaign, swap, *([kind] if kind else [])), CANTILEVER)
     fault = next(fault for fault in faults if fault.kind is FaultKind.SWAPPED)
     assert all(name in fault.sentence for name in pair)
 
 
-def test_outputs_and_lengths(cantilever, campaign):
+def test_outputs_and_lengths(campaign):
     for output, quantity, kind in (
         ("strain[9]", Quantity.STRAIN, FaultKind.MISSING_OUTPUT),
         ("tip_displacement", Quantity.STRAIN, FaultKind.WRONG_QUANTITY),
     ):
         channel = replace(campaign.channels["g0"], output=output, quantity=quantity)
         other = replace(campaign, channels={**campaign.channels, "g0": channel})
-        assert kinds_of(check_against_model(other, cantilever)) == {(kind, "g0")}
+        assert kinds_of(check_against_model(other, CANTILEVER)) == {(kind, "g0")}
     release = next(trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN)
 
     def cut(count, step=1, unit=1.0):
         part = release.rows(slice(0, count, step))
         return check_against_model(
-            replace(campaign, trials=(replace(part, time=unit * part.time),)), cantilever
+            replace(campaign, trials=(replace(part, time=unit * part.time),)), CANTILEVER
         )
 
     assert (FaultKind.TOO_SHORT, "") in kinds_of(cut(100))
@@ -307,7 +305,7 @@ def test_a_rate_of_an_angle_is_measured_and_no_integral(output, quantity, kinds)
     assert kinds_of(check_against_model(Campaign("", channels, (trial,), None, {}, ""), wheel)) == kinds
 
 
-def test_clipped_and_dead_channels(campaign, cantilever):
+def test_clipped_and_dead_channels(campaign):
     def limited(low, high, column):
         def change(_, values):
             values[:, column] = np.clip(values[:, column], low, high)
@@ -330,7 +328,7 @@ def test_clipped_and_dead_channels(campaign, cantilever):
         assert clipped_run(np.array(values), 3.0, np.array(load)) == run
     unplugged = shown(campaign, limited(1e-6, 1e-6, 2), name="loading")
     assert check_data(unplugged) == ()  # a load may do nothing there
-    assert kinds_of(check_against_model(unplugged, cantilever)) == {(FaultKind.DEAD, "g1")}
+    assert kinds_of(check_against_model(unplugged, CANTILEVER)) == {(FaultKind.DEAD, "g1")}
 
 
 @given(st.floats(1e-7, 3e-5), st.floats(0.0, 1.0))

@@ -26,7 +26,7 @@ from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
-MODEL = INPUTS.text("mass_on_a_spring.toml")
+MODEL = model_of(INPUTS.text("mass_on_a_spring.toml"))
 TIME = 0.005 * np.arange(1600)
 
 
@@ -54,11 +54,6 @@ def campaign_of(ring=None, rest=None, digit=1e-6, trials=2):
     return Campaign("rings", channels, tuple(made), None, {}, "")
 
 
-@pytest.fixture(scope="module")
-def model():
-    return model_of(MODEL)
-
-
 def only(faults, kind):
     """Return the one fault of a campaign, which is of a kind; what is held or scaled belies its noise too."""
     (fault,) = (item for item in faults if item.kind is not FaultKind.NOISE_LABEL)
@@ -72,12 +67,12 @@ def test_sound_rings_have_no_fault(model):
     for digit in (1e-6, 0.5):
         campaign = campaign_of(digit=digit)
         assert [item for item in check_data(campaign) if item.kind is not FaultKind.NOISE_LABEL] == []
-        assert check_against_model(campaign, model) == ()
+        assert check_against_model(campaign, MODEL) == ()
 
     def still(values):
         values[:] = 0.02 * np.random.default_rng(1).standard_normal(values.shape)
 
-    fault = only(check_against_model(campaign_of(still), model), FaultKind.UNOBSERVABLE)
+    fault = only(check_against_model(campaign_of(still), MODEL), FaultKind.UNOBSERVABLE)
     assert "'oil'" in fault.sentence
 
 
@@ -228,14 +223,14 @@ def test_noise_of_any_colour_is_at_rest(seed):
         (lambda t: 0.03 * t, "drifts by 0.000121 (SI) over its length, "),
     ],
 )
-def test_a_noise_record_that_moves_is_a_limit(model, motion, what):
+def test_a_noise_record_that_moves_is_a_limit(motion, what):
     def move(values):
         values[:, 1] += motion(TIME[: len(values)])
 
     campaign = campaign_of(rest=move)
     faults = [
         item
-        for item in (*check_data(campaign), *check_against_model(campaign, model))
+        for item in (*check_data(campaign), *check_against_model(campaign, MODEL))
         if item.kind is FaultKind.MOVES_AT_REST
     ]
     assert {(item.channel, item.fatal) for item in faults} == {("y", False)}

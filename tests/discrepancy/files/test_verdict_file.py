@@ -35,14 +35,8 @@ from reporting.errors import FileNotWrittenError
 from tests.discrepancy.bench import Bench
 from tests.refusals import Inputs, refused
 
-
-@pytest.fixture(scope="module")
-def fitted():
-    bench = Bench(amplitudes=(200.0, 150.0), held_out=(False, True))
-    return bench.fit(np.random.default_rng(7))
-
-
 INPUTS = Inputs(__file__)
+FITTED = Bench(amplitudes=(200.0, 150.0), held_out=(False, True)).fit(np.random.default_rng(7))
 GOLDEN = INPUTS.folder / "verdict.json"
 """A verdict with one of everything, written by this version."""
 STORED = read_verdict(GOLDEN)
@@ -56,7 +50,7 @@ def same(first, second):
     return repr(first) == repr(second)
 
 
-def test_a_verdict_comes_back_equal(tmp_path, fitted):
+def test_a_verdict_comes_back_equal(tmp_path):
     assert (VERDICT.kind, VERDICT.log_bayes_factor) == (VerdictKind.NAMED, inf)
     assert FRICTION.parameters[0].value == 0.0123456789012345678
     assert FRICTION.patch == ModelPatch((PowerDamping("root", 1.0 / 3.0, 0.0, 0.0, 0.1, 5e-324),))
@@ -65,7 +59,7 @@ def test_a_verdict_comes_back_equal(tmp_path, fitted):
     assert np.isnan([FRICTION.shape[0].high, STIFFNESS.deviation, VERDICT.gates[0].statistic]).all()
     again = write_verdict(tmp_path / "again.json", VERDICT, None, ORIGIN)
     assert again.read_bytes() == GOLDEN.read_bytes()
-    proof = prove(fitted, fitted)
+    proof = prove(FITTED, FITTED)
     for number, content in enumerate((proof, replace(proof, held_out_before=None))):
         back = read_verdict(write_verdict(tmp_path / f"{number}.json", VERDICT, content, ORIGIN))
         assert same(back.verdict, VERDICT)
@@ -199,18 +193,18 @@ def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_
 # ---------------------------------------------------------------- residuals
 
 
-def test_residuals_come_back_to_the_last_bit(tmp_path, fitted):
+def test_residuals_come_back_to_the_last_bit(tmp_path):
     samples = np.random.default_rng(0).standard_normal(50)
     noise = NoiseRecord(2.0, inf, samples, 0.01, "pre-trigger")
-    channels = dict(fitted.channels)
+    channels = dict(FITTED.channels)
     channels["g2"] = replace(channels["g2"], noise=noise, station=0.4, offset_deviation=inf)
     channels["g3"] = replace(channels["g3"], noise=None)
-    item = fitted.trials[0]
+    item = FITTED.trials[0]
     used, residual = item.used.copy(), item.residual.copy()
     used[3, 1], residual[3, 1] = False, nan
     place = replace(item.trial, used=used, load_place=(1.0, 0.35))
-    trials = (replace(item, trial=place, residual=residual), *fitted.trials[1:])
-    fitted = replace(fitted, channels=channels, trials=trials)
+    trials = (replace(item, trial=place, residual=residual), *FITTED.trials[1:])
+    fitted = replace(FITTED, channels=channels, trials=trials)
     back = read_residuals(write_residuals(tmp_path / "residuals.nc", fitted, {"hypothesis": "none"}))
     assert same(back.channels["g1"], fitted.channels["g1"])
     assert back.channels["g3"].noise is None
@@ -227,8 +221,8 @@ def test_residuals_come_back_to_the_last_bit(tmp_path, fitted):
             assert getattr(one, "dtype", None) == getattr(two, "dtype", None)
 
 
-def test_residual_file_carries_units_and_refuses_damage(tmp_path, fitted):
-    path = write_residuals(tmp_path / "residuals.nc", fitted)
+def test_residual_file_carries_units_and_refuses_damage(tmp_path):
+    path = write_residuals(tmp_path / "residuals.nc", FITTED)
     with xr.open_datatree(path, engine="h5netcdf") as opened:
         tree = opened.load()
     group = tree["trial_001"].to_dataset()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from benchmarks.force_events import counted, drawn, found_in, problem_of
+from benchmarks.force_events import KINDS, counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.conclusion import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch, SwitchedRecord
@@ -225,7 +225,6 @@ def test_the_most_probable_process_is_the_top_of_a_grid(end):
 # ---------------------------------------------------------------- forces that act at times
 
 
-KINDS = ("power", "leak", "tank", "push", "friction", "always", "nothing")
 EVENT, REST = Process(2.0, 0.15, rough=True), Process(0.5, 0.4, rough=True)
 
 

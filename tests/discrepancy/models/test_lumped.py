@@ -22,14 +22,11 @@ from discrepancy.models.system_model import State
 from fe.runtime import patch as patches
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
-from tests.discrepancy.rigs import FloatArray, laws, model_of, seen
-from tests.discrepancy.rigs import trial as asked
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, laws, model_of, seen
 from tests.fe.runtime.stepping import force_of, second_order, states_of
-from tests.refusals import Inputs
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
-INPUTS = Inputs(__file__)
 MASS = np.diag([1.5, 1.2, 0.8])
 STIFFNESS = np.array([[5200.0, -2600.0, 0.0], [-2600.0, 4800.0, -2200.0], [0.0, -2200.0, 2200.0]])
 JOINT = np.array([0.0, -1.0, 1.0])
@@ -41,9 +38,7 @@ DISPLACEMENTS = {f"x{k}": Quantity.DISPLACEMENT for k in (1, 2, 3)}
 X3, VELOCITY, ACCELERATION = (("x3", quantity) for quantity in Quantity.DISPLACEMENT.moving)
 
 
-@pytest.fixture(scope="module")
-def chain() -> LumpedModel:
-    return LumpedModel.load("three_mass_chain")
+CHAIN = LumpedModel.load("three_mass_chain")
 
 
 def trial(kind: TrialKind, time: Any = 400, **said: Any) -> Trial:
@@ -83,50 +78,50 @@ WARM, SOFTER = np.array([0.0, 10.0, 0.0, -20.0]), patches.ModulusTemperature(2e-
         ((SOFTER,), [1.0] * 4, np.outer(1.0 / (1 - 2e-3 * WARM), END), {"temperature": WARM}),
     ],
 )
-def test_static_rows_are_those_of_the_matrices(chain, items, force, wanted, said) -> None:
+def test_static_rows_are_those_of_the_matrices(items, force, wanted, said) -> None:
     given = {"parameters": np.ones(3)} | said
     parameters = given.pop("parameters")
-    found = shown(chain, static(force, **given), *items, parameters=parameters)
+    found = shown(CHAIN, static(force, **given), *items, parameters=parameters)
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
 # ---------------------------------------------------------------- motion
 
 
-def test_a_record_that_begins_under_load_begins_at_rest(chain: LumpedModel) -> None:
+def test_a_record_that_begins_under_load_begins_at_rest() -> None:
     what = trial(TrialKind.FORCED, 100, force=np.full(100, 3.0))
     for items in ((), (MicroSlip("joint", 0.5, 800.0, -0.3),)):
-        still = shown(chain, static([3.0] * 100), *items)
-        np.testing.assert_allclose(shown(chain, what, *items), still, rtol=1e-3 if items else 1e-11)
+        still = shown(CHAIN, static([3.0] * 100), *items)
+        np.testing.assert_allclose(shown(CHAIN, what, *items), still, rtol=1e-3 if items else 1e-11)
 
 
-def test_initial_states_are_shares_of_the_release(chain: LumpedModel) -> None:
-    start = shown(chain, ringdown(), initial=np.array([[0.1, 0.0], [0.05, 0.0]]))[0]
+def test_initial_states_are_shares_of_the_release() -> None:
+    start = shown(CHAIN, ringdown(), initial=np.array([[0.1, 0.0], [0.05, 0.0]]))[0]
     wanted = 0.02 * (1.1 * END / END[2] + 0.05 * SHAPES[:, 1] / SHAPES[2, 1])
     np.testing.assert_allclose(start, wanted, atol=1e-12)
     later, initial = ringdown(release=Release(0.02, at_rest=False)), np.array([[0.0, 0.0], [0.3, -0.4]])
-    values = shown(chain, later, outputs=(X3, VELOCITY), initial=initial, clock=(0.0, -0.02))
+    values = shown(CHAIN, later, outputs=(X3, VELOCITY), initial=initial, clock=(0.0, -0.02))
     begin = 0.02 * np.outer([0.3, -0.4 * np.sqrt(SQUARE[1])], SHAPES[:, 1] / SHAPES[2, 1]).ravel()
     wanted = [(expm(MOTION * t) @ begin)[[2, 5]] for t in later.time - 0.02]  # it moves before, too
     np.testing.assert_allclose(values, wanted, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("items", [(), (PowerDamping("joint", 0.2, 2.0, 0.0, 0.1, 1.0),)])
-def test_a_clock_shows_the_motion_at_other_times(chain: LumpedModel, items: tuple[Primitive, ...]) -> None:
+def test_a_clock_shows_the_motion_at_other_times(items: tuple[Primitive, ...]) -> None:
     stamps, time = np.arange(40001) * 1e-4, ringdown(200).time
-    fine = shown(chain, ringdown(stamps), *items)
+    fine = shown(CHAIN, ringdown(stamps), *items)
     for clock in ((0.02, 0.013), (-0.01, -0.0333), (0.0, -0.02)):
-        values, times = shown(chain, ringdown(200), *items, clock=clock), (1 + clock[0]) * time + clock[1]
+        values, times = shown(CHAIN, ringdown(200), *items, clock=clock), (1 + clock[0]) * time + clock[1]
         expected = np.stack([np.interp(times, stamps, column) for column in fine.T], axis=1)
         np.testing.assert_allclose(values, expected, atol=0.02 * 2e-4)
         assert np.all(values[times < 0.0] == values[0])  # held until the release
 
 
-def test_a_point_mass_sits_between_places(chain: LumpedModel) -> None:
+def test_a_point_mass_sits_between_places() -> None:
     row = np.array([0.0, 0.25, 0.75])
     wanted = np.sqrt(eigh(STIFFNESS, MASS + 0.3 * np.outer(row, row), eigvals_only=True))
     state = State((1.0,) * 3, structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
-    np.testing.assert_allclose(chain.system(state).angular_frequency, wanted, rtol=1e-10)
+    np.testing.assert_allclose(CHAIN.system(state).angular_frequency, wanted, rtol=1e-10)
 
 
 @given(ratios=st.tuples(*[st.floats(0.0, 3.0)] * 3), clock=st.floats(0.0, 0.01))

@@ -22,6 +22,8 @@ from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PointMass, SensorDrift, SensorGain, SensorRotation
 from tests.discrepancy.rigs import chosen
 
+pytestmark = pytest.mark.xdist_group("wing")
+
 TURNS = 24
 DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
 
@@ -51,7 +53,6 @@ def flown(model, tree):
     return outputs, Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
 
 
-@pytest.mark.xdist_group("wing")
 def test_every_turn_is_in_one_trial_and_the_model_has_the_strains_of_the_fmu(run, tmp_path):
     tree, campaign = tree_of(run), run_campaign(run)
     assert [trial.held_out for trial in campaign.trials] == [False, True]
@@ -85,7 +86,6 @@ def test_every_turn_is_in_one_trial_and_the_model_has_the_strains_of_the_fmu(run
 
 
 @pytest.mark.long
-@pytest.mark.xdist_group("wing")
 def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path):
     known = (
         SensorGain("strain[3]", -0.3), SensorRotation("strain[9]", 0.4),
@@ -118,7 +118,6 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("wing")
 @pytest.mark.parametrize("mass", [0.2, 0.0])
 def test_a_mass_that_the_twin_does_not_know_is_found_in_the_run(tmp_path, mass):
     folder = tmp_path / "heavy"
@@ -145,7 +144,6 @@ def test_whole_blocks_are_held_out_and_never_the_first(count, block, share):
     assert held.sum() <= share * count + block
 
 
-@pytest.mark.xdist_group("wing")
 def test_what_is_no_run_of_a_wing_is_refused_in_one_sentence(run, tmp_path):
     with pytest.raises(CampaignFileError, match="no run folder"):
         run_campaign(tmp_path)

@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from functools import cache
 from math import pi
 from pathlib import Path
 
@@ -25,18 +24,12 @@ from tests.discrepancy.rigs import chosen
 PUBLISHED = Path(__file__).parents[3].parent / "shared" / "reference" / "measured"
 
 
-@pytest.fixture(scope="module")
-def rig(tmp_path_factory):
-    """What makes campaign and model of a published rig, once."""
-
-    @cache
-    def made(name):
-        if not (PUBLISHED / name).is_dir():
-            pytest.skip(f"the published records of {name} are not beside the project")
-        folder = write_rig_campaign(name, PUBLISHED / name, tmp_path_factory.mktemp(name) / "campaign")
-        return read_campaign(folder), load_model(folder / "model.toml")
-
-    return made
+def rig(name, folder):
+    """Return campaign and model of a published rig."""
+    if not (PUBLISHED / name).is_dir():
+        pytest.skip(f"the published records of {name} are not beside the project")
+    made = write_rig_campaign(name, PUBLISHED / name, folder / name)
+    return read_campaign(made), load_model(made / "model.toml")
 
 
 def is_sound(campaign, model):
@@ -85,16 +78,16 @@ def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_writte
     assert not out.exists()
 
 
-def test_published_records_are_read_as_they_were_measured(rig):
+def test_published_records_are_read_as_they_were_measured(tmp_path):
     """A fall is no short record; readings at the end of the level sensor go; the pendulum has 50 Hz."""
-    assert is_sound(*rig("falling_phone"))
-    tanks, _ = rig("two_tanks")
+    assert is_sound(*rig("falling_phone", tmp_path))
+    tanks, _ = rig("two_tanks", tmp_path)
     assert [trial.name for trial in tanks.held_out] == ["validation"]
     for trial, left_out in zip(tanks.trials, (47, 37), strict=True):
         assert trial.values.shape == (1024, 1)
         assert int((~trial.used).sum()) == left_out
         assert float(trial.values[trial.used].max()) < 10.0
-    pendulum, _ = rig("pendulum")
+    pendulum, _ = rig("pendulum", tmp_path)
     assert [trial.name for trial in pendulum.held_out] == ["ilqr"]
     assert [len(trial.time) for trial in pendulum.trials] == [195, 1000]
     for trial in pendulum.trials:
@@ -116,8 +109,10 @@ def test_published_records_are_read_as_they_were_measured(rig):
         ("pendulum", ("coulomb_friction", "quadratic_damping", "clock_error"), set(), None),
     ],
 )  # fmt: skip
-def test_what_is_missing_of_a_rig_is_named_in_part_or_its_place_is_said(rig, name, effects, missing, least):
-    verdict = investigate(*rig(name), chosen(*effects), thorough=False).verdict
+def test_what_is_missing_of_a_rig_is_named_in_part_or_its_place_is_said(
+    tmp_path, name, effects, missing, least
+):
+    verdict = investigate(*rig(name, tmp_path), chosen(*effects), thorough=False).verdict
     if not missing:
         assert verdict.kind is VerdictKind.UNEXPLAINED
         assert "is missing at 'pivot', ordered by" in verdict.sentence

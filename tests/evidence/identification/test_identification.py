@@ -20,7 +20,7 @@ from evidence.identification.comparison import _row, outputs
 from evidence.identification.design_file import HEADER, design_toml, rounded
 from evidence.identification.errors import IdentificationError
 from evidence.identification.identifiability import analyse, profile
-from evidence.identification.least_squares import DesignFit, identify, minimise_local
+from evidence.identification.least_squares import DesignFit, identify
 from evidence.identification.local_model import LocalModel, build_local_model
 from evidence.identification.parameters import (
     deviations,
@@ -29,7 +29,6 @@ from evidence.identification.parameters import (
     wing_parameters,
     with_values,
 )
-from evidence.identification.pieces import reduced, wing_pieces
 from evidence.identification.targets import (
     LEVELS,
     MASS_TOTAL,
@@ -250,22 +249,6 @@ def test_the_first_gauge_is_gauge_1():
 # ---------------------------------------------------------------- local models
 
 
-@pytest.mark.parametrize("relief", [False, True])
-def test_the_pieces_are_those_of_the_operators(relief):
-    design = VIRTUAL.changed(lift={"inertia_relief": relief})
-    operators = assemble(design)
-    random = np.random.default_rng(3)
-    static, modal = (random.standard_normal((operators.unknowns, k)) for k in (3, 2))
-    found = reduced(wing_pieces(design), static, modal)
-    for term, own in zip(operators.stiffness_terms, found.stiffness, strict=True):
-        assert own == pytest.approx(static.T @ (term.matrix @ static), rel=1e-9)
-    for term, own in zip(operators.mass_terms, found.modal_mass, strict=True):
-        assert own == pytest.approx(modal.T @ (term @ modal), rel=1e-9)
-    assert found.lift == pytest.approx(operators.load_lift @ static, rel=1e-9)
-    assert found.tip == pytest.approx(operators.load_tip @ static, rel=1e-9)
-    assert found.gauges == pytest.approx(operators.gauge_output @ static, rel=1e-9)
-
-
 @pytest.mark.long
 def test_values_are_those_of_the_full_model(virtual_model):
     operators = assemble(VIRTUAL)
@@ -328,25 +311,6 @@ def test_known_numbers_are_recovered(recovered, virtual_targets):
     assert len(again.iterations) == 1
     assert again.values.tolist() == again.start.tolist()
     assert again.iterations[-1].objective == pytest.approx(recovered.iterations[-1].objective, abs=1e-6)
-
-
-@pytest.mark.long
-def test_bounds_and_the_radius_are_kept(virtual_model, virtual_targets):
-    """Of a fit whose data weigh nothing, which ends at the prior means, and of one that wants to go far."""
-    loose = Weights(**dict.fromkeys(Weights.__dataclass_fields__, 1000000.0))
-    found = minimise_local(virtual_model, SOME, virtual_targets, loose, 100.0)
-    assert np.abs(scaled(SOME, found)).max() < 1e-6
-    softer = replace(virtual_targets, strain=2.0 * virtual_targets.strain)
-    found = minimise_local(virtual_model, SOME, softer, Weights(), 0.3)
-    step = scaled(SOME, found) - scaled(SOME, virtual_model.values)
-    assert np.abs(step).max() == pytest.approx(0.3, abs=1e-6)
-    bounded = [
-        replace(p, lower=v - 0.01 * p.standard_deviation, upper=v + 0.01 * p.standard_deviation)
-        for p, v in zip(SOME, virtual_model.values, strict=True)
-    ]
-    found = minimise_local(virtual_model, bounded, softer, Weights(), 5.0)
-    for parameter, value in zip(bounded, found, strict=True):
-        assert parameter.lower - 1e-12 <= value <= parameter.upper + 1e-12
 
 
 @pytest.mark.long

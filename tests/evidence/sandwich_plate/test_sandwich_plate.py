@@ -115,19 +115,6 @@ def test_gauges_read_a_curvature_times_the_height(coarse_design, surface):
         assert -strain == pytest.approx(0.01 * height, rel=exact)
 
 
-def test_a_rod_adds_its_stiffness_and_its_mass(plate, coarse_design):
-    rod = {"web": 1, "reach": 0.5, "diameter": 0.01, "young_modulus": 100e9, "density": 1500.0}
-    stiffer = assemble_plate(coarse_design.changed(rods=[rod]))
-    assert plate.unknowns == stiffer.unknowns  # no mesh line is new at the rod's end
-    added = stiffer.stiffness_terms[3].matrix - plate.stiffness_terms[3].matrix
-    energy = 0.5 * bent(stiffer) @ (added @ bent(stiffer))
-    length = 0.5 * coarse_design.planform.semi_span
-    assert energy == pytest.approx(0.5 * 100e9 * np.pi * 0.01**4 / 64 * 0.01**2 * length, rel=0.1)
-    heave, _ = rigid(stiffer)
-    mass = heave @ ((stiffer.mass_terms[0] - plate.mass_terms[0]) @ heave)
-    assert mass == pytest.approx(1500.0 * np.pi * 0.005**2 * length, rel=0.1)
-
-
 def test_a_gauge_is_at_an_edge_that_its_widened_patch_reaches(shipped_design):
     """Widened by the cells at edges, or by the largest cells where the mesh names none."""
     wider = shipped_design.changed(mesh={"edge_size": None})
@@ -145,17 +132,8 @@ def kept(checks, limits):
 @pytest.mark.long
 def test_both_models_of_the_wing_agree(shipped_operators):
     """Nothing is fitted to either; docs/verification.md says what is left and why."""
-    checks = [one for one in command.plate_checks(shipped_operators) if one.group == "plate against box"]
-    limits = {
-        "tip stiffness": 0.003, "first bending": 0.003, "second bending": 0.003, "d ln k / d ln e": 0.002,
-        "gauges, rms": 0.021, "gauges, rms off the edges": 0.015,
-        "d ln strain / d ln e, rms": 0.01, "d ln strain / d ln e, rms off the edges": 0.008,
-        "strain ratio, z1 = 0.8, rms": 0.015, "strain ratio, z1 = 0.8, rms off the edges": 0.01,
-        "strain ratio, z2 = 0.8, rms": 0.01, "strain ratio, z2 = 0.8, rms off the edges": 0.004,
-        "strain ratio, z1 = 0.8, largest at the edges": 0.04,
-        "strain ratio, z2 = 0.8, largest at the edges": 0.04,
-    }  # fmt: skip
-    kept(checks, limits)
+    checks = [*command.plate_checks(shipped_operators)]
+    assert [check.name for check in checks if not check.passed] == []
 
 
 def test_the_plate_is_checked_beside_the_box(coarse_design, coarse_operators, monkeypatch, capsys):

@@ -15,7 +15,7 @@ from fe.runtime import patch
 from fe.runtime.arrays import FORCE
 from fe.runtime.errors import SolutionError
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients, rayleigh_damping_ratio
+from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients
 from fe.runtime.motion import (
     NO_LAWS,
     PLANFORM,
@@ -23,6 +23,7 @@ from fe.runtime.motion import (
     Laws,
     at_stations,
     laws_of,
+    port_flexibility,
     static_solution,
 )
 from fe.runtime.motion_arrays import ModalMotion
@@ -326,6 +327,15 @@ def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(ra
     assert moved.q[-1, 0] == pytest.approx(2.0 * ratio - 1.0, abs=0.03 * shift)
 
 
+def test_damping_acts_on_modes_that_hold_nearly_all_of_a_ports_flexibility():
+    """All but a tenth; what it does elsewhere is compared with an integrator in `test_lumped.py`."""
+    acts = laws_of(ModelPatch((PowerDamping("mass", 1.5, 0.5, 0.0, 6.0, 1.0),)), ["mass"])
+    for share, on_modes in ((0.095, True), (0.105, False)):
+        left_out = np.array([share / (1.0 - share) / 40.0])
+        system = ModalSystem(np.sqrt([40.0]), np.zeros((1, 1)), {"mass": np.ones(1)}, left_out)
+        assert port_flexibility(system, acts).tolist() == [0.0 if on_modes else left_out[0]]
+
+
 # ---------------------------------------------------------------- hysteresis
 
 
@@ -381,14 +391,6 @@ def test_the_step_of_any_oscillator_is_the_exponential(omega, zeta):
         wanted = expm(np.array([[0.0, unit], [-omega * omega / unit, -2.0 * zeta * unit]]) * duration)
         scaled = found * [[1.0, unit], [1.0 / unit, 1.0]]
         np.testing.assert_allclose(scaled, wanted, rtol=1e-7, atol=9e-10)
-
-
-@pytest.mark.parametrize(("alpha", "beta"), [(1.0735, 7.3124e-4), (0.0, 1.0), (100.0, 0.0)])
-@pytest.mark.parametrize("frequency", [(5.6492, 29.9699), (0.1, 10.0)])
-def test_rayleigh_coefficients_are_the_inverse_of_the_ratios(alpha, beta, frequency):
-    low, high = rayleigh_damping_ratio(alpha, beta, frequency)
-    found = rayleigh_coefficients(frequency, (float(low), float(high)))
-    np.testing.assert_allclose(found, (alpha, beta), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("frequency", [(1.0, 1.0), (0.0, 1.0), (-1.0, 2.0)])

@@ -26,7 +26,7 @@ from fe.wing.operators import (
     upward,
 )  # fmt: skip
 from fe.wing.parts import DISTRIBUTIONS
-from tests.fe.runtime.stepping import exact, second_order
+from tests.fe.runtime.stepping import second_order
 from tests.refusals import Inputs, refused
 from tests.wings import wing_integrator
 
@@ -294,25 +294,6 @@ HEALTHY = {"servo_mass": 0.169, "pitot_mass": 0.134, "damping_alpha": ALPHA, "da
 @pytest.fixture(scope="module")
 def integrator(model: ReducedModel) -> ModalIntegrator:
     return wing_integrator(model, **HEALTHY)
-
-
-@pytest.mark.parametrize("beta", [0.0, BETA, 0.05])  # with 0.05 s all but the first mode are overdamped
-def test_loads_that_are_held_are_integrated_exactly(model, beta):
-    integrator = wing_integrator(model, **{**HEALTHY, "damping_beta": beta})
-    assert (integrator.damping_ratio[1:] > 1).all() == (beta == 0.05)
-    omega = 2.0 * np.pi * integrator.modes.frequency
-    matrix = second_order(np.diag(omega**2), np.diag(2.0 * integrator.damping_ratio * omega))
-    into = np.concatenate((0.0 * integrator.modes.participation.T, integrator.modes.participation.T))
-    time = np.array((0.0, 0.05, 0.3, 0.31, 0.6))
-    loads = np.array(((3.0, 0.0), (2.0, 5.0), (2.0, -5.0), (2.5, 0.0), (0.0, 0.0)))
-    state = integrator.at_rest((1.0, 0.0))
-    first = np.concatenate((state.displacement, state.velocity))
-    wanted = exact(matrix, into, time, loads, held=True, first=first)
-    for k, duration in enumerate(np.diff(time)):
-        state = integrator.advance(state, duration, loads[k])
-        found, y = np.concatenate((state.displacement, state.velocity / omega)), wanted[k + 1]
-        y[model.mode_count :] /= omega
-        np.testing.assert_allclose(found, y, atol=1e-9 * np.abs(y).max())
 
 
 @pytest.mark.parametrize("kind", ["wing", "beam"])

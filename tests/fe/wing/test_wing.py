@@ -52,12 +52,6 @@ def test_a_wrong_design_is_refused_with_one_sentence_that_names_the_place(conten
         parse_design(content, source="wing.toml")
 
 
-@pytest.mark.parametrize("beside", [{"span_start": 0.3}, {"chord_end": 0.3}])
-def test_regions_may_lie_beside_one_another_along_the_span_or_the_chord(content, beside):
-    content["defects"][1] |= beside
-    assert len(parse_design(content).defects) == 2
-
-
 def test_the_modulus_runs_straight_between_stations_and_steps_between_bands(shipped_design):
     stations = [{"station": s, "young_modulus": m} for s, m in ((0.0, 8e9), (0.5, 10e9), (1.0, 6e9))]
     skin = shipped_design.changed(skin={"stations": stations}).skin
@@ -167,18 +161,6 @@ def test_mesh_lines_that_nearly_coincide_are_named(coarse_design):
     ):
         with pytest.raises(MeshError, match=sentence):
             build_mesh(coarse_design.changed(**changes))
-
-
-def test_cells_beside_the_edges_of_defects_are_small(shipped_design):
-    size = 0.012
-    mesh = build_mesh(shipped_design.changed(mesh={"edge_size": size}))
-    for place in {
-        place for defect in shipped_design.defects for place in (defect.span_start, defect.span_end)
-    }:
-        at = int(np.argmin(np.abs(mesh.span_lines - place)))
-        assert mesh.span_lines[at] == pytest.approx(place)
-        assert np.diff(mesh.span_lines)[at - 1 : at + 1].max() <= 1.5 * size + 1e-9
-    assert determinants(mesh).min() > 0.0
 
 
 # ---------------------------------------------------------------- operators

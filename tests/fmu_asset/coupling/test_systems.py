@@ -226,18 +226,6 @@ def test_units_and_types_are_converted(base, foreign_fmu) -> None:
     assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)
 
 
-def test_an_input_that_is_only_set_keeps_its_value(base) -> None:
-    """A start value of an input that nothing feeds holds; without one it is the FMU's own."""
-    wing, shown = base.component("wing"), []
-    for settled in ({"health.z1": Setting(0.4)}, {}):
-        structure = replace(base, components=(replace(wing, settings=settled),))
-        binding = bound(1.0, {"tip": ("wing.tip_displacement", "mm")})
-        with CoupledAsset(structure, binding, isolated=False) as asset:
-            shown.append((asset.observe().values[0], asset.step().values[0]))
-    assert shown[0][0] == shown[0][1]
-    assert shown[0][1] > 1.03 * shown[1][1]
-
-
 def test_bindings_that_do_not_fit(base) -> None:
     ends = ("push", "wing.load_factor"), ("damage.z1", "wing.health.z1"), ("damage.z1", "percent")
     wiring = Wiring(replace(base, connections=tuple(link(*pair) for pair in ends)))
@@ -315,11 +303,6 @@ def test_algebraic_loops_by_enumeration(pairs, feedthrough) -> None:
         assert all(b in graph[a] for a, b in pairwise(loop))
     assert {labels[nodes.index(loop[0])]: len(loop) - 1 for loop in loops} == shortest
     assert len(loops) == len(shortest)
-
-
-def test_equal_cases_keep_the_order_that_was_written() -> None:
-    joined = [Connection(Endpoint("b", "x"), Endpoint("a", "u"))]
-    assert schedule(("c", "a", "b"), joined, {key: {} for key in "cab"}).order == ("c", "b", "a")
 
 
 def test_a_long_chain_is_put_in_order_and_the_rest_stays_as_it_stood() -> None:
