@@ -134,7 +134,7 @@ def drag_found() -> Investigation:
 Outputs = dict[str, Quantity] | tuple[tuple[str, Quantity], ...]
 
 
-def trial(kind: TrialKind, time: Any, **said: Any) -> Trial:
+def asked(kind: TrialKind, time: Any, **said: Any) -> Trial:
     """Return a trial at times [s], or of so many samples each 10 ms."""
     stamps = 0.01 * np.arange(time) if isinstance(time, int) else np.asarray(time, dtype=np.float64)
     return Trial.plain("a trial", kind, said.pop("channels", ()), stamps, **said)

@@ -43,8 +43,7 @@ from fe.runtime.patch import (
     SensorRotation,
     StiffnessDrift,
 )
-from tests.discrepancy.rigs import INPUTS, campaign, chosen, model_of, seen, setting_of
-from tests.discrepancy.rigs import trial as asked
+from tests.discrepancy.rigs import INPUTS, asked, campaign, chosen, model_of, seen, setting_of
 
 pytestmark = pytest.mark.xdist_group("compiling")
 

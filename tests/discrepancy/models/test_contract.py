@@ -30,8 +30,7 @@ from fe.runtime.patch import (
     PowerDamping,
     PowerStiffness,
 )
-from tests.discrepancy.rigs import INPUTS, FloatArray, campaign, fmu_rig, seen
-from tests.discrepancy.rigs import trial as asked
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, seen
 from tests.refusals import refused
 
 TABLE = INPUTS.table("kinds.toml")

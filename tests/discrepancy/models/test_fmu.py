@@ -20,12 +20,9 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch import LoadGain, LoadPlace, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fmu_asset.packing.contents import build_script_fmu
-from tests.discrepancy.rigs import FloatArray, campaign, fmu_rig, integrated, laws
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, integrated, laws
 from tests.discrepancy.rigs import seen as shown
-from tests.discrepancy.rigs import trial as asked
-from tests.refusals import Inputs
 
-INPUTS = Inputs(__file__)
 STIFFNESS, AMPLITUDE, FREQUENCY = 1974.0, 0.02, np.sqrt(987.0)
 FORCE, SPEED = STIFFNESS * AMPLITUDE, FREQUENCY * AMPLITUDE
 GIVEN: dict[str, Any] = {"parameters": np.array([1.02, 0.9])}

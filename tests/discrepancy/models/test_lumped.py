@@ -22,14 +22,11 @@ from discrepancy.models.system_model import State
 from fe.runtime import patch as patches
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
-from tests.discrepancy.rigs import FloatArray, laws, model_of, seen
-from tests.discrepancy.rigs import trial as asked
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, laws, model_of, seen
 from tests.fe.runtime.stepping import force_of, second_order, states_of
-from tests.refusals import Inputs
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
-INPUTS = Inputs(__file__)
 MASS = np.diag([1.5, 1.2, 0.8])
 STIFFNESS = np.array([[5200.0, -2600.0, 0.0], [-2600.0, 4800.0, -2200.0], [0.0, -2200.0, 2200.0]])
 JOINT = np.array([0.0, -1.0, 1.0])

@@ -37,12 +37,9 @@ from fe.runtime.patch import (
     Primitive,
     Window,
 )
-from tests.discrepancy.rigs import FloatArray, campaign, integrated, model_of, one_mass, seen
-from tests.discrepancy.rigs import trial as asked
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, integrated, model_of, one_mass, seen
 from tests.fe.runtime.stepping import exact
-from tests.refusals import Inputs
 
-INPUTS = Inputs(__file__)
 HEIGHT, LOWER, CELL = {"height": Quantity.DISPLACEMENT}, {"lower": Quantity.LEVEL}, {"cell": Quantity.FORCE}
 FRICTION = PowerDamping("piston", 3.0, 0.0, 0.0, 1.0, 1.0)
 

@@ -42,7 +42,7 @@ from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures import rig_text
-from tests.discrepancy.rigs import INPUTS, FloatArray, campaign, chosen, integrated, seen, setting_of, trial
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, chosen, integrated, seen, setting_of
 from tests.fmu_asset.ours import wing_arrays, wing_model
 
 OUTPUTS = (
@@ -52,9 +52,9 @@ OUTPUTS = (
         for name in ("tip_displacement", "load_point_displacement", "displacement[1.1, 0.6]")
     ),
 )
-STATIC = trial(TrialKind.STATIC, np.arange(5), force=np.array([4.0, 8.0, 20.0, 12.0, 0.0]), run="A")
-FLIGHT = trial(TrialKind.FLIGHT, np.arange(3), load_factor=np.array([1.0, 2.0, 3.0]), run="A")
-RING = trial(TrialKind.RINGDOWN, np.arange(400) / 200.0, release=Release(displacement=0.03), run="A")
+STATIC = asked(TrialKind.STATIC, np.arange(5), force=np.array([4.0, 8.0, 20.0, 12.0, 0.0]), run="A")
+FLIGHT = asked(TrialKind.FLIGHT, np.arange(3), load_factor=np.array([1.0, 2.0, 3.0]), run="A")
+RING = asked(TrialKind.RINGDOWN, np.arange(400) / 200.0, release=Release(displacement=0.03), run="A")
 LATE = RING.time > 0.03  # what more than six modes do has died out
 
 
@@ -249,7 +249,7 @@ class Pair(NamedTuple):
 
 
 def record(kind: TrialKind, count: int, interval: float, **said: Any) -> Trial:
-    return trial(kind, np.arange(count) * interval, run="A", **said)
+    return asked(kind, np.arange(count) * interval, run="A", **said)
 
 
 # ---------------------------------------------------------------- a beam
