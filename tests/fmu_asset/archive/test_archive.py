@@ -219,3 +219,5 @@ def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu) -> None:
     names = ("binding", "first flight", "determinism", "step size", "reset", "instances")
     assert [found[name] for name in names] == ["ok"] * 6
     assert found["state"] == "warning"
+    (problem,) = check_fmu(foreign_fmu("ball2"), bound(1.0, {"z": ("z", "1")})).problems
+    assert "'z'" in problem  # which is no variable
