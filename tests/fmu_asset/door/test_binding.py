@@ -17,7 +17,7 @@ from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import contradictions, conversion, same_dimension
+from fmu_asset.door.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from reporting import units
@@ -105,6 +105,16 @@ def test_dimensions_are_compared_and_contradictions_told() -> None:
     told = contradictions([lying, UnitInfo("m", si(kg=1), 1.0, 0.0, ())])
     assert ["usual are 1000" in text for text in told] == [True, False]
     assert ["another dimension" in text for text in told] == [False, True]
+
+
+@pytest.mark.parametrize(("unit", "of_fmu", "value", "in_fmu"), UNITS["converted"])
+def test_units_convert_both_ways(unit, of_fmu, value, in_fmu) -> None:
+    scale = conversion(unit, variable("v", "input", unit=of_fmu or None), DEFINED, where="here")
+    assert scale.to_fmu(value) == pytest.approx(in_fmu, rel=1e-12)
+    assert scale.from_fmu(in_fmu) == pytest.approx(value, rel=1e-12)
+    other = Conversion(2.0, 0.5)
+    assert scale.then(other).to_fmu(value) == pytest.approx(2.0 * in_fmu + 0.5, rel=1e-12)
+    assert other.then(scale).to_fmu(value) == pytest.approx(scale.to_fmu(2.0 * value + 0.5), rel=1e-12)
 
 
 @pytest.mark.parametrize(("unit", "of_fmu"), UNITS["unfit"])
