@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.special import hyp1f1
 
 from fe.high_pass import filtered_record, high_pass
-from fe.runtime import patch, sensors
+from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError, InvalidStateError
 from fe.runtime.expression import Expression
 from fe.runtime.patch import (
@@ -110,14 +110,6 @@ def applied(items: ModelPatch, *given, filtered=filtered_record, **more):
 
 def shown(*primitives, record=RECORD, **more):
     return applied(ModelPatch(primitives), record, VALUES, RATES, **more)
-
-
-def test_nothing_without_sensors_touches_the_input():
-    mass, clock = patch.PointMass(0.1, 0.2), Clock(0.1, 0.0)
-    values, rates = shown(mass, clock)
-    assert values is VALUES
-    assert rates is RATES
-    assert sensors.clock_of(ModelPatch((Clock(0.1, 0.5), Clock(0.2, -0.1)))) == pytest.approx((0.3, 0.4))
 
 
 def test_order_of_sensors_matters():
