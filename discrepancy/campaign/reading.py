@@ -307,7 +307,9 @@ def _health(
     """Return damage regions, and their losses and deviations (N, K), from columns, keys, or healthy."""
     stated = dict(section.health)
     doubt = stated.pop("deviation", 0.0)
-    columns = [name.removeprefix(schema.OF_REGION) for name in table.columns if schema.OF_REGION in name]
+    columns = [
+        name.removeprefix(schema.OF_REGION) for name in table.columns if name.startswith(schema.OF_REGION)
+    ]
     losses = (name.removesuffix("_deviation") for name in columns)
     regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated, *losses)))
     health, deviation = np.zeros((2, len(table), len(regions)))

@@ -92,8 +92,8 @@ def trial_rows(
     data, point = problem.trials[number], found.point
     columns, index = problem.columns(number, point, found.linearisations[number], candidate)
     root = np.sqrt(precision[data.groups])
-    rows = (data.standardised(columns) * root).reshape(len(columns), -1)
     residual = (found.residuals[number] * root).ravel()
+    rows = (data.standardised(columns) * root).reshape(len(columns), residual.size)
     return TrialRows(rows, index, root, residual, point.local[number], data.unknowns.precision)
 
 

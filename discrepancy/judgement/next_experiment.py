@@ -108,7 +108,7 @@ def mutual_information(
         point = Point(item.point.shared, (np.zeros(data.unknowns.size),), item.point.effect)
         parts = there.linearise(0, point, item.candidate)
         columns, index = there.columns(0, point, parts, item.candidate)
-        rows = data.standardised(columns).reshape(len(columns), -1) * noise_units
+        rows = data.standardised(columns).reshape(len(columns), noise_units.size) * noise_units
         local, shared = np.split(rows, [data.unknowns.size])
         means.append(data.standardised(there.prediction(0, point, parts.response)).ravel() * noise_units)
         root = np.linalg.cholesky(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index)))

@@ -253,9 +253,11 @@ class Search:
             if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
         ]  # fmt: skip
         close = [one for one in able if self.score(one) > self.score(able[0]) - SEARCH.followed]
-        for item in each(
-            self.tell, close[: SEARCH.far_fits], lambda one: f"fitting {one.candidate.words} to the end"
-        ):
+        close = close[: SEARCH.far_fits]
+        # where a reading jumps with the force, more laws follow what one alone is in a simulation
+        whole, known = {*able[0].candidate.key} if able else set(), [one.candidate.key for one in close]
+        close += [one for one in able if {*(key := one.candidate.key)} < whole and key not in known]
+        for item in each(self.tell, close, lambda one: f"fitting {one.candidate.words} to the end"):
             found = attempt(self.problem, item.candidate, force.whole_point(item))
             if found is not None:
                 self.keep(found, exact=True)

@@ -20,15 +20,7 @@ from fmpy import platform as fmi_platform
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.reduced_arrays import ReducedArrays
-from fmu_asset.description import (
-    LOG_CATEGORIES,
-    PLACEHOLDER,
-    ArrayVariable,
-    Declaration,
-    arrays_of,
-    description_members,
-    rendered,
-)
+from fmu_asset import description
 from fmu_asset.errors import FmuBuildError, said
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.table import Roles
@@ -256,7 +248,7 @@ HOST = "It is compiled C and needs nothing but the C library; its sources are in
 
 def compiled_members(
     model: ReducedArrays,
-    declared: Declaration,
+    declared: description.Declaration,
     roles: Roles,
     *,
     fmi: FmiVersion = 2,
@@ -294,13 +286,13 @@ def compiled_members(
     if fmi == 3:
         table = (*table, replace(_TIME, reference=len(table)))
     declared = replace(declared, table=table)
-    arrays = arrays_of(table) if fmi == 3 else ()
+    arrays = description.arrays_of(table) if fmi == 3 else ()
     sources |= variable_sources(table, roles, arrays)
     listed = sorted(name for name in sources if name.endswith(".c"))
     for name in ("CMakeLists.txt", "buildDescription.xml")[: fmi - 1]:
-        sources[name] = rendered(name, identifier=declared.identifier, sources=listed, fmi=fmi)
+        sources[name] = description.rendered(name, identifier=declared.identifier, sources=listed, fmi=fmi)
     return {
-        **description_members(
+        **description.description_members(
             declared, generation_tool="uav-twin", host=HOST, source_files=listed, fmi=fmi, arrays=arrays
         ),
         DATA_FILE: data_file_bytes(model),
@@ -310,7 +302,7 @@ def compiled_members(
 
 
 def variable_sources(
-    table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[ArrayVariable] = ()
+    table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[description.ArrayVariable] = ()
 ) -> dict[str, bytes]:
     """Return the C sources that say what the variables are; placeholders stand for GUID and content tag.
 
@@ -338,11 +330,14 @@ def variable_sources(
         "place": {row.name: row.reference for row in table},
         "roles": roles,
         "shown": elements,
-        "token": PLACEHOLDER,
-        "categories": LOG_CATEGORIES,
+        "token": description.PLACEHOLDER,
+        "categories": description.LOG_CATEGORIES,
         "enumerations": ENUMERATIONS,
     }
-    return {name: rendered(name, **values) for name in ("structure_variables.h", "structure_variables.c")}
+    return {
+        name: description.rendered(name, **values)
+        for name in ("structure_variables.h", "structure_variables.c")
+    }
 
 
 def _sources(fmi: FmiVersion) -> dict[str, bytes]:

@@ -14,6 +14,7 @@ from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.reduced_model import ReducedModelSource
+from twin_master.assets.resolution import asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.loop import fly
@@ -67,6 +68,14 @@ def changed_scenario(name: str, changes: Mapping[str, Any]) -> LoadedScenario:
 def loaded_from(table: dict[str, Any], name: str) -> LoadedScenario:
     """Return a scenario that stands where a shipped one does."""
     return LoadedScenario(parse_scenario(table, name), scenario_files()[name], "0" * 64)
+
+
+def prepared(loaded: LoadedScenario, folder: Path, given: Mapping[str, Any]) -> AssetSource:
+    """Return what flies in a scenario under options, checked and ready in a folder."""
+    source = asset_source(resolve_scenario(loaded, given))
+    source.check()
+    source.prepare(folder, SilentProgress())
+    return source
 
 
 def of_library(

@@ -18,7 +18,7 @@ from reporting.progress import SilentProgress
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from tests.command_line import command, refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import changed_scenario, loaded_from, noted, written
+from tests.twin_master.runs import changed_scenario, loaded_from, noted, prepared, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
@@ -246,9 +246,8 @@ def test_the_twin_flies_with_it(calibrated, tmp_path, monkeypatch):
         pass
     assert any("flown is the watched asset" in note and note.endswith(believed) for note in told)
 
-    scenario = resolve_scenario(mission(draws=3), given)
-    source = asset_source(scenario)
-    source.prepare(tmp_path, SilentProgress())
+    scenario = mission(draws=3).scenario
+    source = prepared(mission(draws=3), tmp_path, given)
     drawn = source.draws(scenario.mission.seed)
     assert dict(drawn.others).keys() == {"pump"}
     table = source.observation_table(drawn, build_graphical_model(scenario))

@@ -23,7 +23,7 @@ from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource, Session
 from twin_master.errors import MissionInputError
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, Count, FileSection, Flag, Section, short
+from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, Count, FileSection, Flag, Section, named_once
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.wiring import Wiring
@@ -123,9 +123,7 @@ class CoupledSection(SeveralSection):
     def faults(self) -> Iterator[Fault]:
         """Yield what an FMU has, and names that come twice."""
         yield from super().faults()
-        names = [component.name for component in self.component]
-        told = f"each component needs a name of its own, and the names are {short(names)}"
-        yield len(set(names)) != len(names), told
+        yield named_once("component", [component.name for component in self.component])
 
 
 class SeveralSource(FmuSource):

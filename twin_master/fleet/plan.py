@@ -16,7 +16,7 @@ from twin_master.errors import FleetError, TwinMasterError, said
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Count, Flag, Name, Probability, Section, Seed
+from twin_master.scenario.section import Count, Flag, Name, Probability, Section, Seed, named_once
 from twin_master.seeds import generator
 from twin_master.watch.feeds import is_broker
 from twin_master.watch.message import Fed
@@ -90,9 +90,7 @@ class FleetFile(Section):
 
     def faults(self) -> Iterator[Fault]:
         """Yield names that come twice."""
-        names = [group.name for group in self.group]
-        told = f"each group needs a name of its own, and the names are {', '.join(names)}"
-        yield len(set(names)) != len(names), told
+        yield named_once("group", [group.name for group in self.group])
 
 
 @dataclass(frozen=True)

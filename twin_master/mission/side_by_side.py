@@ -18,7 +18,7 @@ from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.turns import DamageGrowth, History, Truth, checked_values, decided_to_end
+from twin_master.mission.turns import History, Truth, checked_values, decided_to_end
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import filter_many
 from twin_master.network.planner import decision, rationed
@@ -94,7 +94,6 @@ class _Stateless:
         self._assets = list(distinct.values())
         numbers = {key: number for number, key in enumerate(distinct)}
         self._asset = np.array([numbers[id(asset)] for asset in assets])
-        self._growth = DamageGrowth(knowledge.true_model)
         self._truth = Truth.together(truths)
         self._before: tuple[Index | None, Index | None] = None, None
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
@@ -125,7 +124,7 @@ class _Stateless:
         if self._scenario.truth.kind == "scripted":
             state = self._truth.state(step, None, None)
             return np.zeros_like(control), np.broadcast_to(state, (len(control), len(state)))
-        place = self._growth.following(*self._before, self._truth.uniform[step])
+        place = self._truth.growth.following(*self._before, self._truth.uniform[step])
         self._before = control, place
         return place, self._states.coordinates[place]
 

@@ -232,6 +232,8 @@ class Truth:
         Noise added to the readings of inspections, SI.
     uniform : (T,)
         What drives random growth; zeros where damage is scripted.
+    growth : DamageGrowth
+        How damage grows that does so at random.
     in_asset : bool
         Whether the asset carries damage, noise and faults; then all of the above is zero, and the asset
         tells what happened.
@@ -251,7 +253,7 @@ class Truth:
         self._scripted = scenario.scripted_history() if scenario.truth.kind == "scripted" else None
         grows = scenario.truth.kind == "random_growth"
         self.uniform: Float = generator(seed, "damage").random(steps) if grows else np.zeros(steps)
-        self._states, self._growth = model.states, DamageGrowth(model)
+        self._states, self.growth = model.states, DamageGrowth(model)
 
     def _apply_faults(self, scenario: Scenario) -> None:
         steps = np.arange(scenario.mission.steps)
@@ -281,7 +283,7 @@ class Truth:
             return np.array(self._scripted[step])
         before = None if previous_state is None else np.array([self._states.index(tuple(previous_state))])
         control = None if previous_control is None else np.array([previous_control])
-        place = self._growth.following(control, before, self.uniform[[step]])
+        place = self.growth.following(control, before, self.uniform[[step]])
         return np.asarray(self._states.coordinates[place][0])
 
     @classmethod

@@ -312,17 +312,9 @@ def log_densities(
     sensors, draws, parts, factors = len(shown), offset.shape[1], len(function), outward.shape[1]
     for first in range(0, shown.shape[1], BLOCK):
         size = min(BLOCK, shown.shape[1] - first)
-        distance, slope, exponent = (
-            np.empty((sensors, size)),
-            np.empty((parts, size)),
-            np.empty((draws, size)),
-        )
-        bits, square, along, mantissa = (
-            np.empty(size, np.int64),
-            np.empty(size),
-            np.empty(size),
-            np.empty(size),
-        )
+        distance, slope = np.empty((sensors, size)), np.empty((parts, size))
+        exponent, bits = np.empty((draws, size)), np.empty(size, np.int64)
+        square, along, mantissa = np.empty(size), np.empty(size), np.empty(size)
         for s in range(len(mean)):
             square[:], slope[:] = 0.0, 0.0
             for g in range(sensors):

@@ -29,6 +29,7 @@ from twin_master.scenario.section import (
     Section,
     Seed,
     incomplete,
+    named_once,
     one_or_each,
     short,
     unknown,
@@ -291,8 +292,7 @@ class Scenario(Section):
     def _faults_of_controls(self) -> Iterator[Fault]:
         states, controls, rewards = self.state_names, self.control_names, self.rewards
         for what, names in (("state", states), ("control", controls)):
-            told = f"each {what} needs a name of its own, and the names are {short(names)}"
-            yield len({*names}) != len(names), told
+            yield named_once(what, names)
         inputs, norm = tuple(sorted(self.control[0].values)), rewards.normalise_error_by
         for control in self.control:
             told = said("scenario.inputs", first=controls[0], roles=inputs, control=control)

@@ -7,7 +7,7 @@ are what a user writes, and its `source` makes of them what the mission needs. N
 """
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -109,6 +109,12 @@ class Section(toml_file.Section):
             if key == f"{base}_{unit}":
                 return base, unit
         return key, ""
+
+
+def named_once(what: str, names: Sequence[str]) -> Fault:
+    """Return the fault that a name comes twice."""
+    told = f"each {what} needs a name of its own, and the names are {short(list(names))}"
+    return len({*names}) != len(names), told
 
 
 def short(values: object) -> str:

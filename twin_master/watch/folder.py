@@ -260,16 +260,13 @@ class Watch:
         if not turns or not 0 <= first <= turns:
             raise MissionInputError(said("watch.from_turn", turns=turns))
         outcome = self.trial(file, first)(progress=self._progress)
-        self.adopt(outcome, None, self._kept_verdict(file.parent))
-
-    def _kept_verdict(self, found: Path) -> str:
-        """Keep the missing force that a verdict shows, for viewers; return where, empty without one."""
-        if not (found / PICTURE).is_file() or not (found / VERDICT).is_file():
-            return ""
-        kept = f"{TEACHING}/given_{len(self.models)}"
-        for name in (VERDICT, PICTURE):
-            atomic_write_bytes(self.folder / kept / name, (found / name).read_bytes())
-        return kept
+        # The missing force that its verdict shows is kept for viewers.
+        kept, shown = f"{TEACHING}/given_{len(self.models)}", [file.with_name(VERDICT), file.parent / PICTURE]
+        found = all(path.is_file() for path in shown)
+        for path in shown if found else ():
+            place = self.folder / kept / path.relative_to(file.parent)
+            atomic_write_bytes(place, path.read_bytes())
+        self.adopt(outcome, None, kept * found)
 
     def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> None:
         """Believe a patched model: with its twin it is gone on."""

@@ -10,6 +10,7 @@ import pytest
 from benchmarks.blind_naming import at_unit
 from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
@@ -20,16 +21,17 @@ from discrepancy.missing_force.shares import ForceShares, missing_force, order_o
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.models.fmu import FmuModel
+from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence
-from discrepancy.search.strategy import Search
+from discrepancy.search.strategy import Search, search
 from discrepancy.sources.examples import example_campaign, plan_for, plan_of
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.discrepancy.core.kit import fitted, problem_of
-from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding
+from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass
 from tests.refusals import Inputs
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
@@ -299,6 +301,22 @@ def test_friction_that_holds_is_the_law_of_the_missing_force():
         slips = np.abs(item.speed) > 0.02
         np.testing.assert_allclose(np.abs(item.law[slips]), 0.528, rtol=0.06)
         assert np.abs(item.law).max() < 0.56  # where it sticks no more than that holds it
+
+
+def test_one_law_stands_where_several_follow_the_jumps_that_an_accelerometer_shows():
+    random, time = np.random.default_rng(5), 0.01 * np.arange(150)
+    rig = one_mass(stiffness=200.0, damping={"matrix": 1.0}, output=[{"name": "x", "vector": 1.0}])
+    known = (("x", Quantity.DISPLACEMENT, 2e-4), ("a", Quantity.ACCELERATION, 2e-2))
+    channels = {name: Channel(name, what, "x", NoiseRecord(size, 200.0)) for name, what, size in known}
+    rubs, trials = ModelPatch((PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0),)), []
+    for name in "bc":
+        force = np.r_[0.0, 0.3 * np.cumsum(random.standard_normal(149))]
+        bare = Trial.plain(name, TrialKind.FORCED, ("x", "a"), time, force=force, hold=Hold.LINEAR)
+        shown = rig.respond(bare, tuple(("x", what) for _, what, _ in known), rubs, Conditions(np.zeros(0)))
+        noise = random.standard_normal((150, 2)) * [size for *_, size in known]
+        trials.append(replace(bare, values=shown.values + noise))
+    found = search(problem_of(Campaign("rubs", channels, tuple(trials), None, {}, ""), rig), FEW[:3])
+    assert found.best().candidate.identifiers == ("coulomb_friction",)
 
 
 def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():

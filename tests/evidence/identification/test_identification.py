@@ -336,16 +336,6 @@ def test_the_analysis_tells_known_from_unknown(recovered, virtual_targets):
 # ---------------------------------------------------------------- the command
 
 
-def test_a_folder_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
-    out = tmp_path / "out"
-    words = "--data", tmp_path / "none", "--out", out, "--quiet"
-    assert command_line.call(monkeypatch, *words, main=main) == 1
-    said = capsys.readouterr().err
-    assert said.endswith("is not a folder; give the one that holds the authors' two folders.\n")
-    assert said.count("\n") == 1
-    assert not out.exists()
-
-
 @pytest.mark.long
 def test_a_run_leaves_a_design_a_record_and_a_report(monkeypatch, capsys, published_folder, tmp_path):
     start = tmp_path / "start.toml"

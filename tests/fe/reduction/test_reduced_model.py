@@ -17,10 +17,11 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 from scipy import sparse
 
+from fe.full import subspace
 from fe.reduction.model_cache import reduced_structure, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import Reduction, measured_errors, reduce_structure
 from fe.reduction.terms import ReductionTerms
-from fe.runtime.errors import FiniteElementError, OutsideModelError
+from fe.runtime.errors import FiniteElementError, OutsideModelError, SolutionError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import region_names
 from fe.structure.affine import (
@@ -264,6 +265,12 @@ def test_pymor_reduces_and_bounds_alike():
         energy_bound = float(reduced.estimate_error(mu).ravel()[0])
         coercivity = min(theta / reference["theta"])
         assert np.linalg.norm(residual) / coercivity == pytest.approx(energy_bound, rel=1e-6)
+
+
+def test_a_search_that_does_not_settle_is_refused(monkeypatch):
+    monkeypatch.setattr(subspace, "MOST_ITERATIONS", 1)
+    with refused(SolutionError, "Conjugate gradients did not reach"):
+        reduce_structure(springs(), SETTINGS)
 
 
 def test_same_system_gives_the_same_bytes():

@@ -152,14 +152,9 @@ def test_a_change_of_the_structure_is_that_of_the_full_model(both, change, given
     assert found[1] == pytest.approx(wanted[1], rel=1e-3 if change is softer else FREQUENCY)
 
 
-@pytest.fixture(scope="module")
-def finer(both: Compared) -> AffineOperators:
-    """The same wing in cells of 40 mm along the span."""
-    return assemble(both.design.changed(mesh={"span_size": 0.01}))
-
-
-@pytest.mark.parametrize(("start", "end", "loss"), [(0.2, 0.45, 0.4), (0.5, 0.6, 0.5)])
-def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, start, end, loss):
+def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both):
+    """On the same wing in cells of 40 mm along the span."""
+    finer, start, end, loss = assemble(both.design.changed(mesh={"span_size": 0.01})), 0.2, 0.45, 0.4
     lines = finer.wing_mesh.span_lines
     start, end = (float(lines[np.abs(lines - place).argmin()]) for place in (start, end))
     matrices = finer.stiffness(), both.softened(finer, start, end, loss)

@@ -229,7 +229,7 @@ def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(attempt
     assert not made.exists()
 
 
-@pytest.mark.parametrize("version", range(1, 7))
+@pytest.mark.parametrize("version", [1, 3, 5, 6])
 def test_what_older_kernels_know_is_asked_of_them(tmp_path, key, version) -> None:
     """By the rights of that version, which newer kernels take as well; its own files can be made."""
     own = tmp_path / "own"

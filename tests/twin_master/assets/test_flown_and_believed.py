@@ -24,11 +24,10 @@ from fe.runtime.patch import (
     Washout,
 )
 from fmu_asset.packing.patch_file import SCHEMA
-from reporting.progress import SilentProgress
 from scenarios import binding_files
 from tests import command_line
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import edited, figures_of, loaded_from, table_of, text_of, written
+from tests.twin_master.runs import edited, figures_of, loaded_from, prepared, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
 from twin_master.assets.system_export import export_scenario
@@ -185,10 +184,8 @@ def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(wing, tmp_
             bound = edited(binding_files()["uav_wing"].read_text(), (strains, own))
             table["asset"] |= {"binding": str(written(tmp_path, bound, name=f"{role}.toml"))}
         table["asset"]["isolated"] = False
-        scenario = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
-        source, model = asset_source(scenario), build_graphical_model(scenario)
-        source.check()
-        source.prepare(tmp_path / role, SilentProgress())
+        observed = loaded_from(table, "level_turns")
+        source, model = prepared(observed, tmp_path / role, {}), build_graphical_model(observed.scenario)
         draws = source.draws(0)
         found = source.observation_table(draws, model)
         flown, health, control = source.open(), {"z1": 0.4}, {"load_factor": 3.0}

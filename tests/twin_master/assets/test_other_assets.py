@@ -19,7 +19,6 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError, InvalidDesignError
 from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuError, SspError
-from reporting.progress import SilentProgress
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
     changed_scenario,
@@ -30,11 +29,12 @@ from tests.twin_master.runs import (
     loaded_from,
     merged,
     of_wing,
+    prepared,
     table_of,
     text_of,
     written,
 )
-from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.assets.structure_source import StructureBelief
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
@@ -133,10 +133,7 @@ def shipped(name: str, tmp_path: Path, *changes: tuple[str, str]) -> LoadedScena
 
 
 def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
-    scenario = resolve_scenario(loaded, Overrides(in_process=True))
-    source = asset_source(scenario)
-    source.check()
-    source.prepare(folder, SilentProgress())
+    scenario, source = loaded.scenario, prepared(loaded, folder, {"in_process": True})
     truth = Truth(scenario, build_graphical_model(scenario), scenario.mission.seed)
     return Plant(scenario, truth, source.open())
 

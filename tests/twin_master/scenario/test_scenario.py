@@ -20,20 +20,18 @@ from calibration.result.record import ParameterPrior
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
 from fe.wing.design import SHIPPED_DESIGN
 from fmu_asset.packing.patch_file import SCHEMA
-from reporting.progress import SilentProgress
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import merged, table_of, text_of, written
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import draw_parameter
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
-from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.graphical_model import worsening_table
 from twin_master.run_folder import to_json
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Calibration, Scenario
 from twin_master.scenario.section import AssetSection
-from uav_twin import fly, load_calibration
+from uav_twin import fly, load_calibration, prepare_twin
 
 INPUTS = Inputs(__file__)
 EDITED = ("level_turns", "level_turns_learning", "inspected_wing", "model_mismatch")
@@ -173,9 +171,7 @@ def test_a_kind_of_one_s_own_is_one_class(tmp_path):
     loaded = LoadedScenario(parse_scenario(table, "mine.toml"), tmp_path / "mine.toml", "")
     scenario = resolve_scenario(loaded, Overrides(seed=3))
     assert parse_scenario(scenario.to_dict(), "config.json") == scenario
-    source = asset_source(scenario)
-    source.prepare(tmp_path, SilentProgress())
-    knowledge = prepare_knowledge(scenario, source, 3)
+    knowledge = prepare_twin(loaded, {"seed": 3})
     assert knowledge.sensor_model.mean[0, 1, 0] == pytest.approx(3.0 / 900.0)
     with pytest.raises(ScenarioError, match=r"asset: unknown key `stifness`.*kind, stiffness"):
         parse_scenario(table | {"asset": {"kind": "bellows", "stifness": 1.0}}, "mine.toml")

@@ -24,7 +24,6 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
 from tests.twin_master.watch.conftest import served, viewed
 from twin_master.assets.design_source import DESIGN_COPY
-from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
@@ -38,7 +37,7 @@ TURNS = 50
 @pytest.fixture(scope="module")
 def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("view") / "run"
-    fly(load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False)
+    fly(load_scenario("level_turns"), folder, {"strain_library": library_file}, report=False)
     # The gauges of the library are those of the shipped wing: with its design the page shows them from above.
     shutil.copy(SHIPPED_DESIGN, folder / DESIGN_COPY)
     return folder

@@ -75,6 +75,10 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     assert verdict["to_turn"] == alarm["turn"] + 10
     assert 12 <= verdict["from_turn"] <= 18
     assert model["from_turn"] == verdict["from_turn"]
+    (adopted,) = [record["turn"] for record in records if "model" in record]
+    turns = {record["turn"]: record["log_evidence"] for record in records if "filtered" in record}
+    evidence = [turns[turn] for turn in range(model["from_turn"], adopted + 1)]
+    assert model["before"]["log_evidence"] == pytest.approx(sum(evidence))
     assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
     said = [notice["sentence"] for d in decisions for notice in d["notices"]]
     searched = [sentence for sentence in said if "belief and decision follow" not in sentence]

@@ -1,3 +1,5 @@
+"""A second idealisation of the wing beside closed forms and the box, and the known answers of elements."""
+
 import itertools
 
 import numpy as np
@@ -15,11 +17,15 @@ from evidence.sandwich_plate.plate_known_answers import (
 )
 from evidence.sandwich_plate.plate_layout import PlateLayout
 from evidence.sandwich_plate.sandwich_plate import assemble_plate
+from evidence.verification import calculix_examples as examples
+from evidence.verification import known_answers as answers
+from evidence.verification.__main__ import element_checks, ring_down_checks
 from fe.full.factorisation import Factorisation
 from fe.runtime.state import STANDARD_GRAVITY
 from fe.verification.wing_checks import wing_balance
 from fe.wing.operators import point_masses
 from tests import command_line
+from tests.calculix_decks import needs_calculix
 
 CHECKS = (square_plate_deflection, square_plate_frequency, cantilever_strip)
 
@@ -165,3 +171,35 @@ def test_the_plate_is_checked_beside_the_box(coarse_design, coarse_operators, mo
     text = capsys.readouterr().out
     assert text.count("kept") == 3  # the closed forms; the differences have limits on the mesh of the design
     assert "plate of the box's section" in text
+
+
+# ---------------------------------------------------------------- known answers of the elements
+
+
+def test_every_known_answer_is_met():
+    checks = list(element_checks())
+    assert [check.name for check in checks if not check.passed] == []
+    assert {check.group for check in checks} == {
+        "patch test", "unsupported body", "cantilever", "MacNeal-Harder",
+    }  # fmt: skip
+    assert answers.rigid_body_values()[6] > 1e-6
+
+
+def test_a_cantilever_converges_to_timoshenkos_beam():
+    coarse, middle, fine = (abs(answers.cantilever_check(cells)) for cells in (5, 10, 20))
+    assert fine < middle < coarse < 0.01
+    assert 2.5 < np.log2(coarse / middle) < 4.5  # the tip of a quadratic element: third to fourth order
+
+
+@pytest.mark.skipif(not examples.DECKS.is_dir(), reason="Debian's calculix-ccx-test is not installed")
+@pytest.mark.parametrize("name", examples.NAMES)
+def test_decks_of_calculix_give_its_published_results(name, tmp_path):
+    assert examples.published_difference(name, tmp_path) < 1e-6
+
+
+@pytest.mark.long
+@needs_calculix
+def test_a_ring_down_agrees(coarse_operators, tmp_path):
+    direct, same_rule = ring_down_checks(coarse_operators, tmp_path, 0.125)
+    assert direct.passed
+    assert same_rule.value < 3e-4  # what is left is not the time integration
