@@ -26,6 +26,9 @@ from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 from fmu_asset.door.runs import State
 
+LATEST = 100.0
+"""Lengths of a record after which its stamps count from elsewhere than the trial's start."""
+
 
 class FmuModel(DescribedModel):
     """An FMU (`discrepancy.models.interface.Model`).
@@ -155,8 +158,10 @@ class FmuModel(DescribedModel):
         At samples that are so many times as dense as those of the trial.
         """
         laws, times = self._laws(patch), divided(conditions.stamps(trial.time), parts)
-        if trial.kind is not TrialKind.RINGDOWN and trial.time[0] < 0.0:  # an FMU begins at zero
-            trial, times = replace(trial, time=trial.time - trial.time[0]), times - trial.time[0]
+        first, last = trial.time[[0, -1]].tolist()
+        # an FMU begins at zero, and cannot be followed for hours to where a clock of the day begins
+        if trial.kind is not TrialKind.RINGDOWN and not 0.0 <= first <= LATEST * (last - first):
+            trial, times = replace(trial, time=trial.time - first), times - first
         case = self._case(trial, conditions, patch, laws)
         return self.fmu.motion(case, trial, times, laws, columns, orders, conditions.refinement)
 

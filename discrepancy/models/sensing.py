@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError, said
 from discrepancy.models.interface import ACROSS, Conditions, Model, Response
 from fe.high_pass import filtered_record
@@ -121,7 +121,7 @@ def observe_response(
             release *= 1.0 + float(conditions.initial[0, 0])
     record = SensorRecord(
         tuple((name, campaign.channels[name].quantity.value) for name in trial.channels), trial.kind.value,
-        trial.time, trial.start, trial.temperature, trial.run, release,
+        trial.time, trial.start, trial.temperature, trial.run, release, trial.begins is not Start.UNKNOWN,
     )  # fmt: skip
     with CatalogueError.instead_of(InvalidPatchError):
         check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])

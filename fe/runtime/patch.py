@@ -134,14 +134,14 @@ class SensorRecord:
         "static", "flight", "ringdown", "forced" or "driven".
     time : (N,) ndarray
         Dynamic: since the trial's start [s]. Static, flight: since the campaign's start [s].
-    start : float
-        Of a dynamic trial since the campaign's start [s].
+    start, release : float
+        Of a dynamic trial since the campaign's start [s]; amplitude of a ring-down [m or the signal's unit].
     temperature : (N,) ndarray
         Less the reference temperature [K].
     run : str
         Label of the run.
-    release : float
-        Release amplitude of a ring-down [m or the signal's unit].
+    settled : bool
+        Whether it does not begin in an unknown motion.
     """
 
     channels: Sequence[tuple[str, str]]
@@ -151,6 +151,7 @@ class SensorRecord:
     temperature: FloatArray
     run: str = ""
     release: float = 1.0
+    settled: bool = True
 
     @property
     def is_dynamic(self) -> bool:
@@ -239,10 +240,7 @@ class ThermalStrain(Sensor):
 
 
 class HighPass(Sensor):
-    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
-
-    They had settled before the record's first sample, see `fe.runtime.sensors.held_before`.
-    """
+    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s]."""
 
     channel: str
     time_constant: Annotated[float, "s"]

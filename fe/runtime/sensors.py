@@ -163,9 +163,12 @@ RATES = frozenset({"velocity", "acceleration", "angular_velocity", "angular_acce
 
 
 def held_before(item: HighPass, record: SensorRecord, first: FloatArray) -> FloatArray:
-    """Return what the columns (C,) of a filter had been for ever before the `first` row: at rest there."""
+    """Return what the columns (C,) of a filter had been for ever before the `first` row of a record.
+
+    They were at rest there; what moved already had done so about zero.
+    """
     rates = [record.channels[column][1] in RATES for column in columns_of(item, record.channels)]
-    return np.where(rates, 0.0, first)
+    return np.where(rates, 0.0, first) if record.settled else np.zeros_like(first)
 
 
 LARGEST_ORDER = 4

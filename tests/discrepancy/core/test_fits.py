@@ -184,29 +184,6 @@ def test_evidence_with_flat_priors_is_the_limit_of_wide_ones():
     assert one == pytest.approx(other, abs=0.02)
 
 
-@pytest.mark.parametrize("freedom", [0.0, 10.0, 200.0])
-def test_misfit_is_the_noise_variance_integrated_out(freedom):
-    """Quadrature over sigma^2 ~ scaled inverse chi-square (n0, s0^2) of the Gaussian likelihood."""
-    problem = kit.closed_problem(noise=NoiseRecord(0.02, freedom) if freedom else None)
-    count = problem.counts[0]
-
-    def integrated(total):
-        def log_integrand(v):  # v = ln sigma^2
-            return -0.5 * (freedom + count) * v - 0.5 * (freedom + total) * np.exp(-v)
-
-        peak = log((freedom + total) / (freedom + count))
-        top = log_integrand(peak)
-        area, _ = quad(lambda v: np.exp(log_integrand(v) - top), peak - 4.0, peak + 4.0)
-        return -(top + log(area))
-
-    sums = [np.array([s, 1.0, 1.0]) for s in (0.5 * count, count, 3.0 * count)]
-    values = [problem.misfit(s) - integrated(float(s[0])) for s in sums]
-    assert np.ptp(values) < 1e-6
-    sums, step = count * np.array([0.5, 1.0, 3.0]), np.array([1e-3 * count, 0.0, 0.0])
-    slope = (problem.misfit(sums + step) - problem.misfit(sums - step)) / step[0]
-    assert problem.precisions(sums)[0] == pytest.approx(slope, rel=1e-4)
-
-
 @pytest.mark.parametrize("freedom", [8.0, 50.0, 0.0])
 def test_evidence_with_unknown_variance_against_quadrature(freedom):
     """One unknown (an offset), everything else exact: the evidence is an integral over one number."""

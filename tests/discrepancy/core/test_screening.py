@@ -1,4 +1,4 @@
-"""Screening and gates: dense projections, fits, level and power; what is left beside the noise."""
+"""Screening and gates: fits, level and power; draws, held-out trials; what is left beside the noise."""
 
 from dataclasses import replace
 from math import inf, sin
@@ -30,45 +30,13 @@ from fe.runtime.patch import ModelPatch, RunOffset
 from . import kit
 
 
-@pytest.fixture(scope="module")
-def screened():
-    """Problem, fit without effect, screen, two linear effects (wide priors) with their changes."""
+def test_pairs_and_gains_are_those_of_fits():
+    """For linear effects with wide priors the screen is the fit; one change alone is no pair."""
     problem = kit.closed_problem(seed=12, effect=0.12)
     none = kit.fitted(problem)
     screen = Screen(problem, none)
     terms = (Term(kit.offset_effect(deviation=10.0), "y1"), Term(kit.drift_effect(deviation=10.0), "y1"))
-    return problem, none, screen, terms, [next(iter(screen.changes(term))) for term in terms]
-
-
-def test_change_is_the_projected_one(screened):
-    """Beside change d, derivatives A by nuisances, Hessian, residual and gradient as dense matrices."""
-    problem, none, screen, terms, changes = screened
-    q = problem.shared.size
-    bare = kit.Linear(problem)
-    _, a, hessian = bare.dense()
-    zero = np.concatenate((none.point.shared, np.zeros(1), *none.point.local))
-    kernel = np.eye(len(a)) - a @ np.linalg.solve(hessian, a.T)
-    vectors = []
-    for term, change in zip(terms, changes, strict=True):
-        linear, moved = kit.Linear(problem, Candidate((term,))), zero.copy()
-        moved[q] = change.start[0]
-        residual = linear.residual(zero)
-        d = residual - linear.residual(moved)
-        gradient = a.T @ residual - bare.precision * np.delete(zero, q)
-        assert change.size == pytest.approx(d @ kernel @ d, rel=1e-6)
-        # b(d) = r.d - g' H^-1 J' d; the gradient g is small at the fit, and would be zero at its very end
-        expected = residual @ d - gradient @ np.linalg.solve(hessian, a.T @ d)
-        assert change.fits == pytest.approx(expected, rel=1e-6)
-        vectors.append(d)
-    vector = [change.vector for change in changes]
-    for one, other in ((0, 0), (0, 1), (1, 1)):
-        product = vectors[one] @ kernel @ vectors[other]
-        assert float(vector[one] * screen.sign @ vector[other]) == pytest.approx(product, rel=1e-6)
-
-
-def test_pairs_and_gains_are_those_of_fits(screened):
-    """For linear effects with wide priors the screen is the fit; one change alone is no pair."""
-    problem, none, screen, terms, changes = screened
+    changes = [next(iter(screen.changes(term))) for term in terms]
     ((misfit, first, second),) = pairs(changes, screen.sign)
     found = kit.fitted(problem, *terms)
     assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)

@@ -158,7 +158,7 @@ def test_rest_and_motion_are_those_of_the_lumped_model(rig, what: Trial, items, 
         assert share(rig, LUMPED, what, *items, **given, n=4) < 1.5e-5
 
 
-@pytest.mark.parametrize("first", [-2.0, -0.5, 3.7])
+@pytest.mark.parametrize("first", [-2.0, -0.5, 3.7, 1e6])
 def test_stamps_of_a_forced_record_begin_anywhere(rig, stepped, first: float) -> None:
     what = replace(SHAKEN, time=SHAKEN.time[:100] + first, force=SHAKEN.force[:100] + 5.0)
     assert share(rig, LUMPED, what, *LAWS["coulomb"]) < 4e-4

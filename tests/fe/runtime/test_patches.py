@@ -216,6 +216,8 @@ def test_rates_through_the_high_pass(order):
     assert values[0] == pytest.approx(0.0, abs=1e-12)  # released: it had been held
     # settled under what acts at the first sample
     np.testing.assert_array_equal(shown(item, record=FORCED)[0], values)
+    moving = replace(FORCED, settled=False)  # about zero, which the filter had followed
+    assert shown(item, record=moving)[0][0] == pytest.approx(VALUES[0])
     quick = tuple((name, "acceleration") for name, _ in CHANNELS)  # which is none at rest: a step
     for record in (RECORD, FORCED):
         assert shown(item, record=replace(record, channels=quick))[0][0] == pytest.approx(VALUES[0])
