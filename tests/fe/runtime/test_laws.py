@@ -15,7 +15,7 @@ from fe.runtime import patch
 from fe.runtime.arrays import FORCE
 from fe.runtime.errors import SolutionError
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients
+from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients, rayleigh_damping_ratio
 from fe.runtime.motion import (
     NO_LAWS,
     PLANFORM,
@@ -391,6 +391,14 @@ def test_the_step_of_any_oscillator_is_the_exponential(omega, zeta):
         wanted = expm(np.array([[0.0, unit], [-omega * omega / unit, -2.0 * zeta * unit]]) * duration)
         scaled = found * [[1.0, unit], [1.0 / unit, 1.0]]
         np.testing.assert_allclose(scaled, wanted, rtol=1e-7, atol=9e-10)
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(1.0735, 7.3124e-4), (0.0, 1.0), (100.0, 0.0)])
+@pytest.mark.parametrize("frequency", [(5.6492, 29.9699), (0.1, 10.0)])
+def test_rayleigh_coefficients_are_the_inverse_of_the_ratios(alpha, beta, frequency):
+    low, high = rayleigh_damping_ratio(alpha, beta, frequency)
+    found = rayleigh_coefficients(frequency, (float(low), float(high)))
+    np.testing.assert_allclose(found, (alpha, beta), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("frequency", [(1.0, 1.0), (0.0, 1.0), (-1.0, 2.0)])
