@@ -176,6 +176,21 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both):
     assert found - 1.0 == pytest.approx(effect - 1.0, rel=0.05)
 
 
+def test_strips_make_the_skin_and_losses_that_overlap_multiply(both):
+    everywhere = both.structure(LocalStiffnessLoss(0.25, 0.0, both.wing.span), state=SOUND).stiffness
+    skin = np.tensordot((0.75, 0.75, 0.75, 1.0), both.arrays.stiffness, 1)
+    assert np.abs(everywhere - skin).max() < 1e-6 * np.abs(skin).max()
+    start, end = both.arrays.strip_lines[[4, 6]]
+    once, as_one = (LocalStiffnessLoss(loss, start, end - start) for loss in (0.3, 0.51))
+    assert np.abs(both.structure(once, once).stiffness - both.structure(as_one).stiffness).max() < 1e-12
+    beyond, within = (LocalStiffnessLoss(0.3, start, end - start) for start in (-0.2, 0.0))
+    assert np.array_equal(both.structure(beyond).stiffness, both.structure(within).stiffness)
+    # strains need no factor where a box ends at strips
+    assert both.wing.strain_factors(ModelPatch((once,))) == pytest.approx(1.0, abs=1e-12)
+    nothing = ModelPatch((PointMass(0.1, 1.0), LocalStiffnessLoss(0.0, 0.1, 0.2)))
+    assert both.wing.strain_factors(nothing) is None
+
+
 # ---------------------------------------------------------------- loads
 
 

@@ -109,6 +109,7 @@ def test_a_point_inside_is_found_and_one_outside_on_the_surface(distorted):
 # ---------------------------------------------------------------- structures
 
 INPUTS = Inputs(__file__)
+INNER, OUTER = 1.0, 2.0
 CURVED = ("hexahedron20", "tetra10", "wedge15")
 ON_SPRINGS = (
     ('"root", hold = ["x", "y", "z"]',
@@ -117,7 +118,7 @@ ON_SPRINGS = (
     ('name = "push", set = "tip=1"', 'name = "push", set = "root"'),
 )  # fmt: skip
 MADE = {  # its sets, and what it is of where nothing else is said
-    "cantilever": ("", "hexahedron20", (20, 1, 1)),
+    "ring": ("bore all", "hexahedron20", (2, 4, 1)), "cantilever": ("", "hexahedron20", (20, 1, 1)),
     "plate": ("line", "hexahedron", (2, 1, 1)), "body": ("top tip", "hexahedron", (4, 2, 2)),
     "strip": ("x y z top all", "hexahedron20", (1, 1, 1)),
     "ply": ("x y z top all", "hexahedron20", (1, 1, 1)),
@@ -126,6 +127,10 @@ MADE = {  # its sets, and what it is of where nothing else is said
 
 def bent(name: str, kind: str, points: np.ndarray) -> np.ndarray:
     """Points of the unit cube as those of a body; second order edges follow its curves."""
+    if name == "ring":  # a quarter of a thick one
+        radius, angle = INNER + (OUTER - INNER) * points[:, 0], 0.5 * np.pi * points[:, 1]
+        place = np.column_stack((radius * np.cos(angle), radius * np.sin(angle), 0.1 * points[:, 2]))
+        return np.where(np.abs(place) < 1e-12, 0.0, place)
     place = points * {"cantilever": (1000, 60, 10), "plate": (20, 10, 10), "body": (100, 25, 10)}.get(name, 1)
     if name == "body" and kind in CURVED:  # in the plane of the top
         place[:, 1] += 12.0 * (place[:, 0] / 100.0) ** 2 * (place[:, 1] / 25.0)
@@ -144,7 +149,7 @@ def made(write) -> Callable[..., Structure]:
         points, cells = box(kind, parts)
         x, y, z = points.T
         sets = {"x": x == 0.0, "y": y == 0.0, "z": z == 0.0, "top": z == 1.0, "all": z >= 0.0}
-        sets |= {"tip": x == 1.0, "line": x + y == 0.0}
+        sets |= {"bore": x == 0.0, "tip": x == 1.0, "line": x + y == 0.0}
         data = {own: sets[own].astype(np.int64) for own in used.split()}
         text = INPUTS.text(f"{name}.toml", *changes)
         file = write(bent(name, kind, points), kind, cells, text, point_data=data)
@@ -153,9 +158,44 @@ def made(write) -> Callable[..., Structure]:
     return make
 
 
+def ring_of(made: Callable[..., Structure], kind: str, count: int) -> Structure:
+    """A quarter of a thick ring in plane strain; cells with straight edges leave its bore."""
+    straight = [("0.7071067811865476", "0.70")] * (2 * (kind == "tetra"))
+    return made("ring", *straight, kind=kind, parts=(count, 2 * count, 1))
+
+
+@pytest.mark.parametrize(
+    ("kind", "order", "error"),
+    [
+        ("hexahedron", 1.7, 2e-2),
+        ("tetra", 1.6, 5e-2),
+        ("tetra10", 3.7, 1e-4),
+        ("hexahedron20", 3.7, 1e-4),
+        ("wedge15", 3.5, 1e-4),
+    ],
+)
+def test_a_thick_ring_under_pressure_converges_to_lame(kind, order, error, made):
+    # Lame: u(a) = (1 + nu) p a ((1 - 2 nu) a^2 + b^2) / (E (b^2 - a^2)) in plane strain.
+    wanted = 1.3 * 1e6 * (0.4 * INNER**2 + OUTER**2) / (1e9 * (OUTER**2 - INNER**2))
+    mass = 1000.0 * 0.1 * 0.25 * np.pi * (OUTER**2 - INNER**2)
+    errors, lost = [], []
+    for count in (2, 4):
+        structure = ring_of(made, kind, count)
+        found = static_responses(structure)["p"]
+        # The work of the pressure converges with twice the order of the strains.
+        work = float(structure.load("p") @ found.displacement)
+        errors.append(abs(work / (1e6 * wanted * 0.5 * np.pi * INNER * 0.1) - 1.0))
+        lost.append(abs(weighed(structure)[0] / mass - 1.0))
+        if kind == "hexahedron20":
+            assert found.strain[0] == pytest.approx(wanted / INNER, rel=0.05 / count**2)
+    assert errors[1] < error
+    assert np.log2(errors[0] / errors[1]) > order
+    assert np.log2(lost[0] / lost[1]) > order
+
+
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_the_field_of_every_kind_is_written(kind, made, tmp_path):
-    structure = made("body", kind=kind)
+    structure = ring_of(made, kind, 2)
     write_structure_vtu(tmp_path / "field.vtu", structure)
     found = read_mesh(tmp_path / "field.vtu", 1.0, "m")
     assert found.kind is KINDS[kind]
