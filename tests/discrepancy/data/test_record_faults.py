@@ -62,7 +62,7 @@ def only(faults, kind):
     return fault
 
 
-def test_sound_rings_have_no_fault(model):
+def test_sound_rings_have_no_fault():
     """A motion that begins somehow tells its parameters, and none does not."""
     for digit in (1e-6, 0.5):
         campaign = campaign_of(digit=digit)
