@@ -34,7 +34,7 @@ from tests.twin_master.runs import (
     text_of,
     written,
 )
-from twin_master.assets.resolution import Overrides, resolve_scenario
+from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
 from twin_master.assets.structure_source import StructureBelief
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
@@ -282,6 +282,15 @@ def test_a_mesh_without_a_set_and_one_that_lies_elsewhere_are_refused(tmp_path):
         with pytest.raises((TwinMasterError, FiniteElementError), match=sentence):
             new_run(short(**{table: {"structure": str(file)}}), tmp_path / "run", report=False)
         assert not (tmp_path / "run").exists()
+
+
+def test_a_belief_in_another_unit_than_that_of_the_model_is_refused():
+    """Also where nothing flies whose binding would tell: of a watch, millimetres would be taken for metres."""
+    given = {"role": "displacement", "count": 1, "titles": "", "unit": "mm"}
+    changes: dict[str, Any] = {"asset": "", "truth": "", "observation": given}
+    watched = loaded_from(merged(table_of("bracket"), changes), "bracket")
+    with pytest.raises(MissionInputError, match="shows `displacement` in m, and `observation.unit` says mm"):
+        believed_source(resolve_scenario(watched)).check()
 
 
 # ------------------------------- modes identified of a record of accelerations, as the observation of a turn
