@@ -285,11 +285,11 @@ def test_a_mesh_without_a_set_and_one_that_lies_elsewhere_are_refused(tmp_path):
 
 
 def test_a_belief_in_another_unit_than_that_of_the_model_is_refused():
-    """Also where nothing flies whose binding would tell: of a watch, millimetres would be taken for metres."""
+    """Also where nothing flies whose binding would tell: millimetres would be taken for metres."""
     given = {"role": "displacement", "count": 1, "titles": "", "unit": "mm"}
     changes: dict[str, Any] = {"asset": "", "truth": "", "observation": given}
     watched = loaded_from(merged(table_of("bracket"), changes), "bracket")
-    with pytest.raises(MissionInputError, match="shows `displacement` in m, and `observation.unit` says mm"):
+    with pytest.raises(MissionInputError, match=r"`displacement` in m, and `observation\.unit` says mm"):
         believed_source(resolve_scenario(watched)).check()
 
 
