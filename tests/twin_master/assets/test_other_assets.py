@@ -19,6 +19,7 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError, InvalidDesignError
 from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuError, SspError
+from fmu_asset.ssp.reader import read_ssp
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
     changed_scenario,
@@ -98,6 +99,13 @@ def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, di
     assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
     ssp.unlink()
     assert rows(resume(flown).folder) == rows(direct[name])
+    several = ("step_size = 60.0", "step_size = 15.0\ndecimation = 4\nstart_time = 1000.0")
+    own = written(tmp_path, (folder / "binding.toml").read_text(encoding="utf-8"), several)
+    later = load_scenario(folder / "fouling.toml").scenario
+    asset = later.asset.model_copy(update={"binding": str(own)})
+    later = replace(loaded, scenario=later.model_copy(update={"asset": asset}))
+    ssp = export_scenario(later, tmp_path / "later.ssp", replace_file=False)
+    assert read_ssp(ssp, tmp_path).span == (1000.0, 1000.0 + 60.0 * later.scenario.mission.steps)
 
 
 @pytest.mark.parametrize(
