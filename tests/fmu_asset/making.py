@@ -13,7 +13,7 @@ from fmu_asset.coupling.structure import Component, Connection, Connector, Syste
 from fmu_asset.door.binding import Binding, parse_binding
 
 ROOT = Path(__file__).parents[2]
-DESCRIPTION = "modelDescription.xml"
+DESCRIPTION, XML = "modelDescription.xml", (".xml", ".ssd", ".ssv", ".ssm")
 
 
 def tables(test: str, name: str = "refused") -> dict[str, Any]:
@@ -35,14 +35,14 @@ def archive_of(path: Path, contents: Mapping[str, str | bytes]) -> Path:
     return path
 
 
-def edited(fmu: Path, target: Path, *changes: tuple[str, str], entry: str = DESCRIPTION) -> Path:
-    """Write a copy of an FMU with texts of one entry, its model description, replaced."""
-    contents = members(fmu)
-    text = contents[entry].decode()
+def edited(archive: Path, target: Path, *changes: tuple[str, str]) -> Path:
+    """Write a copy of an FMU, or of an SSP file, with texts of its XML files replaced."""
+    contents = members(archive)
     for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    return archive_of(target, contents | {entry: text.encode()})
+        there = [name for name in contents if name.endswith(XML) and old.encode() in contents[name]]
+        assert there
+        contents |= {name: contents[name].replace(old.encode(), new.encode()) for name in there}
+    return archive_of(target, contents)
 
 
 def parameters_of(fmu: Path) -> dict[str, float]:
