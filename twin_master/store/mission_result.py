@@ -146,15 +146,17 @@ def printed_learnt(name: str, unit: str) -> tuple[float, str]:
         return 100.0, "%"
     if name == "gauge_offset" and unit == "1":
         return 1e6, "microstrain"
+    if unit == SEVERAL_UNITS:
+        return 1.0, "unit of each sensor"
     return 1.0, "" if unit == "1" else unit
 
 
-def learnt_record(quantities: Sequence[LearntQuantity]) -> dict[str, Any]:
+def learnt_record(quantities: Sequence[LearntQuantity], sensor_units: Sequence[str]) -> dict[str, Any]:
     """Return what was learnt for the summary, a list where each sensor has its own; nothing without any."""
     told = {
         quantity.name: {
             "title": quantity.title,
-            "unit": quantity.unit,
+            "unit": sensor_units if quantity.unit == SEVERAL_UNITS else quantity.unit,
             "prior": {name: quantity.prior[..., k] for k, name in enumerate(MOMENTS)},
             "posterior": {name: quantity.course[-1, ..., k] for k, name in enumerate(MOMENTS)},
             "truth": quantity.truth,

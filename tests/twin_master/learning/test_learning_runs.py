@@ -24,7 +24,7 @@ from twin_master.scenario.tables import Noticing
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
-from uav_twin import load_scenario, prepare_twin
+from uav_twin import fly, load_scenario, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -200,6 +200,20 @@ def test_more_transitions_than_there_can_be_are_refused(tmp_path):
     knowledge = prepare_twin(load_scenario(file))
     with pytest.raises(TwinMasterError, match=r"smaller `learning.transition_factors`"):
         knowledge.twin()
+
+
+def test_offsets_of_sensors_of_several_units_have_their_own(tmp_path):
+    """And no mean: that of litres a minute, newton metres, degrees and bars says nothing."""
+    given = {"mission": {"steps": 2}, "learning": {"gauge_offset": [0.5, 0.4, 1.0, 0.1]}}
+    fly(changed_scenario("pump_wear", given | {"calibration": {"draws": 4}}), tmp_path, report=False)
+    summary, units = json.loads((tmp_path / "summary.json").read_text()), ["L/min", "N.m", "degC", "bar"]
+    told = {figure["key"]: figure for figure in summary["figures"]}
+    most = told["gauge_offset_most"]
+    assert most["unit"] == units[int(re.search(r"sensor (\d)", most["title"])[1]) - 1]
+    assert told["gauge_offset_mean"]["value"] is None
+    assert summary["learnt"]["gauge_offset"]["unit"] == units
+    learnt = journal(tmp_path)[-1]["learnt"]
+    assert [learnt[f"gauge_offset[{number}]"]["unit"] for number in range(1, 5)] == units
 
 
 def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
