@@ -140,15 +140,13 @@ def _true_factor(scenario: Scenario) -> Float | None:
     return np.asarray(factor) if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0) else None
 
 
-def printed_learnt(name: str, unit: str) -> tuple[float, str]:
+def printed_learnt(name: str, unit: str, scenario: Scenario) -> tuple[float, str]:
     """Return the factor from the stored unit of a learnt quantity to the printed one, and its name."""
+    factor, units = scenario.observation.printed if name == "gauge_offset" else (1.0, (unit,))
     if name == "gauge_gain":
         return 100.0, "%"
-    if name == "gauge_offset" and unit == "1":
-        return 1e6, "microstrain"
-    if unit == SEVERAL_UNITS:
-        return 1.0, "unit of each sensor"
-    return 1.0, "" if unit == "1" else unit
+    unit = units[0] if len({*units}) == 1 else "unit of each sensor"
+    return factor, "" if unit == "1" else unit
 
 
 def learnt_record(quantities: Sequence[LearntQuantity], sensor_units: Sequence[str]) -> dict[str, Any]:
