@@ -136,6 +136,17 @@ def test_a_scenario_is_described_as_data():
     assert said("scenario", "check", "level_turns", "-q") == ""
 
 
+SHAPES = {
+    "bracket": (81, 40, 4),
+    "stiffened_panel": (64, 40, 6),
+    "three_regions": (125, 50, 24),
+    "pump_wear": (25, 60, 4),
+    "inspected_wing": (25, 120, 24),
+    "watched_wing": (25, 60, 24),
+}
+"""States, steps and sensors, where they are not those of the paper's mission."""
+
+
 @pytest.mark.parametrize("name", sorted(scenario_files()))
 def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name):
     if name == "model_mismatch":  # it names no strain library of its own
@@ -144,6 +155,7 @@ def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name):
         return
     found = check_scenario(load_scenario(name))
     assert found["name"] == name
+    assert (found["states"], found["turns"], found["sensors"]) == SHAPES.get(name, (25, 50, 24))
     assert found["memory"] > 0
 
 

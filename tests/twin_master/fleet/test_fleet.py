@@ -34,8 +34,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.turns import DamageGrowth
 from twin_master.network.transition import TransitionModel
-from twin_master.store.writing import open_run
-from uav_twin import GraphicalModel, fly_fleet, load_scenario, open_fleet, prepare_twin
+from uav_twin import GraphicalModel, fly_fleet, load_scenario, open_fleet, open_run, prepare_twin
 from uav_twin import fly as new_run
 
 

@@ -10,13 +10,14 @@ from scipy.optimize import brentq
 from scipy.stats import foldnorm, invgamma, multivariate_normal, multivariate_t, norm
 
 from tests.twin_master.network.decision_oracles import trajectories
+from tests.twin_master.runs import estimates_of
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter, posterior_of_draws, quantiles_of
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
 from twin_master.scenario.tables import Learning
-from uav_twin import Carried, Estimate, GaussianSensorModel, GraphicalModel
+from uav_twin import Estimate, GaussianSensorModel, GraphicalModel
 
 Float = NDArray[np.float64]
 
@@ -42,15 +43,6 @@ def observations() -> Float:
     seen[1, 0] = np.nan
     seen[2] = np.nan
     return seen
-
-
-def run(learner: LearningFilter, seen: Float, controls: list[int]) -> list[Estimate]:
-    estimates: list[Estimate] = []
-    before: Carried | None = None
-    for turn, (row, control) in enumerate(zip(seen, controls, strict=True)):
-        estimates.append(learner.turn(before, row, control, turn))
-        before = estimates[-1].carried
-    return estimates
 
 
 @cache
@@ -83,7 +75,7 @@ def test_noise_gain_and_offset_of_a_gauge_are_a_conjugate_regression(degrees, ga
         noise=degrees > 0.0, noise_degrees=degrees or 10.0, gauge_gain=gain, gauge_offset=offset
     )
     learner = LearningFilter(model(levels=1), sensor, settings, ("e", [0.9, 1.0, 1.1]))
-    estimates = run(learner, seen, CONTROLS)
+    estimates = estimates_of(learner, seen, CONTROLS)
     there = ~np.isnan(seen[:, 0])
     log_density = np.log(sensor.draw_weight)
     for draw in range(DRAWS):
@@ -107,12 +99,12 @@ def test_the_interval_of_a_state_is_not_learnt_as_noise():
     place = random.normal(size=(400, 2, 1))
     seen = 5.0 + (interval[0, controls] @ place)[..., 0] + 0.7 * random.normal(size=(400, 4))
     learner = LearningFilter(model(levels=1), sensor, Learning(noise_degrees=5.0))
-    estimates = run(learner, seen, controls)
+    estimates = estimates_of(learner, seen, controls)
     learnt = estimates[-1].learnt
     for gauge in range(1, 5):
         assert learnt[f"noise_scale[{gauge}]"].mean == pytest.approx(1.0, abs=0.12)
     known = LearningFilter(model(levels=1), sensor, NOTHING)
-    evidence = [estimate.log_evidence for estimate in run(known, seen, controls)]
+    evidence = [estimate.log_evidence for estimate in estimates_of(known, seen, controls)]
     exact = [
         float(sensor.log_likelihood(row, control)[0]) for row, control in zip(seen, controls, strict=True)
     ]
@@ -144,7 +136,7 @@ def test_a_belief_that_underflows_comes_back():
     """The hypothesis that is right from the second turn on had a weight below the doubles."""
     value = np.array([0.0, 60.0])[:, None, None, None].repeat(2, axis=2)  # (E, 1, U, 1)
     learner = LearningFilter(model(levels=1), GaussianSensorModel(value, 1.0), NOTHING, ("e", [0, 60]))
-    estimates = run(learner, np.array([[0.0], [60.0], [60.0]]), [0, 0, 0])
+    estimates = estimates_of(learner, np.array([[0.0], [60.0], [60.0]]), [0, 0, 0])
     log_belief = [estimate.carried.arrays["log_belief"][:, 0] for estimate in estimates]
     np.testing.assert_allclose(log_belief[0][1], -1800.0, rtol=1e-12)
     np.testing.assert_allclose(log_belief[2][0], -1800.0, rtol=1e-12)
@@ -156,7 +148,7 @@ POLICY = np.array([[0.0, 1.0], [0.3, 0.7], [1.0, 0.0]])
 
 @pytest.fixture(scope="module")
 def turns() -> list[Estimate]:
-    return run(learner_of_all(), observations(), CONTROLS)
+    return estimates_of(learner_of_all(), observations(), CONTROLS)
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +239,7 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     shown = value[0, 0, controls, 0]
     seen = 1.5 + 0.93 * shown + np.array([0.1, -0.7, 0.4, 0.2, -0.1, np.nan, 0.9])
     there = ~np.isnan(seen)
-    estimates = run(learner, seen[:, None], controls)
+    estimates = estimates_of(learner, seen[:, None], controls)
     carried, learnt = [turn.carried for turn in estimates], estimates[-1].learnt
     # Bayesian linear regression of (o - h) / sigma on (offset, gain) in their prior deviations.
     design = np.stack([np.full(6, 2.0), 0.1 * shown[there]], axis=1) / 0.5

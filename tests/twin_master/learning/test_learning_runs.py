@@ -22,9 +22,8 @@ from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
-from uav_twin import load_scenario, prepare_twin
+from uav_twin import load_scenario, open_run, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9

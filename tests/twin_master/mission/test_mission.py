@@ -43,8 +43,7 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import PURPOSES, generator
-from twin_master.store.writing import open_run
-from uav_twin import ScenarioEnvironment, fly_fleet, open_fleet, resume
+from uav_twin import ScenarioEnvironment, fly_fleet, open_fleet, open_run, resume
 from uav_twin import fly as new_run
 
 pytestmark = pytest.mark.usefixtures("no_report")

@@ -20,9 +20,8 @@ from scipy.stats import norm
 import uav_twin
 from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
-from scenarios import structure_files
 from tests.command_line import refused, said
-from tests.twin_master.runs import edited, of_wing, text_of, written
+from tests.twin_master.runs import edited, estimates_of, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.plan import load_fleet
@@ -48,8 +47,8 @@ from twin_master.run_folder import kept_scenario
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Learning, Noticing
-from twin_master.store.writing import open_run
-from uav_twin import Carried, ExactFilter, WatchfulEstimator, reduced_model
+from twin_master.watch.feeds import file_feed
+from uav_twin import ExactFilter, WatchfulEstimator, open_run, reduced_model, structure_files
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3
@@ -121,18 +120,14 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
         others.append(WatchfulEstimator(exact, sensors, known.draws.values, wary))
     rng, states = np.random.default_rng(1), np.array([0, 1, 6, 7, 12, 13])
     controls = [1, INSPECT, 0, INSPECT, INSPECT, 1]
-    before: list[Carried | None] = [None] * (1 + len(others))
-    for turn, control in enumerate(controls):
-        row = sensors.sampled(states[[turn]], control, rng)[0]
-        row[:24] = row[:24] if gauges else np.nan
-        found = [
-            one.turn(last, row, control, turn) for one, last in zip([exact, *others], before, strict=True)
-        ]
-        for estimate in found[1:]:
-            assert estimate.filtered == pytest.approx(found[0].filtered, abs=1e-5)
-            assert estimate.forecast == pytest.approx(found[0].forecast, abs=1e-5)
-        before = [estimate.carried for estimate in found]
-    assert found[0].filtered.max() > 0.3  # something was told
+    rows = [sensors.sampled(states[[turn]], control, rng)[0] for turn, control in enumerate(controls)]
+    seen = np.where(gauges | (np.arange(26) >= 24), rows, np.nan)
+    expected = estimates_of(exact, seen, controls)
+    for estimator in others:
+        for found, right in zip(estimates_of(estimator, seen, controls), expected, strict=True):
+            assert found.filtered == pytest.approx(right.filtered, abs=1e-5)
+            assert found.forecast == pytest.approx(right.forecast, abs=1e-5)
+    assert expected[-1].filtered.max() > 0.3  # something was told
 
 
 def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_run_keeps_readings(tmp_path):
@@ -151,8 +146,13 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
     run = open_run(folder)
     observed, truth = run["observed"], run["truth"]
     inspected = observed["control_index"].values == INSPECT
-    for name in ("z1", "z2"):
+    rows = [
+        message.observed for message, _ in file_feed(folder / "run.nc", kept_scenario(folder)).messages(None)
+    ]
+    np.testing.assert_array_equal([row[:24] for row in rows], observed["strain"])
+    for place, name in enumerate(("z1", "z2"), start=24):
         read = observed[f"inspect_{name}"].values
+        np.testing.assert_array_equal([row[place] for row in rows], read)
         assert np.array_equal(np.isfinite(read), inspected)
         assert inspected.sum() == 11
         assert read[inspected] == pytest.approx(truth["state"].sel(region=name).values[inspected], abs=0.4)

@@ -4,6 +4,7 @@ import itertools
 import json
 import re
 import shutil
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -103,6 +104,15 @@ def test_no_table_whatsoever_raises_anything_but_a_sentence(table):
         except TwinMasterError as error:
             sentence = str(error)
         assert sentence.startswith("x.toml")
+
+
+def test_the_wing_with_a_third_region_is_the_shipped_one_with_a_third_region():
+    shipped = tomllib.loads(SHIPPED_DESIGN.read_text(encoding="utf-8"))
+    three = tomllib.loads(SHIPPED_DESIGN.with_name("uav_wing_three_regions.toml").read_text(encoding="utf-8"))
+    third = three["defects"].pop()
+    assert set(third) == {"span_start", "span_end", "chord_start", "chord_end"}
+    assert (three.pop("name"), shipped.pop("name")) == ("UAV wing, three regions", "UAV wing")
+    assert three == shipped
 
 
 # ---------------------------- the kinds, a kind of one's own, and files of format 1

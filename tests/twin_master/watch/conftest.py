@@ -77,17 +77,6 @@ def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Cou
     return counts
 
 
-def beliefs_of(watch: Watch, observed: np.ndarray, controls: np.ndarray, first: int) -> list[list[float]]:
-    """Return what a twin believes that has the second model of a watch from a turn on."""
-    twin, beliefs = watch.models[0].knowledge.twin(), []
-    for turn, (row, control) in enumerate(zip(observed, controls.tolist(), strict=True)):
-        if turn == first:
-            state, twin = twin.save_state(), watch.models[1].knowledge.twin()
-            twin.restore_state(state)
-        beliefs.append(twin.turn(row, control).filtered.tolist())
-    return beliefs
-
-
 def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
     """Run in a process of its own, killed once the journal has a size; return whether it was killed."""
     journal, child = watch.folder / JOURNAL_NAME, os.fork()
@@ -248,14 +237,6 @@ def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> 
 def watch(base: Watch, tmp_path: Path) -> Watch:
     """One like it in a folder of its own."""
     return begun(base, tmp_path / "watch")
-
-
-@pytest.fixture
-def hasty(watch: Watch) -> Watch:
-    """A watch that notices a silence at once."""
-    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
-    watch.scenario = watch.scenario.model_copy(update={"watch": section})
-    return watch
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ import pytest
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal
 from tests.twin_master.watch.conftest import (
-    beliefs_of,
     decided,
     of_gauge,
     patch_of,
@@ -205,8 +204,13 @@ def test_live_turns_wait_neither_for_the_search_nor_for_the_patched_model(
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
-    beliefs = beliefs_of(noticing, observed, mission.control_index, model["model"]["from_turn"])
-    assert journal(noticing.folder)[-1]["filtered"] == beliefs[-1]
+    twin, patched = (one.knowledge.twin() for one in noticing.models)
+    for turn, (row, control) in enumerate(zip(observed, mission.control_index.tolist(), strict=True)):
+        if turn == model["model"]["from_turn"]:
+            patched.restore_state(twin.save_state())
+            twin = patched
+        believed = twin.turn(row, control).filtered.tolist()
+    assert journal(noticing.folder)[-1]["filtered"] == believed
     again = watchful(noticing, tmp_path / "again")
     twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)]
     assert twins[0].save_state() == twins[1].save_state()
