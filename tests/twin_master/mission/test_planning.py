@@ -146,13 +146,12 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
     run = open_run(folder)
     observed, truth = run["observed"], run["truth"]
     inspected = observed["control_index"].values == INSPECT
-    rows = [
-        message.observed for message, _ in file_feed(folder / "run.nc", kept_scenario(folder)).messages(None)
-    ]
-    np.testing.assert_array_equal([row[:24] for row in rows], observed["strain"])
+    fed = file_feed(folder / "run.nc", kept_scenario(folder)).messages(None)
+    rows = np.array([message.observed for message, _ in fed])
+    np.testing.assert_array_equal(rows[:, :24], observed["strain"])
     for place, name in enumerate(("z1", "z2"), start=24):
         read = observed[f"inspect_{name}"].values
-        np.testing.assert_array_equal([row[place] for row in rows], read)
+        np.testing.assert_array_equal(rows[:, place], read)
         assert np.array_equal(np.isfinite(read), inspected)
         assert inspected.sum() == 11
         assert read[inspected] == pytest.approx(truth["state"].sel(region=name).values[inspected], abs=0.4)

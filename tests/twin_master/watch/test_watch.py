@@ -254,10 +254,8 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
 
 @pytest.mark.parametrize("source", ["standard input", "a file that grows"])
 def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
-    section, told = (
-        watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2}),
-        list[dict[str, Any]](),
-    )
+    told = list[dict[str, Any]]()
+    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
     watch.scenario = watch.scenario.model_copy(update={"watch": section})
     if source == "standard input":
         read, write = os.pipe()
