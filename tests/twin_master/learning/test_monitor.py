@@ -23,14 +23,7 @@ from twin_master.network.estimator import Words
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.twin import TwinTurn
 from twin_master.scenario.tables import Learning, Noticing
-from uav_twin import (
-    ExactFilter,
-    GaussianSensorModel,
-    GraphicalModel,
-    Twin,
-    WatchfulEstimator,
-    prepare_twin,
-)
+from uav_twin import ExactFilter, GaussianSensorModel, GraphicalModel, Twin, WatchfulEstimator, prepare_twin
 
 Float = NDArray[np.float64]
 

@@ -63,13 +63,6 @@ def watchful(base: Watch, folder: Path) -> Watch:
     return watch
 
 
-def decided(watch: Watch, feed: Feed, between: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
-    """Run a watch to the end of its feed; return what was decided."""
-    decisions = list[dict[str, Any]]()
-    watch.run(feed, lambda decision: decisions.append(dict(decision)), between)
-    return decisions
-
-
 def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
     """Run a watch up to each number of turns (None: to the end); return the last counts."""
     for turns in stops or (None,):

@@ -13,15 +13,7 @@ import pytest
 
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal
-from tests.twin_master.watch.conftest import (
-    decided,
-    of_gauge,
-    patch_of,
-    ran,
-    viewed,
-    wait_until,
-    watchful,
-)
+from tests.twin_master.watch.conftest import of_gauge, patch_of, ran, viewed, wait_until, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import replay
@@ -66,7 +58,8 @@ def tutor(
 def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, loose, tmp_path):
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
-    decisions = decided(watch, CsvFeed(loose, watch.scenario), tutor(watch, tmp_path, "named", -0.3).act)
+    decisions = list[dict[str, Any]]()
+    watch.run(CsvFeed(loose, watch.scenario), decisions.append, tutor(watch, tmp_path, "named", -0.3).act)
     records = journal(watch.folder)
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]

@@ -20,16 +20,7 @@ import uav_twin
 from reporting.progress import SilentProgress
 from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
-from tests.twin_master.watch.conftest import (
-    begun,
-    decided,
-    killed_at,
-    ran,
-    viewed,
-    wait_until,
-    watchful,
-    write_csv,
-)  # fmt: skip
+from tests.twin_master.watch.conftest import begun, killed_at, ran, viewed, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, whole_record
 from twin_master.mission.loop import BelievedModel, journalled_decision
@@ -204,7 +195,8 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     late = [*rows[:20], *rows[21:25], rows[20], rows[25].replace(",", ",,", 1), *rows[26:30], rows[25]]
     (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
     watch = watchful(base, tmp_path / "watch")
-    told = decided(watch, CsvFeed(tmp_path / "late.csv", watch.scenario))
+    told = list[dict[str, Any]]()
+    watch.run(CsvFeed(tmp_path / "late.csv", watch.scenario), told.append)
     assert journalled(watch) == told
     assert watch.last_decision() == told[-1] | {"told_again": True}
     assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
