@@ -155,10 +155,8 @@ def test_the_view_shows_what_was_learnt(folder, run):
     """From the posterior of each quantity alone, which the journal tells."""
     flight, filtered = Flight(folder), run["filtered"].to_dataset()
     flight.update()
-    shown, noise = (
-        flight.believed(flight.seen(0, TURNS)).expected,
-        filtered["noise_standard_deviation"].values,
-    )
+    shown = flight.believed(flight.seen(0, TURNS)).expected
+    noise = filtered["noise_standard_deviation"].values
     wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
     np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)

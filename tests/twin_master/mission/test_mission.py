@@ -23,7 +23,6 @@ from tests.twin_master.runs import (
     flight_of,
     journal,
     of_library,
-    table_of,
     text_of,
     written,
 )
@@ -40,7 +39,7 @@ from twin_master.mission.loop import fly, kept_in, taken_up
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Plant, SensorStatus, Truth, Turn
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import PURPOSES, generator
 from uav_twin import ScenarioEnvironment, fly_fleet, open_fleet, open_run, resume
@@ -178,9 +177,8 @@ def test_faults():
     ):  # fmt: skip
         assert np.all(truth.status[part] == status)
     np.testing.assert_allclose(truth.drift[:10, 11], [0] * 8 + [6e-6, 12e-6])
-    table = table_of("failing_gauges")
-    table["truth"]["noise"] = {"standard_deviation_microstrain": 0}
-    truth, value = truth_of(parse_scenario(table, "quiet")), np.full(24, 1e-3)
+    quiet = changed_scenario("failing_gauges", {"truth": {"noise": {"standard_deviation_microstrain": 0}}})
+    truth, value = truth_of(quiet.scenario), np.full(24, 1e-3)
     sensed = truth.sense(13, value)
     assert np.isnan(sensed[16:20]).all()
     assert sensed[11] == pytest.approx(1e-3 + 36e-6)

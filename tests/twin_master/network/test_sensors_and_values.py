@@ -327,10 +327,8 @@ def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed, moves_first):
                 first[control] += problem.discount[control] * later
         value = first.max(axis=0)
     for control, values in ((None, value), (1, first[1])):
-        exact, plan = (
-            np.interp(problem.prior[1], grid, values),
-            plan_on_belief(problem, first=control, gap=1e-4),
-        )
+        exact = np.interp(problem.prior[1], grid, values)
+        plan = plan_on_belief(problem, first=control, gap=1e-4)
         assert plan.lower <= exact + 1e-6
         assert plan.upper >= exact - 1e-4
         assert plan.upper - plan.lower <= 1e-3
