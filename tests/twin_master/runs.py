@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fe.runtime.patch import ModelPatch, Primitive
+from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
@@ -116,6 +118,12 @@ def estimates_of(
         before = estimates[-1].carried if estimates else None
         estimates.append(estimator.turn(before, row, control, turn))
     return estimates
+
+
+def patch_record(*primitives: Primitive, channel: str = "g5") -> dict[str, Any]:
+    """Return a patch of hidden effects, in which a gauge has a name."""
+    effects = [{"id": "hidden", "primitives": ModelPatch(primitives).to_list()}]
+    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
 
 
 def figures_of(folder: Path) -> dict[str, Any]:

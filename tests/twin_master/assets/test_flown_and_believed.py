@@ -17,18 +17,16 @@ from fe.runtime.patch import (
     BoucWen,
     LoadPlace,
     LocalStiffnessLoss,
-    ModelPatch,
     PointMass,
     Primitive,
     SensorDrift,
     SensorGain,
     Washout,
 )
-from fmu_asset.packing.patch_file import SCHEMA
 from scenarios import binding_files
 from tests import command_line
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import edited, figures_of, loaded_from, prepared, table_of, text_of, written
+from tests.twin_master.runs import figures_of, loaded_from, patch_record, prepared, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
 from twin_master.assets.system_export import export_scenario
@@ -169,8 +167,8 @@ def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(wing, tmp_
             del table["rewards"]["health_limit_microstrain"], table["rewards"]["error_scale_microstrain"]
             table["truth"]["noise"] = {"standard_deviation": 0.1}
             own = f'[observation.{role}]\nvariables = {variables}\nunit = "{changes["unit"]}"'
-            bound = edited(binding_files()["uav_wing"].read_text(), (strains, own))
-            table["asset"] |= {"binding": str(written(tmp_path, bound, name=f"{role}.toml"))}
+            bound = binding_files()["uav_wing"].read_text()
+            table["asset"] |= {"binding": str(written(tmp_path, bound, (strains, own), name=f"{role}.toml"))}
         table["asset"]["isolated"] = False
         observed = loaded_from(table, "level_turns")
         source, model = prepared(observed, tmp_path / role, {}), build_graphical_model(observed.scenario)
@@ -204,9 +202,7 @@ FILE = 'patch = "p.json"\n'
 
 
 def write_patch(folder: Path, *primitives: Primitive) -> Path:
-    effects = [{"id": "hidden", "primitives": ModelPatch(primitives).to_list()}]
-    record = {"schema": SCHEMA, "effects": effects, "channels": {"g5": "strain[5]"}}
-    return written(folder, json.dumps(record), name="p.json")
+    return written(folder, json.dumps(patch_record(*primitives)), name="p.json")
 
 
 def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str = "") -> Path:

@@ -1,7 +1,6 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
 import json
-import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 
 from tests.command_line import command, said
 from tests.twin_master.runs import journal, text_of, written
-from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, served, wait_until, write_csv
+from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until, write_csv
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving
@@ -119,15 +118,11 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
 
 
 @pytest.fixture
-def broker(fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+def broker(fleet_file: Path, tmp_path: Path) -> Iterator[Mosquitto]:
     """A broker that has a topic for each asset of the fleet."""
-    if shutil.which("mosquitto") is None:
-        pytest.skip("no mosquitto")
-    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
-    broker = Mosquitto(tmp_path)
-    fleet_of(tmp_path, f'observations = "mqtt://wing@127.0.0.1:{broker.port}/wings/+"')
-    yield broker
-    broker.stop()
+    with mosquitto(tmp_path) as broker:
+        fleet_of(tmp_path, f'observations = "mqtt://wing@127.0.0.1:{broker.port}/wings/+"')
+        yield broker
 
 
 def publish(client: Any, name: str, turn: int, control: str = "2g", strain: Any = (1e-3,) * 24) -> None:

@@ -9,8 +9,8 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
@@ -20,8 +20,6 @@ import numpy as np
 import pytest
 from paho.mqtt import client as paho
 
-from fe.runtime.patch import ModelPatch, SensorGain
-from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from tests.twin_master.runs import flight_of, text_of
 from twin_master.mission.journal import JOURNAL_NAME
@@ -30,7 +28,7 @@ from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.viewer.flight import Flight
-from twin_master.watch.feeds import CsvFeed
+from twin_master.watch.feeds import PASSWORD_VARIABLE, CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts, Feed
 from twin_master.watch.opening import begun_watch
@@ -97,18 +95,6 @@ def viewed(folder: Path) -> Flight:
     return flight
 
 
-def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
-    """Return a patch in which a gauge shows too much by a share."""
-    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
-    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
-
-
-def of_gauge(path: Path, gain: float, channel: str = "g5") -> Path:
-    """Write such a patch."""
-    path.write_text(json.dumps(patch_of(gain, channel)))
-    return path
-
-
 def wait_until(found: Callable[[], object]) -> None:
     limit = time.monotonic() + 60.0
     while not found():
@@ -125,6 +111,18 @@ def served(port: int, path: str = "/", host: str = "localhost") -> tuple[int, st
 
 
 PASSWORD = "a password"
+
+
+@contextmanager
+def mosquitto(folder: Path, *, tls: bool = False) -> Iterator["Mosquitto"]:
+    """Run a broker whose password the twin knows."""
+    if shutil.which("mosquitto") is None:
+        pytest.skip("no mosquitto")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(PASSWORD_VARIABLE, PASSWORD)
+        broker = Mosquitto(folder, tls=tls)
+        yield broker
+        broker.stop()
 
 
 class Mosquitto:

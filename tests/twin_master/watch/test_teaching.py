@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fe.runtime.patch import SensorGain
 from reporting.figures import new_figure, to_svg
-from tests.twin_master.runs import check_same, figures_of, journal
-from tests.twin_master.watch.conftest import of_gauge, patch_of, ran, viewed, wait_until, watchful
+from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
+from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import replay
@@ -46,11 +47,16 @@ place.rename(out)
 """
 
 
+def of_gauge(folder: Path, name: str, gain: float, channel: str = "g5") -> Path:
+    """Write a patch in which a gauge shows too much by a share."""
+    return written(folder, json.dumps(patch_record(SensorGain(channel, gain), channel=channel)), name=name)
+
+
 def tutor(
     watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-", wait: bool = True
 ) -> Tutor:
     answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
-    answer.write_text(json.dumps([kind, patch_of(gain)]))
+    answer.write_text(json.dumps([kind, patch_record(SensorGain("g5", gain))]))
     script.write_text(ANSWER)
     return Tutor(watch, wait=wait, command=(sys.executable, str(script), str(answer), gate))
 
@@ -103,7 +109,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     (folder / "figures").mkdir(parents=True)
     (folder / "figures" / "missing_force.svg").write_bytes(to_svg(new_figure(2.0)))
     (folder / "verdict.json").write_text(json.dumps({"verdict": {"sentence": "It is so."}}))
-    of_gauge(folder / "patch.json", -0.3)
+    of_gauge(folder, "patch.json", -0.3)
     ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
     flight = viewed(noticing.folder)
     before, number = flight.believed(flight.seen(0, 5)).expected.mean, flight.number
@@ -226,7 +232,7 @@ def test_a_policy_that_changes_is_told(base):
 
 def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_path):
     """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
-    file = of_gauge(tmp_path / "patch.json", -0.12, "g17")
+    file = of_gauge(tmp_path, "patch.json", -0.12, "g17")
     known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
     keep_knowledge(tmp_path, taught)
     for read in (taught, kept_knowledge(tmp_path, taught.scenario)):
@@ -271,7 +277,7 @@ def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():
 
 
 def test_a_second_patch_stands_beside_the_first(tmp_path):
-    first, second = (of_gauge(tmp_path / channel, -0.1, channel) for channel in ("g5", "g7"))
+    first, second = (of_gauge(tmp_path, channel, -0.1, channel) for channel in ("g5", "g7"))
     both = json.loads(both_patches(first, second))
     assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
     assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}
