@@ -126,16 +126,13 @@ def test_damage_that_the_asset_lives_by_itself_needs_a_model_for_the_twin(folder
 # ---------------------------------------------------------------------- with the shipped wing
 
 
-def shipped(name: str, tmp_path: Path, *changes: tuple[str, str]) -> LoadedScenario:
-    """Return a shipped scenario with changes, and with a calibration that costs nothing."""
+def plant_of(name: str, folder: Path, *changes: tuple[str, str]) -> Plant:
+    """Return what flies in a shipped scenario with changes, and with a calibration that costs nothing."""
     text = text_of(name)
     calibration = text[text.index("[calibration]") : text.index("[truth]")]
     fixed = '[calibration]\nparameter = "young_modulus_factor"\nsource = "fixed"\nmean = 1.0073\n\n'
-    return load_scenario(written(tmp_path, text, (calibration, fixed), *changes, name=f"{name}.toml"))
-
-
-def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
-    scenario, source = loaded.scenario, prepared(loaded, folder, {"in_process": True})
+    loaded = load_scenario(written(folder, text, (calibration, fixed), *changes, name=f"{name}.toml"))
+    scenario, source = loaded.scenario, prepared(loaded, folder / name, {"in_process": True})
     truth = Truth(scenario, build_graphical_model(scenario), scenario.mission.seed)
     return Plant(scenario, truth, source.open())
 
@@ -145,8 +142,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
     quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
     lived = INPUTS.table("lived_by_fmus.toml")["changes"]
-    split = plant_of(shipped("three_fmus", tmp_path, *lived), tmp_path / "split")
-    single = plant_of(shipped("failing_gauges", tmp_path, quiet), tmp_path / "single")
+    split, single = plant_of("three_fmus", tmp_path, *lived), plant_of("failing_gauges", tmp_path, quiet)
     controls = np.random.default_rng(3).integers(2, size=50).tolist()
     for step, control in enumerate(controls):
         previous = controls[step - 1] if step else None

@@ -49,12 +49,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def grid(files: tuple[Path, Path], mode: float = FINE, **changes: object) -> SamplingGrid:
-    texts = [
-        f"wear={','.join(map(str, WEAR))}",
-        f"gain={','.join(map(str, GAIN))}",
-        f"push={','.join(map(str, PUSH))}",
-        f"mode={mode}",
-    ]
+    texts = ["wear=0,0.25,0.5", "gain=0.9,1.0,1.1", "push=2,4", f"mode={mode}"]
     return replace(grid_of_fmu(*files, texts), **changes)  # type: ignore[arg-type]
 
 
