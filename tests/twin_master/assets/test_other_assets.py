@@ -67,39 +67,31 @@ def folder(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return place
 
 
-@pytest.fixture(scope="module")
-def direct(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The mission with the one FMU, and with the system of one component."""
-    place = tmp_path_factory.mktemp("direct")
-    return {
-        name: new_run(load_scenario(folder / f"{name}.toml"), place / name).folder
-        for name in ("fouling", "coupled_fouling")
-    }
-
-
 def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
-@pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
-def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
+def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, tmp_path):
     """Also of a system of that FMU. It cannot save its state: its inputs are replayed.
 
     What is flown lies in the run folder.
     """
-    loaded = load_scenario(folder / f"{name}.toml")
-    inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
-    assert rows(inside) == rows(direct[name]) == rows(direct["fouling"])
-    with cut_off_after(11):
-        new_run(loaded, tmp_path / "part")
-    resume(tmp_path / "part")
-    check_same(tmp_path / "part", direct[name], "run.nc", "config.json", "summary.json", "journal.jsonl")
-    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
-    flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
-    assert rows(flown) == rows(direct[name])
-    assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
-    ssp.unlink()
-    assert rows(resume(flown).folder) == rows(direct[name])
+    alone = rows(new_run(load_scenario(folder / "fouling.toml"), tmp_path / "alone").folder)
+    for name in ("fouling", "coupled_fouling"):
+        loaded, place = load_scenario(folder / f"{name}.toml"), tmp_path / name
+        whole = new_run(loaded, place / "whole").folder
+        inside = new_run(loaded, place / "inside", Overrides(in_process=True)).folder
+        assert rows(inside) == rows(whole) == alone
+        with cut_off_after(11):
+            new_run(loaded, place / "part")
+        resume(place / "part")
+        check_same(place / "part", whole, "run.nc", "config.json", "summary.json", "journal.jsonl")
+        ssp = export_scenario(loaded, place / "x.ssp", replace_file=False)
+        flown = new_run(loaded, place / "flown", Overrides(ssp=ssp)).folder
+        assert rows(flown) == alone
+        assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
+        ssp.unlink()
+        assert rows(resume(flown).folder) == alone
 
 
 @pytest.mark.parametrize(

@@ -264,11 +264,6 @@ def at_levels(name: str, between: bool) -> Knowledge:
     return prepare_twin(changed_scenario(name, FEW | {"observation": {"between_levels": between}}))
 
 
-@pytest.fixture(scope="module")
-def wing() -> Knowledge:
-    return prepare_twin(changed_scenario("paper_level_turns", FEW))
-
-
 @pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 6)])
 def test_damage_between_two_levels_raises_no_alarm(between, alarmed):
     """Six flights of the panel with a stiffener that grows soft between two levels, and nothing else."""
@@ -333,7 +328,8 @@ def test_belief_and_decision_follow_what_holds_now(between):
     assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
 
 
-def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named(wing):
+def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():
+    wing = prepare_twin(changed_scenario("paper_level_turns", FEW))
     assert wing.scenario.control_names[wing.safest] == "2g"
     planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
     named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))
