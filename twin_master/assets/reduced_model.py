@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 
 FIELD_NAME = "structure.vtu"
+UNITS = {"strain": "1", "displacement": "m", "frequency": "Hz"}
+"""Of what a reduced model shows, by role."""
 
 
 class NamedStructure(AssetSource):
@@ -149,6 +151,10 @@ class NamedStructure(AssetSource):
                 raise MissionInputError(said("assets.modes", most=most, number=number))
         advice = self.advice["state"] or f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], advice=advice)
+        if modes is None and (came := sorted({*observation.sensor_units} - {"1", UNITS[role]})):
+            raise MissionInputError(
+                said("assets.own_unit", where=where, role=role, own=UNITS[role], came=came)
+            )
         if observation.count != known[role]:
             both = {"has": known[role], "count": observation.count}
             raise MissionInputError(said("assets.sensors", where=where, role=role, **both))

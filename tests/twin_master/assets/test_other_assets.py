@@ -33,7 +33,7 @@ from tests.twin_master.runs import (
     text_of,
     written,
 )
-from twin_master.assets.resolution import Overrides, resolve_scenario
+from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
 from twin_master.assets.structure_source import StructureBelief
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
@@ -45,7 +45,7 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.message import MessageReader
 from uav_twin import fly as new_run
-from uav_twin import fly_fleet, load_scenario, open_run, resume, structure_files
+from uav_twin import fly_fleet, load_scenario, open_run, resume, structure_files, watch
 
 pytestmark = [pytest.mark.usefixtures("no_report"), pytest.mark.xdist_group("wing")]
 INPUTS = Inputs(__file__)
@@ -274,6 +274,15 @@ def test_a_mesh_without_a_set_and_one_that_lies_elsewhere_are_refused(tmp_path):
         assert not (tmp_path / "run").exists()
 
 
+def test_a_belief_in_another_unit_than_that_of_the_model_is_refused():
+    """Also where nothing flies whose binding would tell: millimetres would be taken for metres."""
+    given = {"role": "displacement", "count": 1, "titles": "", "unit": "mm"}
+    changes: dict[str, Any] = {"asset": "", "truth": "", "observation": given}
+    watched = loaded_from(merged(table_of("bracket"), changes), "bracket")
+    with pytest.raises(MissionInputError, match=r"`displacement` in m, and `observation\.unit` says mm"):
+        believed_source(resolve_scenario(watched)).check()
+
+
 # ------------------------------- modes identified of a record of accelerations, as the observation of a turn
 
 TWO = {
@@ -304,13 +313,21 @@ def features(tree: Any, titles: list[str]) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def test_the_twin_finds_the_loss_from_records_of_accelerations(file, tmp_path):
-    """Features lie within their errors of those of the model that flies; the inner region is accused."""
-    tree = fly(mission(file), tmp_path / "run")
+    """Features lie within their errors of those of the model that flies; the inner region is accused.
+
+    A watch of what is stored believes the same, and residuals count the errors of the record.
+    """
+    loaded = mission(file, observation={"between_levels": False})
+    tree = fly(loaded, tmp_path / "run")
+    again = open_run(watch(loaded, tmp_path / "run" / "run.nc", tmp_path / "again", report=False))
+    np.testing.assert_allclose(again["filtered"]["log_evidence"], tree["filtered"]["log_evidence"], rtol=1e-9)
     true, seen, errors = features(tree, TITLES)
     assert list(tree["observed"]["sensor_unit"].values) == ["Hz", "1", "1"] * 2
     # mode 5, at 8 kHz and strongly damped, is in the record and told by none of the bands: a small bias
     assert np.abs((seen - true) / np.hypot(errors, 5e-3 * np.abs(true))).max() < 5.0
     assert np.all(errors[:, 0] < 1e-3 * true[:, 0])
+    noise = np.hypot(errors, loaded.scenario.observation.standard_deviation)
+    np.testing.assert_allclose(tree["filtered"]["noise_standard_deviation"], noise, rtol=1e-9)
     np.testing.assert_allclose(tree["filtered"]["mean"].values, tree["truth"]["state"].values, atol=0.02)
 
 

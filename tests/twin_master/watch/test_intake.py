@@ -269,6 +269,14 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     scenario = load_scenario("pump_wear").scenario
     pump, unit = MessageReader(scenario), scenario.observation.sensor_units[0]
     assert pump.message({f"{next(iter(pump._index))} [k{unit}]": 2.0}).observed[0] == 2000.0
+    for own, unit, size in (
+        ("m2", "mm2", 1e-6),
+        ("m\N{SUPERSCRIPT THREE}/s", "mm\N{SUPERSCRIPT THREE}/s", 1e-9),
+        ("s^-1", "ms^-1", 1e3),
+    ):
+        leak = scenario.observation.model_copy(update={"unit": own})
+        reader = MessageReader(scenario.model_copy(update={"observation": leak}))
+        np.testing.assert_allclose(reader.message({f"operation_2 [{unit}]": 3.0}).observed[1], 3.0 * size)
     refused = MessageReader(allowing).message(b'{"strain_2_bar": 1e-4}')  # a gauge that is there
     assert "`bar` is no unit of sensor 2" in str(refused)
 
