@@ -16,8 +16,7 @@ from fmu_asset.check import FmuCheck, check_file, check_fmu
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.session import FmiAsset
 from tests.fmu_asset.door.kinds import HOSTILE, WING_BINDING
-from tests.fmu_asset.foreign.workshop import MODELS
-from tests.fmu_asset.making import DESCRIPTION, archive_of, bound, edited, members, tables
+from tests.fmu_asset.making import DESCRIPTION, MODELS, archive_of, bound, edited, members, tables
 
 REFUSED = tables(__file__)["refused"]
 

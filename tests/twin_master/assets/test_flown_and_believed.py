@@ -123,15 +123,9 @@ def test_the_credible_set_by_enumeration(weights, truth):
     probability = np.array(weights) / sum(weights)
     sets = [[s for s in range(25) if weights[s] >= least] for least in (5, 4, 3, 2, 1)]
     smallest = next(s for s in sets if 10 * sum(weights[i] for i in s) >= 9 * sum(weights))
-    levels = np.arange(0, 81, 20)
-    near = [
-        {int(level) for level in levels if abs(level - z) == np.abs(levels - z).min()} for z in truth
-    ]  # fmt: skip
-    expected = any(
-        round(100 * model.states.coordinates[s, 0]) in near[0]
-        and round(100 * model.states.coordinates[s, 1]) in near[1]
-        for s in smallest
-    )
+    away = np.abs(np.rint(100.0 * model.states.coordinates) - truth)
+    nearest = (away == away.min(axis=0)).all(axis=1)  # also two levels, of a truth half way between them
+    expected = bool(nearest[smallest].any())
     found = in_credible_set(model, probability[None], np.array([truth]) / 100.0)
     assert found.tolist() == [expected]
 
@@ -140,10 +134,8 @@ def test_a_model_error_reaches_the_twin(library_file, tmp_path):
     """A twin that doubts its model trusts each sensor less, by a share of what it predicts."""
     percent = [float(value) for value in range(24)]
     listed = ("# model_error_percent = 3", f"model_error_percent = {percent}\nbetween_levels = false")
-    scenario = resolved(
-        library_file,
-        written(tmp_path, TEXT, ('kind = "design"\ndesign = "uav_wing"\n', 'kind = "asset"\n'), listed),
-    )
+    asset = ('kind = "design"\ndesign = "uav_wing"\n', 'kind = "asset"\n')
+    scenario = resolved(library_file, written(tmp_path, TEXT, asset, listed))
     sensors = prepare_knowledge(scenario, asset_source(scenario), 1).sensor_model
     expected = np.hypot(125e-6, np.arange(24) / 100.0 * sensors.mean)
     np.testing.assert_allclose(sensors.total_standard_deviation, expected, rtol=1e-12)

@@ -99,13 +99,11 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     assert [state[f"north/wing-{number}"]["last"]["turn"] for number in range(3)] == [TURNS - 1] * 3
     (again / "watched.json").unlink()  # as if a kill had come: nobody knows whether the last ones were told
     told = list[tuple[str, bool]]()
-    fleet = FleetWatch(
-        load_fleet(fleet_file),
-        again,
-        lambda one, decision: told.append((one.name, decision["told_again"])),
-        print,
-    )
-    fleet.run()
+
+    def tell(one: WatchedAsset, decision: Decision) -> None:
+        told.append((one.name, decision["told_again"]))
+
+    FleetWatch(load_fleet(fleet_file), again, tell, print).run()
     assert sorted(told) == [(f"north/wing-{number}", True) for number in range(3)]
     with pytest.raises(RunFolderError, match="another fleet"):
         FleetWatch(load_fleet(fleet_file, seed=8), again, print, print)
@@ -318,9 +316,8 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     config = json.loads((outcome.folder / "config.json").read_text())
     soon = leaving(outcome.folder, config["fleet"]["groups"][0], group)
     for _ in range(2):  # the second time nothing is left to read
-        records = [
-            asset.record() for _, asset in sorted(watched(fleet_file, tmp_path / "out").assets.items())
-        ]
+        assets = watched(fleet_file, tmp_path / "out").assets
+        records = [asset.record() for _, asset in sorted(assets.items())]
         assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
         assert sum(record["alarms"] > 0 for record in records) == alarmed
 

@@ -64,9 +64,7 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     watched = estimates_of(WatchfulEstimator(inner, sensors, DRAWS, words=words), seen)
     for turn, (plain, found) in enumerate(zip(estimates_of(inner, seen), watched, strict=True)):
         # The filter goes on as if it were alone, and the evidence is the model's.
-        np.testing.assert_array_equal(
-            found.carried.arrays["log_filtered"], plain.carried.arrays["log_filtered"]
-        )
+        np.testing.assert_array_equal(*(one.carried.arrays["log_filtered"] for one in (found, plain)))
         assert found.log_evidence == plain.log_evidence
         probability = {one.name: one.probability for one in found.hypotheses}
         told = 1.0 - sum(probability.values())  # those that are left out are improbable
@@ -141,11 +139,8 @@ def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch
         return total
 
     for gauge in range(3):
-        rival = sum(
-            weight * np.mean([evidence(gauge, gain, begin) for gain in GAINS])
-            for begin, weight in enumerate(first)
-        )
-        expected = np.log(rival / evidence(gauge, 0.0, 0))
+        each = [np.mean([evidence(gauge, gain, begin) for gain in GAINS]) for begin in range(turns + 1)]
+        expected = np.log(first @ each / evidence(gauge, 0.0, 0))
         assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-5)
 
 
@@ -199,10 +194,8 @@ def twins() -> dict[str, Twin]:
     """Return twins of two gauges that do not learn, learn, and give notice beside either."""
     model, sensors = small(2)
     priors = Learning(noise_degrees=10.0, gauge_gain=0.1, gauge_offset=1.0)
-    inner = {
-        "exact": ExactFilter(model, sensors),
-        "learning": LearningFilter(model, sensors, priors, ("e", DRAWS)),
-    }
+    learning = LearningFilter(model, sensors, priors, ("e", DRAWS))
+    inner = {"exact": ExactFilter(model, sensors), "learning": learning}
     own = inner | {f"watchful {name}": WatchfulEstimator(e, sensors, DRAWS) for name, e in inner.items()}
     return {name: Twin(name, model, sensors, np.ones((3, 1)), estimator=e) for name, e in own.items()}
 

@@ -131,9 +131,8 @@ def test_what_is_damaged_is_sampled_again(files, tmp_path, monkeypatch):
         else:
             kept.write_bytes(kept.read_bytes()[:-8])
         outcome = sample_library(some, out, workers=1, resume=True)
-        assert outcome.block_count - outcome.kept_blocks == (
-            1 if out.stem == "block" else outcome.block_count
-        )
+        again = outcome.block_count - outcome.kept_blocks
+        assert again == (1 if out.stem == "block" else outcome.block_count)
         assert out.read_bytes() == whole.path.read_bytes()
 
 
@@ -141,10 +140,9 @@ def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(files, 
     for mode in (LAG, COUNT):
         with pytest.raises(MissionInputError, match=r"remembers earlier steps: at wear = .*--settle"):
             sample_library(grid(files, mode), tmp_path / "lever.nc", workers=1, replace_existing=True)
+    early = grid(files, LAG, settling_steps=3)
     with pytest.raises(MissionInputError, match="has not settled after 3 steps"):
-        sample_library(
-            grid(files, LAG, settling_steps=3), tmp_path / "lever.nc", workers=1, replace_existing=True
-        )
+        sample_library(early, tmp_path / "lever.nc", workers=1, replace_existing=True)
     lagging = grid(files, LAG, settling_steps=40)
     settled = sample_library(lagging, tmp_path / "lever.nc", workers=1, replace_existing=True)
     exact = sample_library(grid(files), tmp_path / "exact.nc", workers=1)

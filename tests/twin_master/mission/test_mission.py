@@ -359,9 +359,7 @@ def test_our_policy_flies_the_mission_of_the_loop(environment):
             action = twin.turn(info["observed"], info["control"]).next_control
             observation, reward, terminated, truncated, info = environment.step(action)
             assert not terminated
-            np.testing.assert_array_equal(
-                observation, np.where(np.isnan(info["observed"]), 0, info["observed"])
-            )
+            np.testing.assert_array_equal(observation, np.nan_to_num(info["observed"]))
             observed.append(info["observed"])
             controls.append(info["control"])
             rewards.append(reward)

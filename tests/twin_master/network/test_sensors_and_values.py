@@ -90,15 +90,8 @@ def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
     interval = size * rng.normal(size=(STATES, CONTROLS, SENSORS, factors))
     covariance = interval @ interval.swapaxes(-1, -2) + np.diag(deviation**2)
     part = covariance[:, 1][:, seen][:, :, seen]
-    each = np.array(
-        [
-            [
-                multivariate_normal.logpdf(observation[seen], values[e, s, 1, seen], part[s])
-                for e in range(DRAWS)
-            ]
-            for s in range(STATES)
-        ]
-    )
+    residual = (observation - values[:, :, 1])[..., seen]
+    each = np.array([multivariate_normal.logpdf(residual[:, s], cov=part[s]) for s in range(STATES)])
     expected = logsumexp(each, b=weight, axis=1)
     close = {"rtol": 1e-7, "atol": 1e-7}  # the covariance has a condition of up to 1e7
     model = GaussianSensorModel(values, deviation, weight, interval=interval)
