@@ -17,8 +17,11 @@ import xarray as xr
 from benchmarks.seeds import fly_seeds
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError, InvalidDesignError
+from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuError, SspError
+from fmu_asset.ssp.reader import read_ssp
+from fmu_asset.structures import structure_binding_text
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
     changed_scenario,
@@ -92,6 +95,13 @@ def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, tm
         assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
         ssp.unlink()
         assert rows(resume(flown).folder) == alone
+    several = ("step_size = 60.0", "step_size = 15.0\ndecimation = 4\nstart_time = 1000.0")
+    own = written(tmp_path, (folder / "binding.toml").read_text(encoding="utf-8"), several)
+    loaded = load_scenario(folder / "fouling.toml")
+    asset = loaded.scenario.asset.model_copy(update={"binding": str(own)})
+    later = replace(loaded, scenario=loaded.scenario.model_copy(update={"asset": asset}))
+    ssp = export_scenario(later, tmp_path / "later.ssp", replace_file=False)
+    assert read_ssp(ssp, tmp_path).span == (1000.0, 1000.0 + 60.0 * later.scenario.mission.steps)
 
 
 @pytest.mark.parametrize(
@@ -326,6 +336,12 @@ def test_the_twin_finds_the_loss_from_records_of_accelerations(file, tmp_path):
     # mode 5, at 8 kHz and strongly damped, is in the record and told by none of the bands: a small bias
     assert np.abs((seen - true) / np.hypot(errors, 5e-3 * np.abs(true))).max() < 5.0
     assert np.all(errors[:, 0] < 1e-3 * true[:, 0])
+    # a record has its own rate, however many steps of the binding make a turn
+    several = ("step_size = 1.0", "step_size = 1.0\ndecimation = 4")
+    binding = written(tmp_path, structure_binding_text(load_structure(file)), several)
+    once = {"mission": {"steps": 1}, "truth": {"gains": []}, "asset": {"binding": str(binding)}}
+    rate = fly(mission(file, **once), tmp_path / "rate")
+    np.testing.assert_array_equal(rate["observed"]["modes"].values, seen[:1])
     noise = np.hypot(errors, loaded.scenario.observation.standard_deviation)
     np.testing.assert_allclose(tree["filtered"]["noise_standard_deviation"], noise, rtol=1e-9)
     np.testing.assert_allclose(tree["filtered"]["mean"].values, tree["truth"]["state"].values, atol=0.02)
