@@ -25,7 +25,6 @@ from fmu_asset.structures import structure_binding_text
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
     changed_scenario,
-    check_resumed,
     check_same,
     cut_off_after,
     edited,
@@ -71,41 +70,36 @@ def folder(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return place
 
 
-@pytest.fixture(scope="module")
-def direct(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The mission with the one FMU, and with the system of one component."""
-    place = tmp_path_factory.mktemp("direct")
-    return {
-        name: new_run(load_scenario(folder / f"{name}.toml"), place / name).folder
-        for name in ("fouling", "coupled_fouling")
-    }
-
-
 def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
-@pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
-def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
+def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, tmp_path):
     """Also of a system of that FMU. It cannot save its state: its inputs are replayed.
 
     What is flown lies in the run folder.
     """
-    loaded = load_scenario(folder / f"{name}.toml")
-    inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
-    assert rows(inside) == rows(direct[name]) == rows(direct["fouling"])
-    check_resumed(direct[name], loaded, tmp_path / "part", 11)
-    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
-    flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
-    assert rows(flown) == rows(direct[name])
-    assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
-    ssp.unlink()
-    assert rows(resume(flown).folder) == rows(direct[name])
+    alone = rows(new_run(load_scenario(folder / "fouling.toml"), tmp_path / "alone").folder)
+    for name in ("fouling", "coupled_fouling"):
+        loaded, place = load_scenario(folder / f"{name}.toml"), tmp_path / name
+        whole = new_run(loaded, place / "whole").folder
+        inside = new_run(loaded, place / "inside", Overrides(in_process=True)).folder
+        assert rows(inside) == rows(whole) == alone
+        with cut_off_after(11):
+            new_run(loaded, place / "part")
+        resume(place / "part")
+        check_same(place / "part", whole, "run.nc", "config.json", "summary.json", "journal.jsonl")
+        ssp = export_scenario(loaded, place / "x.ssp", replace_file=False)
+        flown = new_run(loaded, place / "flown", Overrides(ssp=ssp)).folder
+        assert rows(flown) == alone
+        assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
+        ssp.unlink()
+        assert rows(resume(flown).folder) == alone
     several = ("step_size = 60.0", "step_size = 15.0\ndecimation = 4\nstart_time = 1000.0")
     own = written(tmp_path, (folder / "binding.toml").read_text(encoding="utf-8"), several)
-    later = load_scenario(folder / "fouling.toml").scenario
-    asset = later.asset.model_copy(update={"binding": str(own)})
-    later = replace(loaded, scenario=later.model_copy(update={"asset": asset}))
+    loaded = load_scenario(folder / "fouling.toml")
+    asset = loaded.scenario.asset.model_copy(update={"binding": str(own)})
+    later = replace(loaded, scenario=loaded.scenario.model_copy(update={"asset": asset}))
     ssp = export_scenario(later, tmp_path / "later.ssp", replace_file=False)
     assert read_ssp(ssp, tmp_path).span == (1000.0, 1000.0 + 60.0 * later.scenario.mission.steps)
 
@@ -134,16 +128,13 @@ def test_damage_that_the_asset_lives_by_itself_needs_a_model_for_the_twin(folder
 # ---------------------------------------------------------------------- with the shipped wing
 
 
-def shipped(name: str, tmp_path: Path, *changes: tuple[str, str]) -> LoadedScenario:
-    """Return a shipped scenario with changes, and with a calibration that costs nothing."""
+def plant_of(name: str, folder: Path, *changes: tuple[str, str]) -> Plant:
+    """Return what flies in a shipped scenario with changes, and with a calibration that costs nothing."""
     text = text_of(name)
     calibration = text[text.index("[calibration]") : text.index("[truth]")]
     fixed = '[calibration]\nparameter = "young_modulus_factor"\nsource = "fixed"\nmean = 1.0073\n\n'
-    return load_scenario(written(tmp_path, text, (calibration, fixed), *changes, name=f"{name}.toml"))
-
-
-def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
-    scenario, source = loaded.scenario, prepared(loaded, folder, {"in_process": True})
+    loaded = load_scenario(written(folder, text, (calibration, fixed), *changes, name=f"{name}.toml"))
+    scenario, source = loaded.scenario, prepared(loaded, folder / name, {"in_process": True})
     truth = Truth(scenario, build_graphical_model(scenario), scenario.mission.seed)
     return Plant(scenario, truth, source.open())
 
@@ -153,8 +144,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
     quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
     lived = INPUTS.table("lived_by_fmus.toml")["changes"]
-    split = plant_of(shipped("three_fmus", tmp_path, *lived), tmp_path / "split")
-    single = plant_of(shipped("failing_gauges", tmp_path, quiet), tmp_path / "single")
+    split, single = plant_of("three_fmus", tmp_path, *lived), plant_of("failing_gauges", tmp_path, quiet)
     controls = np.random.default_rng(3).integers(2, size=50).tolist()
     for step, control in enumerate(controls):
         previous = controls[step - 1] if step else None

@@ -24,9 +24,8 @@ from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.store.mission_result import MissionResult, printed_learnt
-from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
-from uav_twin import fly, load_scenario, prepare_twin
+from uav_twin import fly, load_scenario, open_run, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -104,12 +103,7 @@ def test_prior_and_truth_are_those_of_the_scenario(learnt, run):
 @pytest.mark.parametrize(("faster", "truth"), [({"2g": 0.1, "3g": 0.2}, 2.0), ({"2g": 0.1, "3g": 0.1}, None)])
 def test_the_true_factor_is_that_of_the_true_probabilities(faster, truth):
     learning = {"parameter": False, "noise": False, "transition_factors": [1.0, 2.0]}
-    changes = {
-        "learning": learning,
-        "truth": {"probability": faster},
-        "mission": {"steps": 2},
-        "notice": False,
-    }
+    changes = {"learning": learning, "truth": {"probability": faster}, "mission": {"steps": 2}}
     known, source = of_wing(changed_scenario("growing_damage", changes | {"notice": False}).scenario)
     (factor,) = MissionResult(known.scenario, known, flight_of(known, source), known.truth(3)).learnt
     assert (factor.name, factor.truth) == ("transition_factor", truth)
@@ -158,24 +152,17 @@ def test_the_view_shows_what_was_learnt(folder, run):
     """From the posterior of each quantity alone, which the journal tells."""
     flight, filtered = Flight(folder), run["filtered"].to_dataset()
     flight.update()
-    shown, noise = (
-        flight.believed(flight.seen(0, TURNS)).expected,
-        filtered["noise_standard_deviation"].values,
-    )
+    shown = flight.believed(flight.seen(0, TURNS)).expected
+    noise = filtered["noise_standard_deviation"].values
     wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
     np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
-    ahead = (
-        flight.predicted(flight.seen(TURNS - 1, TURNS)[0]).expected.mean
-        - run["predicted"]["quantity_mean"].values[-1]
-    )
-    assert np.abs(ahead / noise[-1]).max() < 0.06
+    ahead = flight.predicted(flight.seen(TURNS - 1, TURNS)[0]).expected.mean
+    assert np.abs((ahead - run["predicted"]["quantity_mean"].values[-1]) / noise[-1]).max() < 0.06
 
     def off() -> float:
-        error = (
-            flight.believed(flight.seen(0, TURNS)).expected.mean - filtered["quantity_mean"].values
-        ) / noise
-        return float(np.abs(error).max())
+        error = flight.believed(flight.seen(0, TURNS)).expected.mean - filtered["quantity_mean"].values
+        return float(np.abs(error / noise).max())
 
     residual = (run["observed"]["strain"].values - filtered["quantity_mean"].values) / noise
     np.testing.assert_allclose(residual, filtered["residual"].values)

@@ -17,12 +17,7 @@ from tests.twin_master.network.decision_oracles import (
 )
 from tests.twin_master.runs import loaded_from, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, check_scenario_fits, resolve_scenario
-from twin_master.errors import (
-    ImpossibleObservation,
-    InvalidModelError,
-    InvalidObservationError,
-    TwinMasterError,
-)
+from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network import transition as transition_file
 from twin_master.network.graphical_model import Factor, StateSpace, worsening_table
@@ -133,7 +128,7 @@ def test_a_noise_whose_unit_was_forgotten_is_refused(key, number, tmp_path, libr
     change = (f"standard_deviation_microstrain = {number}", "standard_deviation = 0.05")
     loaded = load_scenario(written(tmp_path, text_of("level_turns", change)))
     scenario = resolve_scenario(loaded, Overrides(strain_library=library_file))
-    with refused(TwinMasterError, f"`{key}` is 0.05.*sensor 1.*write `{key}_microstrain = 0.05`"):
+    with refused(InvalidModelError, f"`{key}` is 0.05.*sensor 1.*write `{key}_microstrain = 0.05`"):
         prepare_knowledge(scenario, asset_source(scenario), 0)
 
 

@@ -90,15 +90,8 @@ def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
     interval = size * rng.normal(size=(STATES, CONTROLS, SENSORS, factors))
     covariance = interval @ interval.swapaxes(-1, -2) + np.diag(deviation**2)
     part = covariance[:, 1][:, seen][:, :, seen]
-    each = np.array(
-        [
-            [
-                multivariate_normal.logpdf(observation[seen], values[e, s, 1, seen], part[s])
-                for e in range(DRAWS)
-            ]
-            for s in range(STATES)
-        ]
-    )
+    residual = (observation - values[:, :, 1])[..., seen]
+    each = np.array([multivariate_normal.logpdf(residual[:, s], cov=part[s]) for s in range(STATES)])
     expected = logsumexp(each, b=weight, axis=1)
     close = {"rtol": 1e-7, "atol": 1e-7}  # the covariance has a condition of up to 1e7
     model = GaussianSensorModel(values, deviation, weight, interval=interval)
@@ -327,10 +320,8 @@ def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed, moves_first):
                 first[control] += problem.discount[control] * later
         value = first.max(axis=0)
     for control, values in ((None, value), (1, first[1])):
-        exact, plan = (
-            np.interp(problem.prior[1], grid, values),
-            plan_on_belief(problem, first=control, gap=1e-4),
-        )
+        exact = np.interp(problem.prior[1], grid, values)
+        plan = plan_on_belief(problem, first=control, gap=1e-4)
         assert plan.lower <= exact + 1e-6
         assert plan.upper >= exact - 1e-4
         assert plan.upper - plan.lower <= 1e-3
