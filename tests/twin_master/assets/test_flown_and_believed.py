@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
@@ -112,7 +112,6 @@ def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path,
         asset_source(scenario).check()
 
 
-@settings(deadline=None)
 @given(
     weights=st.lists(st.integers(0, 5), min_size=25, max_size=25).filter(any),
     truth=st.tuples(st.integers(0, 80), st.integers(0, 80)),

@@ -16,7 +16,7 @@ from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
 from twin_master.scenario.tables import Learning
-from uav_twin import Estimate, GaussianSensorModel, GraphicalModel
+from uav_twin import GaussianSensorModel, GraphicalModel
 
 Float = NDArray[np.float64]
 
@@ -142,16 +142,6 @@ SETTINGS = 2.0, (-0.1, 0.1), 0.8, (2.0, 3.0)
 POLICY = np.array([[0.0, 1.0], [0.3, 0.7], [1.0, 0.0]])
 
 
-@pytest.fixture(scope="module")
-def turns() -> list[Estimate]:
-    return estimates_of(learner_of_all(), observations(), CONTROLS)
-
-
-@pytest.fixture(scope="module")
-def expectation() -> LearntExpectation:
-    return LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
-
-
 def moments(values: Float, weight: Float) -> tuple[Float, Float]:
     """Return mean and standard deviation of values (..., n) under weights (...)."""
     share = weight / weight.sum()
@@ -160,11 +150,12 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
 
 
 @pytest.mark.parametrize("other", [None, np.array([0.2, 0.7, 0.1])])
-def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation, other):
+def test_filtered_and_smoothed_are_sums_over_all_trajectories(other):
     """States, draws and transition factors; what is expected to be seen, also of another belief."""
-    carried, seen = [turn.carried for turn in turns], observations()
-    rewards = RewardModel(sensors(), *SETTINGS)
-    now, later = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
+    learner, seen, rewards = learner_of_all(), observations(), RewardModel(sensors(), *SETTINGS)
+    expectation, turns = LearntExpectation(learner, rewards, POLICY), estimates_of(learner, seen, CONTROLS)
+    carried = [turn.carried for turn in turns]
+    now, later = np.array([turn.filtered for turn in turns]), learner.smoothed(carried)
     value, whole, evidence = sensors().value_per_draw, enumerated(STEPS), 0.0
     for t, turn in enumerate(turns):
         until = enumerated(t + 1)
@@ -202,8 +193,10 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
                 np.testing.assert_allclose(found.reward_standard_deviation[t, place], deviation[0], atol=1e-7)
 
 
-def test_predicted_follows_the_scenario_through_the_policy(turns, expectation):
-    found = expectation.predicted([turns[2].carried], [turns[2].filtered], [POLICY], 2)
+def test_predicted_follows_the_scenario_through_the_policy():
+    *_, turn = estimates_of(learner_of_all(), observations()[:3], CONTROLS[:3])
+    expectation = LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
+    found = expectation.predicted([turn.carried], [turn.filtered], [POLICY], 2)
     table = enumerated(3).sum(axis=(0, 1, 4))  # (S, E)
     table = table / table.sum()
     matrix, value = model().transition.matrix, sensors().value_per_draw
