@@ -1,10 +1,8 @@
 """Missions of assets by FMUs, coupled ones and SSP files, and of structures from a mesh."""
 
-import json
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -311,7 +309,7 @@ def mission(file: Path, **changes: Any) -> LoadedScenario:
 
 
 @pytest.fixture(scope="module")
-def file(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(write_beam: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_beam(tmp_path_factory.mktemp("beam"), TWO)
 
 
@@ -380,7 +378,7 @@ def test_a_watch_takes_features_with_their_covariance(file):
     reader, count = MessageReader(scenario), scenario.observation.count
     covariance = np.diag([1e-2, 1e-8, 1e-6, 1.0, 1e-6, 1e-6])
     told = {"frequency_1_Hz": 461.7, "mid_1": None, "modes_4": 4590.0, "covariance": covariance.tolist()}
-    message = reader.message(json.dumps(told).encode())
+    message = reader.message(told)
     np.testing.assert_array_equal(message.observed[:count], [461.7, np.nan, np.nan, 4590.0, np.nan, np.nan])
     np.testing.assert_array_equal(message.observed, packed_row(message.observed[:count], covariance))
     for wrong, sentence in (([1.0], "6 rows of 6"), ((-covariance).tolist(), "eigenvalues of zero or more")):

@@ -44,9 +44,8 @@ def test_the_page_begins_with_what_was_decided_believed_and_explained(run):
     assert left == "The twin left 3g for 2g at turn 31."  # by a policy of both states
     mean, deviation = (100 * run[f"filtered/{name}"][-1, 0] for name in ("mean", "standard_deviation"))
     low, high = max(mean - 2 * deviation, 0.0), min(mean + 2 * deviation, 80.0)
-    assert (
-        f"puts the stiffness loss of region 1 at {mean:.1f} % ({low:.1f} to {high:.1f}, truth 60)" in believed
-    )
+    interval = f"{mean:.1f} % ({low:.1f} to {high:.1f}, truth 60)"
+    assert f"puts the stiffness loss of region 1 at {interval}" in believed
     # 150 µε of noise, 125 assumed
     assert f"{predictive_check(run).standard_deviation:.3g} times as far as it assumes" in explained
     text = html.unescape(report.render_page(run, {}, {})).replace("\N{NO-BREAK SPACE}", " ")
