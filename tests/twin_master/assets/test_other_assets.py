@@ -35,7 +35,6 @@ from tests.twin_master.runs import (
     written,
 )
 from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
-from twin_master.assets.structure_source import StructureBelief
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
 from twin_master.fleet.plan import ensemble
@@ -408,7 +407,6 @@ def test_gauges_that_cannot_stand_beside_those_of_the_file(tmp_path):
     gauges = text[text.index("[[gauge]]") : text.index("[[displacement]]")]
     rows = 'gauge = [{ name = "end_1", point = [40, 50, -20], direction = [1, 0, 0] }]\n'
     inline = written(tmp_path, rows + edited(text, (gauges, "")), name="panel.toml")
-    assert isinstance(panel.belief, StructureBelief)
     believed = panel.belief.model_copy(update={"structure": str(inline)})
     with pytest.raises(MissionInputError, match=r"as tables \[\[gauge\]\], not in a list"):
         with_candidates(panel.model_copy(update={"belief": believed}), "3", tmp_path / "3")
