@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +16,16 @@ from scenarios import scenario_files
 from tests.command_line import said
 from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
+from twin_master.command import _shown
 from twin_master.errors import TwinMasterError
 from twin_master.report.model import learnt_figure, sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
-from twin_master.store.mission_result import MissionResult
+from twin_master.store.mission_result import MissionResult, printed_learnt
 from twin_master.viewer.flight import Flight
-from uav_twin import load_scenario, open_run, prepare_twin
+from uav_twin import fly, load_scenario, open_run, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -186,6 +188,23 @@ def test_more_transitions_than_there_can_be_are_refused(tmp_path):
         knowledge.twin()
 
 
+def test_offsets_of_sensors_of_several_units_have_their_own(tmp_path):
+    """And no mean: that of litres a minute, newton metres, degrees and bars says nothing."""
+    given: dict[str, Any] = {"mission": {"steps": 2}, "calibration": {"draws": 4}}
+    given |= {"learning": {"gauge_offset": [0.5, 0.4, 1.0, 0.1]}}
+    plain = changed_scenario("pump_wear", given | {"observation": {"unit": "1"}})  # which is no strain
+    assert printed_learnt("gauge_offset", "1", plain.scenario) == (1.0, "")
+    fly(changed_scenario("pump_wear", given), tmp_path, report=False)
+    summary, units = json.loads((tmp_path / "summary.json").read_text()), ["L/min", "N.m", "degC", "bar"]
+    told = {figure["key"]: figure for figure in summary["figures"]}
+    most = told["gauge_offset_most"]
+    assert most["unit"] == units[int(re.search(r"sensor (\d)", most["title"])[1]) - 1]
+    assert told["gauge_offset_mean"]["value"] is None
+    assert summary["learnt"]["gauge_offset"]["unit"] == units
+    learnt = journal(tmp_path)[-1]["learnt"]
+    assert [learnt[f"gauge_offset[{number}]"]["unit"] for number in range(1, 5)] == units
+
+
 def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
     assert dict(Noticing()) == vars(Noticing())
     for name in scenario_files():
@@ -221,6 +240,7 @@ def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_re
     faults = ("# What the figures", Inputs(__file__).text("faults.toml") + "# What the figures")
     spoilt, noticed = written(tmp_path, TEXT, *SHORT, faults), tmp_path / "run"
     console = said("run", spoilt, "--out", noticed, "--no-report")
+    assert _shown(123_456, "") == "123456"  # a turn has all of its digits
     alarm = next(line for line in console.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
     assert "gauge 5 shows too much, since about turn 2 (" in alarm
     search = f"; to find the cause: uav-twin discrepancy run --from-run {noticed} --from-turn 2"
