@@ -232,9 +232,8 @@ def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():
     delay, early = _fallbacks(knowledge, flights)
     np.testing.assert_array_equal(delay, [np.inf, np.inf, np.nan, 1.0, np.nan])
     assert (early == 0).all()
-    both = replace(
-        knowledge, policy=np.eye(2)[(knowledge.model.states.coordinates.sum(axis=1) < 0.5).astype(int)]
-    )
+    lost = knowledge.model.states.coordinates.sum(axis=1)
+    both = replace(knowledge, policy=np.eye(2)[(lost < 0.5).astype(int)])
     delay, early = _fallbacks(both, flights)  # by which no state alone calls for a fallback
     assert (np.isnan(delay) & (early == -1)).all()
 

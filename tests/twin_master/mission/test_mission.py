@@ -261,9 +261,8 @@ BINDING = INPUTS.text("hostile_binding.toml")
 
 def hostile(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = BINDING) -> Any:
     written(folder, binding, name="binding.toml")
-    return load_scenario(
-        written(folder, INPUTS.text("hostile.toml"), ("FMU", str(fmu)), *changes, name="scenario.toml")
-    )
+    text = INPUTS.text("hostile.toml")
+    return load_scenario(written(folder, text, ("FMU", str(fmu)), *changes, name="scenario.toml"))
 
 
 def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch):

@@ -199,12 +199,9 @@ def test_times_stand_for_turns_and_a_clock_that_is_set_after_the_first_spoils_no
     gap, counted = watched(timed, [*lines[:4], *lines[5:]])
     assert (gap.turns, counted.counts.missing) == (8, 1)
     np.testing.assert_array_equal(gap.observed(7), strains[7])
-    # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up.
-    for later in (
-        b"1700000500",
-        b"1.6e9",
-        b"1.7e308",
-    ):  # the first near enough that a missing limit ends, too
+    # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up;
+    # the first is near enough that a missing limit ends, too.
+    for later in (b"1700000500", b"1.6e9", b"1.7e308"):
         again = taken_up(intake.state(), b'{"time": %s, "strain_1": 1e-4}\n' % later)
         assert again.read(twin) is None
         assert again.counts.rejected == 1

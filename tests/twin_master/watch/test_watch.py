@@ -181,9 +181,8 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     controls[[20, 30]] = 1 - controls[[20, 30]]
     header, *rows = write_csv(tmp_path / "m.csv", mission.observed, controls).read_text().split()
     part = f"30,,{rows[30].split(',')[2]}{',' * 23}"  # one gauge, and no control
-    (tmp_path / "late.csv").write_text(
-        "\n".join([header, *rows[:20], *rows[21:25], rows[20], *rows[25:30], part, *rows[30:], ""])
-    )
+    late = [*rows[:20], *rows[21:25], rows[20], *rows[25:30], part, *rows[30:]]
+    (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
     first, second = begun(base, tmp_path / "first"), begun(base, tmp_path / "second")
     for watch, source, stops in (
         (first, tmp_path / "late.csv", (None,)),
@@ -293,9 +292,8 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_path, monkeypatch):
-    lines = [
-        json.dumps({"turn": t, "strain": row}) + "\n" for t, row in enumerate(mission.observed[:4].tolist())
-    ]
+    rows = mission.observed[:4].tolist()
+    lines = [json.dumps({"turn": turn, "strain": row}) + "\n" for turn, row in enumerate(rows)]
     line = [sys.executable, "-m", "uav_twin", "watch", str(scenario.path), "--no-report"]
     out, pipe = ["--out", str(tmp_path / "watch")], subprocess.PIPE
     with subprocess.Popen([*line, *out], stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
