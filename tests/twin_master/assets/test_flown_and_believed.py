@@ -210,9 +210,7 @@ def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str
     + [(SensorDrift("strain[1]", 1e-5, 1.0), "on time"), (BoucWen("tip", 1.0, 1e-3, 1.0), "loads before")]
     + [(SensorDrift("strain[1]", 1e-5, 1.0, 0.0), "")],
 )
-def test_places_beside_the_wing_are_refused_and_what_changes_in_a_mission_is_no_model(
-    primitive, words, tmp_path
-):
+def test_places_beside_the_wing_and_what_changes_in_a_mission_are_refused(primitive, words, tmp_path):
     write_patch(tmp_path, primitive)
     for lines, belief in (("", FILE), *[(FILE, "")] * ("m" in words.split())):
         loaded = load_scenario(scenario_of(tmp_path, lines, belief=belief))

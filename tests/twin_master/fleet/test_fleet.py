@@ -104,9 +104,7 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
     assert fly_fleet(fleet, cut).shards_flown == 0
 
 
-def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
-    library_file, tmp_path, monkeypatch
-):
+def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_in_vain(library_file, tmp_path, monkeypatch):
     fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
     monkeypatch.setattr("twin_master.fleet.shard.CONNECTING", 0.2)
     with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
@@ -338,9 +336,7 @@ def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
         (Remembering, FmuEndedError("It is over.", time=1.0)),
     ],
 )
-def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_the_others(
-    driven, error, library_file
-):
+def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown(driven, error, library_file):
     knowledge, asset = known("growing_damage", library_file)
     truths, soft = [knowledge.truth(seed) for seed in range(6)], until_soft(asset, error)
     whole = fly_side_by_side(knowledge, truths, [asset] * 6)

@@ -361,9 +361,7 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         asked = grid_of_scenario(loaded, tmp_path / "made", grid, overrides=given)
         given = replace(given, library=sample_library(asked, tmp_path / "l.nc", workers=1).path)
     elif way == "learnt":
-        learnt = (
-            'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100\nstandard_deviation = 30\n'
-        )
+        text = 'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100\nstandard_deviation = 30\n'
         given = replace(given, learnt=written(tmp_path, text))
     known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
     assert ("the observation library is interpolated" in known.draws.source) is (way == "swept")
