@@ -19,11 +19,11 @@ import pytest
 from calibration.result.file import save_calibration
 from calibration.result.record import Calibration
 from tests import command_line
+from tests.conftest import REFERENCE
 from tests.meshes import box
 from tests.refusals import Inputs
 
 ROOT, INPUTS = Path(__file__).parents[1], Inputs(__file__)
-REFERENCE = ROOT.parent / "shared" / "reference"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 BLOCK = re.compile(r"^```(?:\{code-cell\} )?(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
