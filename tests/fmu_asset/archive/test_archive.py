@@ -35,6 +35,13 @@ def test_what_is_wrong_with_a_file_is_one_sentence(fmu, tmp_path, row) -> None:
         read_fmu(archive_of(path, in_utf_16(contents) if "utf_16" in row else contents))
 
 
+def test_a_display_unit_that_is_one_over_the_value_is_none(ours, tmp_path) -> None:
+    inverse = ('<DisplayUnit name="microstrain"', '<DisplayUnit inverse="true" name="microstrain"')
+    changed = edited(ours("fmi3"), tmp_path / "changed.fmu", inverse)
+    shown = [{u.name: u.displays for u in read_fmu(path).units}["1"] for path in (ours("fmi3"), changed)]
+    assert [("microstrain", 1e6, 0.0) in displays for displays in shown] == [True, False]
+
+
 def test_what_is_no_fmu_or_dangerous_is_one_sentence(fmu, tmp_path) -> None:
     """Among them archives that would fill the disk."""
     link, contents, text = tmp_path / "link.fmu", members(fmu), tmp_path / "a.fmu"

@@ -110,11 +110,8 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
 def test_what_was_refused_behind_the_last_turn_is_refused_once_when_it_is_read_again(knowledge, tmp_path):
     path, rejected = tmp_path / "m.csv", tmp_path / "rejected.jsonl"
     path.write_text("turn,strain_1\nno,1\n0,1e-4\nno,2\n1,1e-4\nno,3\n")
-    twin, intake = (
-        knowledge.twin(lag=20),
-        intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario)),
-    )
-    states = [json.dumps(intake.state()) for _ in operate(twin, intake)]
+    intake = intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario))
+    states = [json.dumps(intake.state()) for _ in operate(knowledge.twin(lag=20), intake)]
     whole = rejected.read_text()
     for cut in ("", '{"message": 7, "rea'):  # a kill may leave half a line
         rejected.write_text(whole + cut)
