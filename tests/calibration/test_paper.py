@@ -13,10 +13,7 @@ from scipy.stats import multivariate_normal, norm
 from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
 from calibration.joint.posterior import PUBLISHED_MODES
 from calibration.joint.wing_table import TOTAL_MASS, weighed
-from calibration.paper.load_test import (
-    calibrate_static,
-    particle_filter,
-)
+from calibration.paper.load_test import calibrate_static, particle_filter
 from calibration.paper.procedure import fit_masses
 from calibration.static.errors_in_variables import (
     assess_fit,

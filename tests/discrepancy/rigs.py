@@ -18,7 +18,7 @@ from discrepancy.document import Origin
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
-from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import collect_provenance
@@ -102,19 +102,23 @@ def hiding(
     return chosen(identifier)[0].patch(setting_of(campaign, model), values, place)
 
 
-def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:
-    """A simulated campaign of the single-mass rig."""
-    model = LumpedModel.load(MODEL)
-    outputs = tuple(item.name for item in model.description.output)
-    plan = plan_for(model, outputs, model.description.input[0].name)
+def simulated(
+    model: Model, kind: Any, seed: int, hidden: Any = None, folder: Path | None = None
+) -> Campaign:
+    """Return an example that hides a patch, or an effect by name, values and place; half as long as usual."""
+    plan = plan_of(model)
     plan = replace(plan, duration=0.5 * plan.duration)
-    bare, patch = example_campaign(model, kind, 4, plan), ModelPatch()  # type: ignore[arg-type]
-    if hidden:
-        (effect,) = chosen(hidden)
-        values = {item.name: item.prior.value(0.0) for item in effect.parameters}
-        values[effect.parameters[0].name] = value
-        patch = hiding(bare, model, hidden, values, effect.places(setting_of(bare, model))[0])
-    return example_campaign(model, kind, 4, plan, patch), model  # type: ignore[arg-type]
+    if isinstance(hidden, tuple):
+        hidden = hiding(example_campaign(model, kind, seed, plan), model, *hidden)
+    if folder is not None:
+        return write_example(model, folder, kind, seed, plan, hidden)
+    return example_campaign(model, kind, seed, plan, hidden)
+
+
+def measured(drag: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:
+    """A simulated campaign of the single-mass rig, which may hide a drag."""
+    model, values = LumpedModel.load(MODEL), {"equivalent_damping_ratio": drag}
+    return simulated(model, kind, 4, ("quadratic_damping", values, "slide") if drag else None), model
 
 
 FEW = chosen(
@@ -126,7 +130,7 @@ FEW = chosen(
 @cache
 def drag_found() -> Investigation:
     """Quadratic damping, hidden in ring-downs and static trials of the rig, and found; group `verdict`."""
-    return investigate(*measured("quadratic_damping", 0.01), FEW, seed=3)
+    return investigate(*measured(0.01), FEW, seed=3)
 
 
 # ---------------------------------------------------------------- what is asked of models
