@@ -2,7 +2,7 @@
 
 import shutil
 import tomllib
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -102,9 +102,7 @@ def hiding(
     return chosen(identifier)[0].patch(setting_of(campaign, model), values, place)
 
 
-def simulated(
-    model: Model, kind: Any, seed: int, hidden: Any = None, folder: Path | None = None
-) -> Campaign:
+def simulated(model: Model, kind: Any, seed: int, hidden: Any = None, folder: Path | None = None) -> Campaign:
     """Return an example that hides a patch, or an effect by name, values and place; half as long as usual."""
     plan = plan_of(model)
     plan = replace(plan, duration=0.5 * plan.duration)
@@ -141,7 +139,7 @@ Outputs = dict[str, Quantity] | tuple[tuple[str, Quantity], ...]
 def asked(kind: TrialKind, time: Any, **said: Any) -> Trial:
     """Return a trial at times [s], or of so many samples each 10 ms."""
     stamps = 0.01 * np.arange(time) if isinstance(time, int) else np.asarray(time, dtype=np.float64)
-    return Trial.plain("a trial", kind, said.pop("channels", ()), stamps, **said)
+    return Trial.plain(said.pop("name", "a trial"), kind, said.pop("channels", ()), stamps, **said)
 
 
 def seen(model: Model, what: Trial, outputs: Outputs, *items: Primitive, **given: Any) -> FloatArray:
@@ -165,3 +163,20 @@ def integrated(rate: Any, time: FloatArray, first: Any, parts: bool = False, **o
         moved = solve_ivp(rate, (time[k], time[k + 1]), states[-1], args=(k,), **limits)
         states.append(moved.y[:, -1])
     return np.array(states)
+
+
+def same(one: Any, other: Any, rtol: float = 0.0) -> bool:
+    """Compare records to the last bit in all they hold, or to rounding but for what files do not keep."""
+    if is_dataclass(one):
+        kept = [item.name for item in fields(one) if not rtol or (item.compare and item.name != "data_hash")]
+        return all(same(getattr(one, name), getattr(other, name), rtol) for name in kept)
+    if isinstance(one, dict):
+        return list(one) == list(other) and same(tuple(one.values()), tuple(other.values()), rtol)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(same(*pair, rtol) for pair in zip(one, other, strict=True))
+    if isinstance(one, np.ndarray | float):
+        first, second = np.asarray(one), np.asarray(other)
+        largest = np.abs(first).max(initial=0.0, where=np.isfinite(first)) if rtol else 0.0
+        alike = (first.dtype, first.shape) == (second.dtype, second.shape)
+        return alike and np.allclose(first, second, rtol=rtol, atol=rtol * largest, equal_nan=True)
+    return bool(one == other)

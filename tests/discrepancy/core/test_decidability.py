@@ -22,14 +22,7 @@ from discrepancy.judgement.next_experiment import (
 )
 from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
 from discrepancy.report.text import group_lines
-from discrepancy.self_calibration import (
-    NOTHING,
-    Simulator,
-    outcome_of,
-    self_calibrate,
-    wilson,
-    write_self_calibration,
-)
+from discrepancy.self_calibration import Simulator, outcome_of, self_calibrate, wilson, write_self_calibration
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import FEW, ORIGIN, measured, model_of
@@ -244,8 +237,8 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
 @pytest.mark.parametrize(
     ("hidden", "kind", "named", "group", "outcome"),
     [
-        (NOTHING, VerdictKind.NOTHING_MISSING, (), (), "right"),
-        (NOTHING, VerdictKind.NAMED, ("a",), (), "wrong"),
+        ("nothing", VerdictKind.NOTHING_MISSING, (), (), "right"),
+        ("nothing", VerdictKind.NAMED, ("a",), (), "wrong"),
         ("a", VerdictKind.NAMED, ("a",), (), "right"),
         ("a", VerdictKind.NAMED, ("b",), (), "wrong"),
         ("a", VerdictKind.NAMED, ("a", "b"), (), "wrong"),
@@ -297,8 +290,8 @@ def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     steps = []
     found = self_calibrate(campaign, model, FEW, 6, seed=2, workers=1, advance=lambda: steps.append(1))
     assert len(steps) == len(found.cases) == 6
-    assert [case.hidden == NOTHING for case in found.cases] == [True, False, False] * 2
-    assert all(case.distance >= 25.0 for case in found.cases if case.hidden != NOTHING)
+    assert [case.hidden == "nothing" for case in found.cases] == [True, False, False] * 2
+    assert all(case.distance >= 25.0 for case in found.cases if case.hidden != "nothing")
     assert sum(found.confusion()[2].ravel()) == 6
     assert found.share("right", null=True).total == 2
     none, square = wilson(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)

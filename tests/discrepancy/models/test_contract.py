@@ -21,15 +21,7 @@ from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.models.system_model import State, SystemModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import (
-    PRIMITIVES,
-    FreePlay,
-    LoadGain,
-    LoadPlace,
-    PointMass,
-    PowerDamping,
-    PowerStiffness,
-)
+from fe.runtime.patch import PRIMITIVES, FreePlay, LoadPlace, PointMass, PowerDamping, PowerStiffness
 from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, seen
 from tests.refusals import refused
 
@@ -121,7 +113,7 @@ def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> 
 def test_what_changes_nothing_changes_no_bit(kind: Kind, how: TrialKind) -> None:
     what = kind.trial(how, **({"force": np.linspace(0.0, 5.0, 9)} if how is TrialKind.STATIC else {}))
     once = kind.seen(what)
-    for items in ((), (patch.SensorGain("*", 0.5),), (LoadGain(0.0, 0.0),)):
+    for items in ((), (patch.SensorGain("*", 0.5),), (patch.LoadGain(0.0, 0.0),)):
         assert np.array_equal(kind.seen(what, *items), once)
     if isinstance(kind.model, LumpedModel | WingModel):
         assert np.array_equal(kind.seen(what, PointMass(0.0, 0.3)), once)
