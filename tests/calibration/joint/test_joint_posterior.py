@@ -103,10 +103,7 @@ def test_enumeration_finds_mean_and_deviation():
 
 
 SHARP = modes(frequency_1=0.001, frequency_2=0.03)
-
-
 SOFT = replace(STATIC, displacement=STATIC.displacement * 0.7)
-
 OVERDAMPED = modal_readings((5.6492, 29.9699, 0.01, 0.3), (0.06, 0.3, 1e-4, 1e-3))
 
 

@@ -146,25 +146,19 @@ def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range():
 HALF = np.array([0.5, 0.5])
 
 
-def one_reading(shift):
-    """One reading of unit noise; two hypotheses: nothing, or an offset of `shift` noise deviations."""
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("weight", [0.5, 0.2])
+def test_information_of_one_reading_against_quadrature(shift, weight):
+    """Of unit noise; two hypotheses: nothing, or an offset of `shift` noise deviations."""
     channel = Channel("y1", Quantity.DISPLACEMENT, "y1", kit.NOISE)
     trial = kit.blank_trial("one", TrialKind.STATIC, ("y1",), np.array([1.0]))
     trial = replace(trial, values=np.full((1, 1), 1.5))
     tight = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
     problem = kit.problem_of(Campaign("", {"y1": channel}, (trial,), None, tight, ""), kit.ClosedForm())
-    none = kit.fitted(problem)
-    other = kit.fitted(problem, Term(kit.offset_effect(deviation=0.02), "y1"))
+    none, other = kit.fitted(problem), kit.fitted(problem, Term(kit.offset_effect(deviation=0.02), "y1"))
     point = replace(none.point, effect=np.array([shift]))
-    known = replace(other, point=point, covariance=np.diag([1.0, 1.0, 1e-12]))
-    return problem, Proposal(trial, "", "", 1.0), [none, known]
-
-
-@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 4.0])
-@pytest.mark.parametrize("weight", [0.5, 0.2])
-def test_information_of_one_reading_against_quadrature(shift, weight):
-    problem, proposal, fits = one_reading(shift)
-    weights = np.array([weight, 1.0 - weight])
+    fits = [none, replace(other, point=point, covariance=np.diag([1.0, 1.0, 1e-12]))]
+    proposal, weights = Proposal(trial, "", "", 1.0), np.array([weight, 1.0 - weight])
     got = mutual_information(problem, proposal, fits, weights)
 
     def density(y):

@@ -78,16 +78,6 @@ def available(problem):
     return [item for item in library() if item.unavailable(problem.setting) is None]
 
 
-def show(problem, gain=1.0):
-    """Give a campaign the model's own response, times a gain, and noise alone as its readings."""
-    random = np.random.default_rng(8)
-    start = problem.start(Candidate())
-    for number, data in enumerate(problem.trials):
-        bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
-        response = gain * problem.prediction(number, start, bare)
-        data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
-
-
 def blind(folder, number, seed=1, samples=64):
     """Write a campaign of the blind rigs, shorter than theirs, and return it with its model."""
     folder = folder / "campaign"
@@ -180,8 +170,12 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
 @pytest.mark.parametrize("gain", [1.0, 1.05])
 def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
     """The same campaign with the model's own response and noise alone as its readings; a gain is no law."""
-    problem = blind(tmp_path, CART)
-    show(problem, gain)
+    problem, random = blind(tmp_path, CART), np.random.default_rng(8)
+    start = problem.start(Candidate())
+    for number, data in enumerate(problem.trials):
+        bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
+        response = gain * problem.prediction(number, start, bare)
+        data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
     search = ForceSearch(problem)
     assert gain != 1.0 or missing_force(search, search.whole) is None
     found = investigate(problem.campaign, problem.model, FEW)
