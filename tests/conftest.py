@@ -332,7 +332,7 @@ def heat_exchanger(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def foreign_fmu(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Build FMUs of other conventions and misbehaviours from C: `foreign_fmu("ball2")` is a path."""
-    from tests.fmu_asset.foreign.workshop import Workshop
+    from tests.fmu_asset.making import Workshop
 
     return Workshop(tmp_path_factory.mktemp("foreign"))
 

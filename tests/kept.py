@@ -105,22 +105,6 @@ def exported(script: Path) -> Path:
     return packed(path, pack, (script,), None)
 
 
-def kept_folder(
-    folder: Path, fill: Callable[[], _Made], places: tuple[Path, ...], inputs: object = None
-) -> _Made:
-    """Return what `fill` returns, which fills a folder unless that is kept; parameters as of `kept`."""
-
-    def filled() -> tuple[_Made, dict[str, bytes]]:
-        told, files = fill(), (path for path in folder.rglob("*") if path.is_file())
-        return told, {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
-
-    told, files = kept(folder.name, filled, places, inputs)
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-    return told
-
-
 def compiled_wing(model: ReducedModel, path: Path, **options: Any) -> Path:
     """Return the compiled FMU of a wing or structure, packed with further options of `build_fmu`."""
     options = {"kind": "compiled", **options}

@@ -89,8 +89,10 @@ class Court:
 
     @cached_property
     def _noise(self) -> Mapping[str, float]:
-        levels = noise_levels(self.problem, self.found.best())
-        return dict(zip(self.problem.channel_names, levels.tolist(), strict=True))
+        """Deviation of each channel's noise over that beside which residuals of the model as it is stand."""
+        known, left = self.problem.freedom > 0.0, self.problem.precisions(self.found.none.sums)
+        levels = np.where(known, 1.0, left * noise_levels(self.problem, self.found.best()))
+        return dict(zip(self.problem.channel_names, np.sqrt(levels).tolist(), strict=True))
 
     def share_of(self, item: Any, *, held_out: bool) -> Share:
         """Return the share of the gap that a hypothesis closes; sizes are over the noise."""
@@ -98,13 +100,12 @@ class Court:
         pairs = zip(*([i for i in one.trials if i.trial.held_out is held_out] for one in sets), strict=True)
         rows, trials = [], 0
         for first, second in pairs:
-            scale = np.array([self._noise[name] for name in first.trial.channels])
+            noise = first.noise_deviation * [self._noise[name] for name in first.trial.channels]
             count, trials = len(first.used), trials + 1
             blocks = min(WINDOWS, max(1, count // SHORTEST)) if first.trial.is_dynamic else 1
-            squares = [np.where(one.used, one.standardised, 0.0) ** 2 for one in (first, second)]
+            squares = [np.where(one.used, one.residual / noise, 0.0) ** 2 for one in (first, second)]
             for part in np.array_split(np.arange(count), blocks):
-                level = float((first.used[part] * scale).sum())
-                rows.append((float(squares[0][part].sum()), float(squares[1][part].sum()), level))
+                rows.append([float(one[part].sum()) for one in (*squares, first.used)])
         before, after, noise = np.array(rows).T
         left, whole = (float(np.sqrt(max(one.sum() / noise.sum() - 1.0, 0.0))) for one in (after, before))
         return Share(before, after, noise, held_out, trials, left, whole, OF_READINGS, tested=True)

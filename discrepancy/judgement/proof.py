@@ -160,7 +160,8 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
     sums, counts, within = [], [], 0.0
     for first, second in zip(before.trials, after.trials, strict=True):
         use = first.used
-        gain = np.where(use, log_density(second) - log_density(first), 0.0)
+        finer = np.log(first.noise_deviation / second.noise_deviation)  # where no noise is recorded
+        gain = np.where(use, log_density(second) - log_density(first) + finer, 0.0)
         sums.append(float(gain.sum()))
         counts.append(int(use.sum()))
         within += _variance_within(gain.sum(axis=1))
@@ -241,7 +242,7 @@ def prove(before: ResidualSet, after: ResidualSet, *, seed: int = 0) -> Proof:
     Parameters
     ----------
     before, after : ResidualSet
-        The same trials and samples; noise deviations are alike.
+        The same trials and samples.
     seed : int
         As of `scores`.
 

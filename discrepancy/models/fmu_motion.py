@@ -19,7 +19,7 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace, state_motion
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import ALIKE, Boundaries, Laws, static_solution, steps_under
+from fe.runtime.motion import ALIKE, Boundaries, Laws, StaticSolution, static_solution, steps_under
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.motion_arrays import State as Moving
 from fmu_asset.door.runs import Run, State
@@ -70,8 +70,20 @@ class FmuMotion(FmuPace):
         if not even:  # as many lengths of steps as stamps would take long
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
         loads = [] if case.course is None else [Load(case.lever, case.course)]
-        acting, start = Acting(trial.time, stamps, loads), self._start(system, case, amounts)
-        found = state_motion(system, acting, start, laws, seen, numbers, still[seen], refinement)
+        acting, start, memory = Acting(trial.time, stamps, loads), self._start(system, case, amounts), None
+        if len(laws) and case.course is not None:  # it has settled under the first force
+            first, gain = float(case.course.values[0]) * case.lever, system.gain
+
+            def acts(pulls: FloatArray) -> FloatArray:
+                return np.asarray(first - np.bincount(numbers, pulls[0], len(first)))
+
+            def asked(pulls: FloatArray) -> FloatArray:
+                return (still + gain @ acts(pulls))[None]
+
+            rest = self._with_laws(laws, asked, gain[np.ix_(seen, numbers)], trial.name)[1]
+            start, memory = system.at_rest(acts(rest.forces)), rest.memory
+        law = seen, numbers, still[seen], refinement, memory
+        found = state_motion(system, acting, start, laws, *law)
         (states, forces), (rows, at_once) = found, system.rows(columns, orders)
         values = states @ rows.T + forces @ at_once.T + np.where(derived, 0.0, still[columns])
         if case.starts:  # the force that holds it until then may be seen at once
@@ -98,7 +110,7 @@ class FmuMotion(FmuPace):
             run = self._run(case._replace(step=step, record=ceil(end / step - 1e-6)), amounts)
             if len(laws):
                 with np.errstate(all="ignore"):  # an unstable coupling grows beyond all numbers
-                    return self._beside(run, laws)
+                    return self._beside(run, laws, trial.name)
             given = (values.tobytes() for values in run.courses.values())
             return self.remembered((*run[:3], *run.begin.items(), *given), lambda: self.followed(run))
 
@@ -110,8 +122,28 @@ class FmuMotion(FmuPace):
         parts *= refinement
         return moved(parts)[:, columns], fixed or whole / parts
 
-    def _beside(self, run: Run, laws: Laws) -> FloatArray:
+    def _begun(self, run: Run, laws: Laws, trial: str) -> tuple[Run, FloatArray | None]:
+        """Return a run that has settled with laws under its first loads, and the memory of these."""
+        at = np.array([self.x[self.ports.index(name)] for name in laws.ports])
+
+        def under(pulls: FloatArray) -> Run:
+            begin = self._less({name: np.full(1, value) for name, value in run.begin.items()}, laws, pulls)
+            return run._replace(begin={name: float(values[0]) for name, values in begin.items()})
+
+        def asked(pulls: FloatArray) -> FloatArray:
+            return self.begun(under(pulls))[1][None]
+
+        free = asked(np.zeros((1, len(laws))))
+        if not run.courses or not free[0, at].any():
+            return run, None
+        sizes = np.diag([self.size(self.forces[self.ports.index(name)]) for name in laws.ports])
+        moved = np.array([free[0, at] - asked(size[None])[0, at] for size in sizes])
+        rest = self._with_laws(laws, asked, moved.T / np.diag(sizes), trial, free)[1]
+        return under(rest.forces), rest.memory
+
+    def _beside(self, run: Run, laws: Laws, trial: str) -> FloatArray:
         """Return the outputs (K, C) of a run with laws at the ports."""
+        run, memory = self._begun(run, laws, trial)
         at = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
         ports, names, x, v = zip(
             *((self.ports[port], self.forces[port], self.x[port], self.v[port]) for port in at), strict=True
@@ -136,7 +168,7 @@ class FmuMotion(FmuPace):
         )  # fmt: skip
         rows, rigid = laws.rows(modal.ports, count), np.zeros(len(laws))
         given = tuple(laws.at(rows, laws.rows(modal.actions, count), rigid, 0.0, go.transition))
-        moving = Moving(np.zeros(count), np.zeros(count), laws.memory())
+        moving = Moving(np.zeros(count), np.zeros(count), laws.memory() if memory is None else memory)
         (q, v_end), (pulls, lagged) = np.zeros((2, 2, count)), np.zeros((2, 2, len(laws)))
         out = ModalMotion(q, v_end, pulls, lagged, moving.memory)
         before, taken = 2.0 * free[0, v] - free[1, v], np.zeros(count)
@@ -150,7 +182,7 @@ class FmuMotion(FmuPace):
             go.push[:] = np.concatenate((0.5 * h * h * push, h * push))
             go.begin[:] = go.end[:] = push
             compiled_kernel().integrate(
-                tuple(go), 0, 1, 0, True, number > 0, given, tuple(moving), tuple(out)
+                tuple(go), 0, 1, 0, True, memory is not None or number > 0, given, tuple(moving), tuple(out)
             )
             before, taken = speed, speed + h * push - moving.v
             row[pushed] -= np.linalg.solve(gain, taken)
@@ -258,19 +290,49 @@ class FmuMotion(FmuPace):
         if not len(laws):
             return values
         at = [self.ports.index(name) for name in laws.ports]
-        columns, compliance = [self.x[port] for port in at], self.flexibility(states[0])[np.ix_(at, at)]
+        compliance = self.flexibility(states[0])[np.ix_(at, at)]
+        return self._with_laws(
+            laws, lambda pulls: self.rest(states, self._less(loads, laws, pulls)), compliance, trial, values
+        )[0]
+
+    def _less(self, loads: Mapping[str, FloatArray], laws: Laws, pulls: FloatArray) -> dict[str, FloatArray]:
+        """Return loads less the forces (L, J) of laws, by input."""
+        given = dict(loads)
+        for name, pull in zip(laws.ports, pulls.T, strict=True):
+            force = self.forces[self.ports.index(name)]
+            given[force] = given.get(force, 0.0) - pull
+        return given
+
+    def _with_laws(
+        self, laws: Laws, asked: Callable[[FloatArray], FloatArray], compliance: FloatArray, trial: str,
+        values: FloatArray | None = None,
+    ) -> tuple[FloatArray, StaticSolution]:  # fmt: skip
+        """Return the outputs (L, C) at rest with laws, and what these do then.
+
+        Parameters
+        ----------
+        laws : Laws
+            J of them.
+        asked : callable
+            Forces (L, J) of the laws to outputs at rest.
+        compliance : (J, J) ndarray
+            Displacements of their ports under unit forces at each.
+        trial : str
+            Where.
+        values : (L, C) ndarray, optional
+            Outputs without laws, where they are known.
+        """
+        columns = [self.x[self.ports.index(name)] for name in laws.ports]
+        values = asked(np.zeros((1, len(laws)))) if values is None else values
         linear = values[:, columns]
         for _ in range(STATIC_ITERATIONS):
-            forces = static_solution(laws, linear, compliance, kernel=compiled_kernel()).forces
-            given = dict(loads)
-            for port, pull in zip(at, forces.T, strict=True):
-                given[self.forces[port]] = given.get(self.forces[port], 0.0) - pull
-            values = self.rest(states, given)
+            rest = static_solution(laws, linear, compliance, kernel=compiled_kernel())
+            values = asked(rest.forces)
             # where the FMU is not linear, the law is solved again about the points that were reached
-            again = values[:, columns] + forces @ compliance.T
+            again = values[:, columns] + rest.forces @ compliance.T
             change, linear = np.abs(again - linear).max(axis=1), again
             if np.all(change <= STATIC_TOLERANCE * np.maximum(np.abs(again).max(axis=1), 1e-300)):
-                return values
+                return values, rest
         names, level = ", ".join(dict.fromkeys(laws.ports)), int(np.argmax(change)) + 1
         raise ModelError(
             said("models.too_strong", at=names, model=self, level=level, trial=trial, most=STATIC_ITERATIONS)

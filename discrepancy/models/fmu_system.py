@@ -86,6 +86,7 @@ class Case(NamedTuple):
 def state_motion(
     system: StateSpace, acting: Acting, start: FloatArray, laws: Laws = NO_LAWS, columns: IntArray = NONE,
     numbers: IntArray = NONE, still: FloatArray = NONE, refinement: int = 1,
+    memory: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Return states (N, n) and forces (N, E) of a system at the times of what acts, with laws at ports.
 
@@ -108,6 +109,8 @@ def state_motion(
         Position of each law's port without forces.
     refinement : int
         Steps with laws are this many times smaller.
+    memory : ndarray, optional
+        Of the laws at the first time; by default loaded from zero at once.
     """
     acts, modal, law = _with_ports(system, laws.ports, tuple(columns.tolist()), tuple(numbers.tolist()))
     smooth = any(course.hold is Hold.SMOOTH for _, course, _ in acting.loads)
@@ -117,8 +120,8 @@ def state_motion(
     feed, seen = acting.load_at(boundaries.time, system.direct[columns].T), system.outputs[columns[law]]
     first = Begin(
         np.concatenate((seen @ start + still[law], 0.0 * start)),
-        np.concatenate((seen @ system.generator @ start, start)),
-    )
+        np.concatenate((seen @ system.generator @ start, start)), memory,
+    )  # fmt: skip
     found = advance(modal, laws, steps_under(modal, boundaries, begin, end, feed), first, compiled_kernel())
     forces = acting.load_at(acting.sampled, np.eye(system.push.shape[1]))
     np.subtract.at(forces.T, numbers, found.port_forces.T)

@@ -221,16 +221,18 @@ def _released(system: LinearSystem, acting: Acting, laws: Laws) -> tuple[Begin, 
     given = np.zeros((len(w), 2))
     given[: len(acting.initial)] = acting.initial[: len(w)]
     unit, size = release.displacement / safe, release.displacement
+    load = acting.load_at(acting.time[:1], np.eye(len(system.mass)))
     if not release.at_rest:
-        return Begin(given[:, 0] * unit, given[:, 1] * unit * w), None
+        rest = (load @ system.shapes)[0] / w**2 if load.any() else 0.0
+        return Begin(given[:, 0] * unit + rest, given[:, 1] * unit * w), None
     answer, deviation = system.flexibility(row), given[:, 0] * unit
     deviation[0], compliance = 0.0, float(row @ answer)
     holding = size * (1.0 + given[0, 0]) / compliance
-    memory, acts = system.static(holding * row[None], laws, fixed=row, time=0.0)[1], holding * row
+    memory, acts = system.static(holding * row + load, laws, fixed=row, time=0.0)[1], holding * row + load[0]
     if memory is not None:
         rows = system.port_rows(laws, 0.0)
         holding += float(rows @ answer @ memory[:, LAGGED]) / compliance
-        acts = holding * row - memory[:, LAGGED] @ rows
+        acts = holding * row + load[0] - memory[:, LAGGED] @ rows
         if system.truncated:  # of the port's position, fades after the release
             memory[:, FADING] = holding * (rows @ system.residual(row))
     return Begin(acts @ system.shapes / w**2 + deviation, np.zeros(len(w)), memory), holding * row

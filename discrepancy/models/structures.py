@@ -111,16 +111,8 @@ class StructureModel(SystemModel):
         return self._pull(state, none | {control: 1.0}) - self._pull(state, none)
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
-        """Return what outputs show.
-
-        Loads that always act shift what a motion shows.
-        """
-        found = [Shown.of(self._rows[output], quantity.order) for output, quantity in outputs]
-        always = self._always(case.state)
-        if acting is None or not always.any():
-            return found
-        still = self.system(case.state).flexibility(always)
-        return [item._replace(constant=float(item.rows[0] @ still)) for item in found]
+        """Return what outputs show."""
+        return [Shown.of(self._rows[output], quantity.order) for output, quantity in outputs]
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
@@ -141,17 +133,14 @@ class StructureModel(SystemModel):
         """Return the load (1, n) of the load factor."""
         return self._load(state, LOAD_FACTOR)[None]
 
-    def _always(self, state: State) -> FloatArray:
-        """Return the load (n,) of constant loads and of controls that no trial records."""
+    def acting(self, case: Case) -> Acting:
+        """Return what acts in a trial, with constant loads and controls that no trial records."""
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
-        return self._pull(state, recorded)
-
-    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
-        """Return loads in a trial; in motion what always acts is in what is shown."""
-        (loads, drives), trial = super().pushes(case), case.trial
-        if not trial.is_dynamic:
-            loads.append(Load(self._always(case.state), Course(trial.time, np.ones(len(trial.time)))))
-        return loads, drives
+        acting, always = super().acting(case), self._pull(case.state, recorded)
+        if not always.any():
+            return acting
+        steady = Load(always, Course(acting.time, np.ones(len(acting.time))))
+        return replace(acting, loads=(*acting.loads, steady))
 
     def made(self, state: State) -> LinearSystem:
         """Return the structure in a state, in the coordinates of `ReducedModel.at`.

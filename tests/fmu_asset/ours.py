@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from threadpoolctl import threadpool_limits
 
-from fe.reduction import patch_basis
 from fe.reduction.model_cache import build_patch_arrays
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.reduced import ReducedModel
@@ -26,7 +25,6 @@ from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
-from tests.conftest import BEAM
 from tests.fmu_asset.making import tables
 from tests.kept import FE, ROOT, compiled_wing, exported, kept
 
@@ -54,15 +52,8 @@ def wing_model(name: str = "wing") -> ReducedModel:
 
 @cache
 def wing_arrays() -> PatchArrays:
-    """Return the wing for patches, in few vectors: what they hold is the same on both sides of a test."""
-
-    def few() -> PatchArrays:
-        with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
-            patch.setattr(patch_basis, "VECTORS", 60)
-            patch.setattr(patch_basis, "STATES", 40)
-            return build_patch_arrays(DESIGNS["wing"])
-
-    return kept("few-patches", few, FE)
+    """Return that wing for patches."""
+    return kept("coarse-patches", lambda: build_patch_arrays(DESIGNS["wing"]), FE, DESIGNS["wing"].hash)
 
 
 class OurFmus:
@@ -99,7 +90,7 @@ class OurFmus:
         which = STRUCTURES[name]["model"]
         if which in DESIGNS:
             return wing_model(which)
-        return kept("beam", lambda: self._fixture("beam_reduction").model, FE, BEAM)
+        return self._fixture("beam_reduction").model
 
     def options(self, name: str) -> dict[str, Any]:
         """Return the options of `build_fmu` for a structure's FMU."""

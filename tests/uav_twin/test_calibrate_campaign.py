@@ -14,7 +14,7 @@ from fmu_asset.packing.contents import build_script_fmu
 from scenarios import asset_scripts, binding_files
 from tests.command_line import refused, said
 from tests.refusals import Inputs
-from tests.twin_master.runs import changed_scenario, edited
+from tests.twin_master.runs import changed_scenario, edited, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from uav_twin import FmiAsset, fly, load_calibration, open_run
@@ -142,12 +142,19 @@ def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench, tmp_path):
         wanted = pump.step({"speed": 1800.0, "pressure": 180.0}).values
     np.testing.assert_allclose(tree["truth"]["operation"].values[0], wanted, rtol=1e-6)
 
-    other = replace(found, priors=(replace(found.priors[0], high=9.0),), samples=found.samples + 0.25)
-    (tmp_path / "other.nc").write_bytes(result_bytes(other))  # of a pump that takes thicker oil
-    resolved = resolve_scenario(scenario, Overrides(calibration=tmp_path / "other.nc"))
-    wrong = r"range of 'viscosity_factor', 0\.8 to 1\.2.* calibration has"
-    with pytest.raises(MissionInputError, match=wrong):
-        asset_source(resolved).check()
+    (prior,), binding = found.priors, (binding_files()["gear_pump"]).read_text()
+    shares = written(tmp_path, binding, ('variable = "wear"\nunit = "1"', 'variable = "wear"\nunit = "%"'))
+    for changes, own, wrong in (  # of a pump that takes thicker oil, and one that was told otherwise
+        ({"high": 9.0}, {}, r"range of 'viscosity_factor', 0\.8 to 1\.2.* calibration has"),
+        ({"unit": "%"}, {}, r"the parameter viscosity_factor in 1, and `calibration.file` .* says %"),
+        ({}, {"binding": shares}, "the state wear in %, and `state.unit` of the scenario says 1"),
+    ):
+        samples = found.samples + 0.25 * ("high" in changes)
+        other = replace(found, priors=(replace(prior, **changes),), samples=samples)
+        (tmp_path / "other.nc").write_bytes(result_bytes(other))
+        resolved = resolve_scenario(scenario, Overrides(calibration=tmp_path / "other.nc", **own))
+        with pytest.raises(MissionInputError, match=wrong):
+            asset_source(resolved).check()
 
 
 def test_what_an_fmu_does_not_have_is_one_sentence(bench):

@@ -16,6 +16,7 @@ from reporting.arrays import Float
 from reporting.files import hash_file
 from reporting.progress import Progress
 from reporting.toml_file import Fault, Number, Positive
+from reporting.units import meaning_of
 from twin_master.assets.asset_source import (
     BINDING_COPY,
     FLOWN_DESIGN_HASH,
@@ -217,7 +218,7 @@ class FmuSource(AssetSource):
             Binding, FMU, script, design or structure is wrong, or the binding does not fit the FMU.
         """
         scenario, section = self._scenario, self.section
-        read_calibration(scenario.calibration)
+        found = read_calibration(scenario.calibration)
         self.files()
         binding = self.binding()
         parameters = [*binding.parameter, *self._check_calibration(binding)]
@@ -239,6 +240,14 @@ class FmuSource(AssetSource):
             raise MissionInputError(said("assets.calibrated", error=error, own=", ".join(own))) from error
         self._observed(binding)
         self._inner_roles(binding)
+        told = scenario.truth.state
+        for factor in scenario.state:
+            of = binding.monitor[told[factor.name]] if told else binding.health[factor.name]
+            _check_unit(binding, f"the state {factor.name}", of.unit, "state.unit", factor.unit)
+        for prior in found.priors if found is not None and found.design is None else ():
+            if prior.name in binding.parameter:
+                unit = binding.parameter[prior.name].unit
+                _check_unit(binding, f"the parameter {prior.name}", unit, "calibration.file", prior.unit)
 
     def _check_calibration(self, binding: Binding) -> tuple[str, ...]:
         """Check the calibration; return what parameters there are beside those of the binding."""
@@ -284,9 +293,7 @@ class FmuSource(AssetSource):
         chosen = self._slice(binding, role)
         bound, given = binding.observation[role].units, self._scenario.observation.sensor_units
         for number, (there, here) in enumerate(zip(bound, given, strict=True), 1):
-            if there != here != "1":
-                which, units = f"value {number} of `{role}`", (there, here)
-                raise MissionInputError(said("assets.unit", binding=binding, which=which, units=units))
+            _check_unit(binding, f"value {number} of `{role}`", there, "observation.unit", here)
         return chosen
 
     def _slice(self, binding: Binding, role: str) -> slice:
@@ -350,6 +357,17 @@ class FmuSource(AssetSource):
             session.close()
             raise
         return FmuAsset(session, chosen, self.section.load, inner)
+
+
+def _check_unit(binding: Binding, which: str, there: str, key: str, here: str) -> None:
+    """Refuse another unit in a scenario than in a binding; "1" is of any dimension, but not a percentage."""
+    if there == here:
+        return  # pint takes a third of a second to load
+    meant = meaning_of(there)
+    share = meant is not None and not any(meant.exponents) and meant.factor != 1.0
+    if here != "1" or share:
+        units = there, here
+        raise MissionInputError(said("assets.unit", binding=binding, which=which, units=units, key=key))
 
 
 class ScriptSource(FmuSource):

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 
 FIELD_NAME = "structure.vtu"
+UNITS = {"strain": "1", "displacement": "m", "frequency": "Hz"}
+"""Of what a reduced model shows, by role."""
 
 
 class NamedStructure(AssetSource):
@@ -149,6 +151,10 @@ class NamedStructure(AssetSource):
                 raise MissionInputError(said("assets.modes", most=most, number=number))
         advice = self.advice["state"] or f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], advice=advice)
+        if modes is None and (came := sorted({*observation.sensor_units} - {"1", UNITS[role]})):
+            raise MissionInputError(
+                said("assets.own_unit", where=where, role=role, own=UNITS[role], came=came)
+            )
         if observation.count != known[role]:
             both = {"has": known[role], "count": observation.count}
             raise MissionInputError(said("assets.sensors", where=where, role=role, **both))
@@ -371,7 +377,7 @@ class RecordedStructure(Asset):
         assert scenario.truth.record is not None
         self._scenario, self._model = scenario, model
         self._section, self._record = scenario.observation.modes, scenario.truth.record
-        bound = binding.with_header(step_size=1.0 / self._record.sampling_rate)
+        bound = binding.with_header(step_size=1.0 / self._record.sampling_rate, decimation=1)
         self._parameters = {**parameters, "response": 2.0}
         self._session = session(bound, self._parameters)
         begin, names = bound.observation_slice("acceleration").start, self._section.accelerometers

@@ -46,15 +46,19 @@ class Expected:
 
 
 def expected_of(
-    sensor_model: GaussianSensorModel, rewards: RewardModel, joint: Float, observed: Float | None,
+    sensor_model: GaussianSensorModel, rewards: RewardModel, joint: Float, rows: Float | None,
     *, quantiles: bool = True,
 ) -> Expected:  # fmt: skip
-    """Return what beliefs (..., S, U) say where nothing is learnt; without quantiles those are NaN."""
+    """Return what beliefs (..., S, U) say where nothing is learnt; without quantiles those are NaN.
+
+    Rows that were observed are (..., G + I); None where they are predicted.
+    """
     mean, deviation = sensor_model.moments(joint)
     lower = upper = np.full_like(mean, np.nan)
     if quantiles:
         lower, upper = np.moveaxis(sensor_model.quantiles(joint, _LEVELS), -2, 0)
-    noise = sensor_model.noise(joint)
+    observed = None if rows is None else rows[..., : sensor_model.sensor_count]
+    noise = sensor_model.noise(joint, rows)
     return Expected(mean, deviation, lower, upper, noise, *rewards.expectation(joint, observed))
 
 

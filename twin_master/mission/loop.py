@@ -104,16 +104,16 @@ def expected_in(turns: History, knowledge: Knowledge, name: str, belief: Float) 
     belief : (T, S), or (T, H, S) where it is predicted
         Of that name.
     """
-    learns, seen, more = knowledge.expectation, None, tuple[Any, ...]()
+    learns, rows, more = knowledge.expectation, None, tuple[Any, ...]()
     if name == "predicted":
         asked = knowledge.asked(turns.unexplained)
         joint = belief[..., None] * asked[:, None]  # (T, H, S, U), eqs. (37)-(39)
         belief, more = turns.filtered, (asked, belief.shape[1])
     else:
-        seen = turns.observed
-        joint, more = known_control(belief, turns.control_index, len(knowledge.model.controls)), (seen,)
+        rows, more = turns.row, (turns.observed,)
+        joint = known_control(belief, turns.control_index, len(knowledge.model.controls))
     if learns is None:
-        expected = expected_of(knowledge.sensor_model, knowledge.rewards, joint, seen)
+        expected = expected_of(knowledge.sensor_model, knowledge.rewards, joint, rows)
     else:
         carried = [turn.concluded.carried for turn in turns.turns]
         expected = getattr(learns, name)(carried, belief, *more)

@@ -34,6 +34,12 @@ class IdentifiedSensorModel(GaussianSensorModel):
         rows = np.asarray(observation, dtype=np.float64)
         return rows, np.zeros((*rows.shape[:-1], self.state_count))
 
+    def noise(self, joint: ArrayLike, rows: Float | None = None) -> Float:
+        """Return the standard deviation of sensors, that of what was identified among it; see there."""
+        assumed, place = super().noise(joint), np.cumsum(np.arange(self.sensor_count) + 1) - 1
+        told = np.zeros(1) if rows is None else np.nan_to_num(rows[..., self.sensor_count + place])
+        return np.asarray(np.sqrt(assumed**2 + told))
+
     def _densities(self, observations: ArrayLike, control_index: ArrayLike, draws: int) -> Float:
         """Return log densities (T, S, E) of each draw, or of their average where `draws` is one.
 

@@ -315,10 +315,11 @@ class GaussianSensorModel(QuantityModel):
         order = np.argsort(-distance[best])[:_WORST_SHOWN]
         return {f"sensor {index + 1}": float(residual[best, index]) for index in order}
 
-    def noise(self, joint: ArrayLike) -> Float:
+    def noise(self, joint: ArrayLike, _rows: Float | None = None) -> Float:
         """Return the standard deviation (..., G) of what beliefs (..., S, U) leave unsaid of a sensor, SI.
 
-        It is noise, model error, and what a sensor changes by within the interval of a state.
+        It is noise, model error, what a sensor changes by within the interval of a state, and what rows that
+        were observed (..., G + I) say of their own.
         """
         return np.asarray(
             np.sqrt(np.tensordot(self.weights(joint), self.total_standard_deviation**2, axes=2))

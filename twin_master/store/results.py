@@ -113,6 +113,8 @@ def _observed(result: MissionResult) -> Iterator[Entry]:
     flight, scenario = result.flight, result.scenario
     yield "{role}", flight.observed, {}
     yield "control_index", flight.control_index, {}
+    if scenario.observation.modes is not None:
+        yield "{role}_covariance", flight.readings, {}
     for place, (_, state, name, _) in enumerate(scenario.readings):
         words = {"reading": name, "unit": scenario.state[state].unit}
         yield "{reading}", flight.readings[:, place], words

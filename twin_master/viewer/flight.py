@@ -223,12 +223,11 @@ class Flight:
         filtered = np.array([turn["filtered"] for turn in turns])
         controls = [turn["control_index"] for turn in turns]
         joint = known_control(filtered, controls, len(known.model.controls))
-        observed, learns = self.observed(turns), known.expectation
-        if learns is None:
-            expected = _expected(known, joint, observed)
+        if (learns := known.expectation) is None:
+            expected = _expected(known, joint, np.array([array_of(turn["observed"]) for turn in turns]))
         else:
             parts = []
-            for turn, own, seen in zip(turns, joint, observed, strict=True):
+            for turn, own, seen in zip(turns, joint, self.observed(turns), strict=True):
                 u = slice(turn["control_index"], turn["control_index"] + 1)
                 parts.append(learns.of_marginals(_learnt(turn), own[None, :, u], u, seen))
             expected = joined(parts)
@@ -248,8 +247,8 @@ class Flight:
         return Belief(coming, expected, joint.sum(axis=-2))
 
 
-def _expected(known: Knowledge, joint: Float, observed: Float | None) -> Expected:
-    return expected_of(known.sensor_model, known.rewards, joint, observed, quantiles=False)
+def _expected(known: Knowledge, joint: Float, rows: Float | None) -> Expected:
+    return expected_of(known.sensor_model, known.rewards, joint, rows, quantiles=False)
 
 
 def _learnt(record: Record) -> dict[str, Learnt]:

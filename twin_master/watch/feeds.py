@@ -226,6 +226,11 @@ class RunFeed(RecordedFeed):
             for name in (name for *_, name, _ in scenario.readings if name in group):
                 for record, value in zip(records, group[name].values.tolist(), strict=True):
                     record |= {name: value} if math.isfinite(value) else {}
+            known = group.get(f"{role}_covariance")  # of modes
+            for record, triangle in zip(records, () if known is None else known.values, strict=False):
+                matrix = np.zeros((scenario.observation.count,) * 2)
+                matrix[np.tril_indices(len(matrix))] = np.nan_to_num(triangle)
+                record["covariance"] = (matrix + np.tril(matrix, -1).T).tolist()
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
             reason = str(error).rstrip(".")
             raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None

@@ -18,6 +18,7 @@ from hashlib import sha256
 from pathlib import Path
 from select import select
 from typing import IO, Any, BinaryIO
+from unicodedata import normalize
 
 import numpy as np
 
@@ -36,6 +37,8 @@ LARGEST_STRAIN = 0.5
 LARGEST = 1e30
 """The same of any other sensor, SI: far beyond what exists, and its powers are still numbers."""
 _PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
+_POWER = re.compile(r"[^\W\d_]+(?:\^|\*\*)?([+-]?\d)")
+"""A unit whose first name has a power, which its prefix has, too: a mm2 is 1e-6 m2."""
 _WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
 _NAMED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
 
@@ -111,7 +114,9 @@ class MessageReader:
             raise Refused(said("watch.no_sensor", name=name[:60], near=near, count=len(self._units)))
         sensor = self._index[base]
         own = self._units[sensor]
-        known = {prefix + own: factor for prefix, factor in _PREFIXES.items()}
+        squared = _POWER.match(normalize("NFKC", own))
+        power = int(squared[1]) if squared else 1
+        known = {prefix + own: factor**power for prefix, factor in _PREFIXES.items()}
         known = _WITHOUT_UNIT if own == "1" else known
         if unit and unit not in known:
             what = f"`{unit[:30]}` is no unit of sensor {sensor + 1}"

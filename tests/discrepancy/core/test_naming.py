@@ -177,9 +177,11 @@ def test_without_a_noise_record_the_sentence_says_so():
         (0.4, None, VerdictKind.NAMED),
         (0.4, kit.NOISE, VerdictKind.NAMED),
     ):
-        problem = kit.closed_problem(seed=3, effect=effect, noise=noise)
-        verdict, _, _ = name(problem, (kit.offset_effect(),))
+        problem = kit.closed_problem(seed=3, effect=effect, noise=noise, offset_deviation=0.0)
+        verdict, found, fit = name(problem, (kit.offset_effect(),))
         assert verdict.kind is kind, verdict.sentence
+        share = Court(found).share_of(fit, held_out=False)
+        assert share.value == pytest.approx(float(effect > 0.0), abs=0.01)
         assert ("No noise record" in verdict.sentence) is (noise is None)
     assert "record" not in verdict.sentence
 

@@ -67,6 +67,9 @@ def test_a_closed_gap_is_one_and_an_open_gap_zero():
     assert proof.gap_closed == pytest.approx(1.0, abs=0.1)
     assert proof.gap_reason == ""
     assert proof.log_score_gain > 5.0 * proof.log_score_gain_error > 0.0
+    other = [replace(item, noise_deviation=3.0 * item.noise_deviation) for item in after.trials]  # its own
+    gain = prove(before, replace(after, trials=tuple(other))).log_score_gain
+    assert gain == pytest.approx(proof.log_score_gain)
     assert proof.remaining.startswith("Nothing that these data can show remains")
     none = prove(before, before)
     assert none.gap_closed == 0.0

@@ -42,7 +42,7 @@ def seen(model: Model, what: Trial, *items: Primitive, **given: Any) -> FloatArr
 
 RINGDOWN = trial(TrialKind.RINGDOWN, release=Release(AMPLITUDE))
 LOADS = trial(TrialKind.STATIC, 7, force=np.array([0.0, 5.0, 10.0, 15.0, 10.0, 5.0, -5.0]))
-SHAKEN = trial(TrialKind.FORCED, force=8.0 * np.sin(28.0 * 0.01 * np.arange(300)))
+SHAKEN = trial(TrialKind.FORCED, force=8.0 * np.sin(28.0 * 0.01 * np.arange(300) + 2.0))
 
 
 @pytest.fixture(scope="module")

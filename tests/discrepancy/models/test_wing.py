@@ -221,14 +221,19 @@ def test_it_is_its_fmu(kind: TrialKind, laws: tuple[PowerStiffness, ...], beam: 
 
 
 def test_what_no_trial_records_acts_always(write_beam, tmp_path: Path) -> None:
-    """Gravity, where it is no load factor: at rest, and as a shift of what moves."""
+    """Gravity, where it is no load factor: at rest and in motion, with a spring that stiffens."""
     changes = {"load_factor": "gee", 'set = "end", force': "point = [100, 10, 5], force"}
     reduced = reduce_structure(load_and_assemble(write_beam(tmp_path, changes, cells=2))).model
     model, wanted = StructureModel(reduced), reduced.static_response({"push": 0.0})
     still = {"force": np.zeros(3)}
-    for what in (record(TrialKind.STATIC, 3, 1e-4, **still), record(TrialKind.FORCED, 3, 1e-4, **still)):
+    trials = [record(kind, 3, 1e-4, **still) for kind in (TrialKind.STATIC, TrialKind.FORCED)]
+    for what in trials:
         found = seen(model, what, BEAM, parameters=model.prior_mean())
-        assert found == pytest.approx(np.tile([wanted.displacement[0], wanted.strain[0]], (3, 1)), rel=1e-9)
+        assert found == pytest.approx(np.tile([wanted.displacement[0], wanted.strain[0]], (3, 1)), rel=1e-6)
+    stiff = PowerStiffness("tip", 100.0, 3.0, 0, 1e-6)
+    held, moved = (seen(model, what, BEAM, stiff, parameters=model.prior_mean()) for what in trials)
+    assert moved == pytest.approx(held, rel=1e-2)
+    assert abs(held[0, 0]) < 0.5 * abs(found[0, 0])
 
 
 def test_a_structure_without_a_force_is_refused(write_beam, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from fe.wing.operators import (
 from fe.wing.parts import DISTRIBUTIONS
 from tests.fe.runtime.stepping import second_order
 from tests.refusals import Inputs, refused
-from tests.wings import wing_integrator
+from tests.wings import rigid, wing_integrator
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -48,6 +48,9 @@ class Compared:
         self.mesh, self.design = operators.wing_mesh, operators.wing_mesh.design
         self.place, self.row = wing.arrays.load_place, wing.force_row("tip_load")
         self.factors = Factorisation(operators.stiffness(FACTOR, STATE[1]))
+        masses = self.design.masses
+        mass, self.upwards = operators.mass(point_masses(masses.servo, masses.pitot)), rigid(operators)
+        self.weight = STANDARD_GRAVITY * (mass @ self.upwards)  # along the free unknowns [N]
 
     def structure(
         self, *items: Any, state: Any = STATE, masses: Any = MASSES, temperature: float = 0.0
@@ -74,19 +77,6 @@ class Compared:
             if cells.size:
                 whole = whole - loss * factor * operators.body.stiffness(cells)
         return whole.tocsr()
-
-    @property
-    def upwards(self) -> FloatArray:
-        """Free unknowns of which the vertical ones are one."""
-        heave = self.operators.expansion.T @ upward(np.ones(len(self.mesh.points)))
-        return np.append(heave[:-3], (1.0, 0.0, 0.0))
-
-    @property
-    def weight(self) -> FloatArray:
-        """Weight along the free unknowns [N]."""
-        masses = self.design.masses
-        mass = self.operators.mass(point_masses(masses.servo, masses.pitot))
-        return STANDARD_GRAVITY * (mass @ self.upwards)
 
 
 @pytest.fixture(scope="module")

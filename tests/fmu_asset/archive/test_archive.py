@@ -16,8 +16,7 @@ from fmu_asset.check import FmuCheck, check_file, check_fmu
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.session import FmiAsset
 from tests.fmu_asset.door.kinds import HOSTILE, WING_BINDING
-from tests.fmu_asset.foreign.workshop import MODELS
-from tests.fmu_asset.making import DESCRIPTION, archive_of, bound, edited, members, tables
+from tests.fmu_asset.making import DESCRIPTION, MODELS, archive_of, bound, edited, members, tables
 
 REFUSED = tables(__file__)["refused"]
 
@@ -34,6 +33,13 @@ def test_what_is_wrong_with_a_file_is_one_sentence(fmu, tmp_path, row) -> None:
     contents |= {row[key]: b"x" for key in row.keys() & {"add"}}
     with pytest.raises(getattr(errors, row["error"]), match=row["sentence"]):
         read_fmu(archive_of(path, in_utf_16(contents) if "utf_16" in row else contents))
+
+
+def test_a_display_unit_that_is_one_over_the_value_is_none(ours, tmp_path) -> None:
+    inverse = ('<DisplayUnit name="microstrain"', '<DisplayUnit inverse="true" name="microstrain"')
+    changed = edited(ours("fmi3"), tmp_path / "changed.fmu", inverse)
+    shown = [{u.name: u.displays for u in read_fmu(path).units}["1"] for path in (ours("fmi3"), changed)]
+    assert [("microstrain", 1e6, 0.0) in displays for displays in shown] == [True, False]
 
 
 def test_an_archive_that_would_fill_the_disk_is_refused(fmu, tmp_path) -> None:

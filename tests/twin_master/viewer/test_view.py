@@ -27,9 +27,8 @@ from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
-from twin_master.store.writing import open_run
 from twin_master.viewer.flight import LATEST, Belief, Flight, Request, Teller
-from uav_twin import fly, load_scenario
+from uav_twin import fly, load_scenario, open_run
 
 TURNS = 50
 

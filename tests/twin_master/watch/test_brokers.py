@@ -2,7 +2,6 @@
 
 import json
 import random
-import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -15,7 +14,7 @@ import pytest
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
+from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, mosquitto, ran, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of
@@ -29,15 +28,9 @@ Told = dict[str, Any]
 
 
 @pytest.fixture
-def broker(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Mosquitto]:
-    if shutil.which("mosquitto") is None:
-        pytest.skip("no mosquitto")
-    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    broker = Mosquitto(tmp_path, tls=getattr(request, "param", False))
-    yield broker
-    broker.stop()
+def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Mosquitto]:
+    with mosquitto(tmp_path, tls=getattr(request, "param", False)) as broker:
+        yield broker
 
 
 def address(broker: Mosquitto) -> str:

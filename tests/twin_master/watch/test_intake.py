@@ -110,11 +110,8 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
 def test_what_was_refused_behind_the_last_turn_is_refused_once_when_it_is_read_again(knowledge, tmp_path):
     path, rejected = tmp_path / "m.csv", tmp_path / "rejected.jsonl"
     path.write_text("turn,strain_1\nno,1\n0,1e-4\nno,2\n1,1e-4\nno,3\n")
-    twin, intake = (
-        knowledge.twin(lag=20),
-        intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario)),
-    )
-    states = [json.dumps(intake.state()) for _ in operate(twin, intake)]
+    intake = intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario))
+    states = [json.dumps(intake.state()) for _ in operate(knowledge.twin(lag=20), intake)]
     whole = rejected.read_text()
     for cut in ("", '{"message": 7, "rea'):  # a kill may leave half a line
         rejected.write_text(whole + cut)
@@ -272,6 +269,14 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     scenario = load_scenario("pump_wear").scenario
     pump, unit = MessageReader(scenario), scenario.observation.sensor_units[0]
     assert pump.message({f"{next(iter(pump._index))} [k{unit}]": 2.0}).observed[0] == 2000.0
+    for own, unit, size in (
+        ("m2", "mm2", 1e-6),
+        ("m\N{SUPERSCRIPT THREE}/s", "mm\N{SUPERSCRIPT THREE}/s", 1e-9),
+        ("s^-1", "ms^-1", 1e3),
+    ):
+        leak = scenario.observation.model_copy(update={"unit": own})
+        reader = MessageReader(scenario.model_copy(update={"observation": leak}))
+        np.testing.assert_allclose(reader.message({f"operation_2 [{unit}]": 3.0}).observed[1], 3.0 * size)
     refused = MessageReader(allowing).message(b'{"strain_2_bar": 1e-4}')  # a gauge that is there
     assert "`bar` is no unit of sensor 2" in str(refused)
 
