@@ -29,24 +29,19 @@ class Deck(NamedTuple):
     held: list[int]
 
 
-class _Nodes(dict[Point, int]):
-    def number(self, place: FloatArray) -> int:
-        x, y, z = (round(float(value), 6) for value in place)
-        return self.setdefault((x, y, z), len(self) + 1)
-
-
 def stiffened_skin(*, skin: float = 1.0, patch: float = 1.0) -> Deck:
     """A skin of 300 x 200 x 4 mm with an upright web along its middle, clamped at x = 0.
 
     `patch` is times the modulus of a patch of the skin, `skin` of the rest of it.
     """
-    nodes, number = _Nodes(), itertools.count(1)
+    nodes, number = dict[Point, int](), itertools.count(1)
     elements: dict[str, list[list[int]]] = {"SKIN": [], "PATCH": [], "WEB": []}
 
     def quad(corner: Point, along: Point, across: Point) -> list[int]:
         first, a, b = np.array(corner), np.array(along), np.array(across)
-        middles = a / 2, a + b / 2, a / 2 + b, b / 2
-        return [nodes.number(first + part) for part in (0 * a, a, a + b, b, *middles)]
+        parts = 0 * a, a, a + b, b, a / 2, a + b / 2, a / 2 + b, b / 2
+        places: list[Point] = [tuple((first + part).tolist()) for part in parts]
+        return [nodes.setdefault(place, len(nodes) + 1) for place in places]
 
     for i in range(6):
         for j in range(4):

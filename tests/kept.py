@@ -8,8 +8,6 @@ import hashlib
 import os
 import pickle
 import platform
-import shlex
-import shutil
 import subprocess
 import sys
 import time
@@ -22,7 +20,6 @@ from typing import Any, TypeVar
 
 from fe.reduction.built_once import built_once, cache_folder
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.compiled.package import COMPILERS
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 
@@ -44,11 +41,6 @@ if not os.environ.get("CI"):
     from numba.core.caching import UserProvidedCacheLocator
 
     UserProvidedCacheLocator.get_suitable_cache_subpath = classmethod(lambda cls, py_file: "")
-
-# It keeps the objects of the C sources that most of our FMUs share.
-if _compiler := next(filter(None, map(shutil.which, COMPILERS)), None):
-    _words = (sys.executable, "-SE", str(ROOT / "tests" / "compiler.py"), str(FOLDER / "objects"), _compiler)
-    os.environ.setdefault("CC", shlex.join(_words))
 
 _Made = TypeVar("_Made")
 

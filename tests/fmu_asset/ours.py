@@ -6,7 +6,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
 from threadpoolctl import threadpool_limits
 
 from fe.reduction.model_cache import build_patch_arrays
@@ -18,8 +17,6 @@ from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import companion_bytes
-from fmu_asset.compiled.package import find_compiler
-from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.structure_fmu import build_fmu
@@ -79,10 +76,7 @@ class OurFmus:
         options = self.options(name)
         if options.get("kind") != "compiled":
             return build_fmu(self.model(name), path, **options).path
-        try:
-            find_compiler()
-        except FmuBuildError as error:
-            pytest.skip(f"no C compiler: {error}")
+        self._fixture("compiler")  # skips where there is none
         return compiled_wing(self.model(name), path, **options)
 
     def model(self, name: str) -> ReducedModel:

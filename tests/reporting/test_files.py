@@ -167,21 +167,6 @@ def test_xarray_and_we_read_what_was_written(groups, tmp_path_factory):
                 assert variable.values.dtype.kind == "U" or values.tobytes() == variable.values.tobytes()
 
 
-def test_a_run_is_flown_and_stored_without_heavy_libraries():
-    """`uav-twin run --no-report` reads the program's modules and none of these."""
-    code = (
-        "import sys, twin_master.workflow, twin_master.assets.design_source\n"
-        "import calibration.paper.load_test\n"
-        "import calibration.static.errors_in_variables, calibration.static.experiments\n"
-        "import calibration.static.posterior\n"
-        "heavy = {'xarray', 'pandas', 'dask', 'distributed', 'zarr', 'matplotlib', 'bokeh', 'skfem', 'pymor',"
-        " 'meshio', 'scipy.interpolate', 'scipy.optimize', 'scipy.sparse'}\n"
-        "print(*sorted(heavy & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     begin = Variable(("trial",), np.array([0.0, 1.0]), {"units": "hours since 2020-01-01"})

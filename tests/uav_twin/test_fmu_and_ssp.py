@@ -236,15 +236,10 @@ END = "</ssm:ParameterMapping>"
 
 
 @pytest.fixture(scope="module")
-def scenario(heat_exchanger: Path) -> Path:
-    return heat_exchanger / "fouling.toml"
-
-
-@pytest.fixture(scope="module")
-def system(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def system(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The heat exchanger as an SSP file."""
     place = tmp_path_factory.mktemp("system") / "x.ssp"
-    assert "x.ssp: " in said("ssp", "export", scenario, "--out", place)
+    assert "x.ssp: " in said("ssp", "export", heat_exchanger / "fouling.toml", "--out", place)
     return place
 
 
@@ -254,7 +249,7 @@ def mapped(*entries: tuple[str, str]) -> tuple[str, str]:
     return END, "".join(texts) + END
 
 
-def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(scenario, system, tmp_path):
+def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(heat_exchanger, system, tmp_path):
     """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
     text = said("ssp", "check", system)
     assert "no problem found; 7 connections, 2 parameters" in text
@@ -277,12 +272,13 @@ def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(scenario, syst
     asked = "asks for linear interpolation of inputs, but no component"
     assert asked in refused(*simulate, "--interpolation", "linear")
     out = tmp_path / "run"
-    said("run", system, "--scenario", scenario, "--out", out, "--in-process", "--no-report", "-q")
+    options = "--out", out, "--in-process", "--no-report", "-q"
+    said("run", system, "--scenario", heat_exchanger / "fouling.toml", *options)
     assert (out / "asset" / "system.ssp").read_bytes() == system.read_bytes()
     assert (out / "csv" / "observed.csv").is_file()
 
 
-def test_what_nothing_takes_is_a_warning_and_not_flown(scenario, system, tmp_path):
+def test_what_nothing_takes_is_a_warning_and_not_flown(heat_exchanger, system, tmp_path):
     """The nearest name is said; what another entry gives is not missed."""
     file = edited(system, tmp_path / "more.ssp", mapped(("conductance", "baffle")))
     named = f"{file} sets parameters that nothing takes: heat_exchanger.baffle; correct"
@@ -295,7 +291,7 @@ def test_what_nothing_takes_is_a_warning_and_not_flown(scenario, system, tmp_pat
     named = f"{file} sets parameters that nothing takes: {meant}"
     assert f"warning: {named}" in " ".join(said("ssp", "check", file).split())
     out = tmp_path / "run"
-    assert named in refused("run", file, "--scenario", scenario, "--out", out, "-q")
+    assert named in refused("run", file, "--scenario", heat_exchanger / "fouling.toml", "--out", out, "-q")
     assert not out.exists()
 
 

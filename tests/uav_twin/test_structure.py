@@ -73,9 +73,12 @@ def test_a_structure_is_reduced_and_compared(write_beam, tmp_path, monkeypatch):
     """`structure reduce` says ranges and measured errors; a second call finds the model in the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     file = str(write_beam(tmp_path))
-    record = json.loads(said("structure", "reduce", file, "--json", "--states", "2", "--quiet"))
+    record = json.loads(said("structure", "reduce", file, "--json", "--states", "4", "--quiet"))
     assert record["ranges"]["z1"] == [0.0, 0.8]
-    assert record["errors"]["strain"] < record["errors"]["bound"] < 1e-3
+    errors = record["errors"]  # the bound holds, nearly as asked for, and tells the error within a few times
+    assert max(errors["strain"], errors["displacement"]) < errors["bound"] < min(1e-3, 15 * errors["strain"])
+    assert (errors["broken"], errors["states"]) == (0, 4)
+    assert errors["frequency"] < 2e-5
     kept = list((tmp_path / "cache" / "uav-twin").glob("structure-*.npz"))
     before = kept[0].stat().st_mtime_ns
     assert "load_factor" in said("structure", "reduce", file, "--states", "0")

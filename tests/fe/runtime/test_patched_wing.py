@@ -16,6 +16,7 @@ from fe.runtime.patched_wing import PatchedState, PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
+from fe.runtime.wing_rows import PatchArrays
 from fe.wing.operators import (
     AffineOperators,
     assemble,
@@ -80,8 +81,8 @@ class Compared:
 
 
 @pytest.fixture(scope="module")
-def both(coarse_patched_wing: PatchedWing, coarse_operators: AffineOperators) -> Compared:
-    return Compared(coarse_patched_wing, coarse_operators)
+def both(coarse_patch_arrays: PatchArrays, coarse_operators: AffineOperators) -> Compared:
+    return Compared(PatchedWing(coarse_patch_arrays), coarse_operators)
 
 
 # ---------------------------------------------------------------- structure
@@ -334,13 +335,13 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
 
-def test_a_released_wing_for_patches_moves_as_all_its_unknowns(coarse_patched_wing):
+def test_a_released_wing_for_patches_moves_as_all_its_unknowns(both):
     """What its modes leave out fades as the damping has it, for a law as well."""
     vector = np.array((1.0, 0.0, 0.0, 0.169, 0.134, 1.0, 0.0))
     weak = patch.PowerStiffness("tip", 1e-6, 1.0, 0, 1.0)  # which only tells where the tip is
-    motion = ModalIntegrator(coarse_patched_wing, vector, ALPHA, BETA, ModelPatch((weak,)))
+    motion = ModalIntegrator(both.wing, vector, ALPHA, BETA, ModelPatch((weak,)))
     structure, load = motion.structure, motion.structure.acting(vector)
-    answers, tip = structure.answers, coarse_patched_wing.port_rows["tip"]
+    answers, tip = structure.answers, both.wing.port_rows["tip"]
     held = 0.03 / (structure.outputs[-1] @ answers[:, HOLDING]) * answers[:, HOLDING]
     rest, n = answers[:, :4] @ load, len(held)
     state = motion.advance(motion.released(0.03, load, HOLDING), 5e-4, load)

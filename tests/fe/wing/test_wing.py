@@ -89,22 +89,14 @@ def test_the_lifting_line_has_the_induced_drag_of_glauerts_table():
 # ---------------------------------------------------------------- mesh
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
-LOCAL, WEIGHT = gauss_points(3)
-
-
-def determinants(mesh):
-    return np.linalg.det(jacobians(mesh.kind, mesh.nodes, LOCAL))
-
-
-def cells_of(mesh, name):
-    return np.flatnonzero(mesh.region == mesh.region_names.index(name))
 
 
 def test_parts_have_the_edges_and_volumes_of_the_design(coarse_design):
     coarse_mesh = build_mesh(coarse_design)
-    plan, volume = coarse_design.planform, determinants(coarse_mesh) @ WEIGHT
+    plan, (local, weight) = coarse_design.planform, gauss_points(3)
+    volume = np.linalg.det(jacobians(coarse_mesh.kind, coarse_mesh.nodes, local)) @ weight
     for name, defect in zip(coarse_design.regions, coarse_design.defects, strict=True):
-        inside = cells_of(coarse_mesh, name)
+        inside = np.flatnonzero(coarse_mesh.region == coarse_mesh.region_names.index(name))
         x, y, _ = coarse_mesh.corners[inside].reshape(-1, 3).T
         fraction = x / plan.chord(y / plan.semi_span) + plan.straight_chord_line
         assert (y.min(), y.max()) == pytest.approx((defect.span_start, defect.span_end))

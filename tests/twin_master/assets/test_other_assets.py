@@ -1,10 +1,8 @@
 """Missions of assets by FMUs, coupled ones and SSP files, and of structures from a mesh."""
 
-import json
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +35,6 @@ from tests.twin_master.runs import (
     written,
 )
 from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
-from twin_master.assets.structure_source import StructureBelief
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
 from twin_master.fleet.plan import ensemble
@@ -113,15 +110,6 @@ def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, nam
     text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     with refused((TwinMasterError, FmuError, SspError), sentence):
         new_run(load_scenario(written(folder, text, (old, new), name="wrong.toml")), tmp_path / "run")
-    assert not [*tmp_path.iterdir()]
-
-
-def test_damage_that_the_asset_lives_by_itself_needs_a_model_for_the_twin(folder, tmp_path):
-    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
-    own = '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
-    path = written(folder, text[: text.index("[truth]")] + own, name="own.toml")
-    with pytest.raises(MissionInputError, match="name a model for the twin in the table `belief`"):
-        new_run(load_scenario(path), tmp_path / "run")
     assert not [*tmp_path.iterdir()]
 
 
@@ -311,7 +299,7 @@ def mission(file: Path, **changes: Any) -> LoadedScenario:
 
 
 @pytest.fixture(scope="module")
-def file(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(write_beam: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_beam(tmp_path_factory.mktemp("beam"), TWO)
 
 
@@ -380,7 +368,7 @@ def test_a_watch_takes_features_with_their_covariance(file):
     reader, count = MessageReader(scenario), scenario.observation.count
     covariance = np.diag([1e-2, 1e-8, 1e-6, 1.0, 1e-6, 1e-6])
     told = {"frequency_1_Hz": 461.7, "mid_1": None, "modes_4": 4590.0, "covariance": covariance.tolist()}
-    message = reader.message(json.dumps(told).encode())
+    message = reader.message(told)
     np.testing.assert_array_equal(message.observed[:count], [461.7, np.nan, np.nan, 4590.0, np.nan, np.nan])
     np.testing.assert_array_equal(message.observed, packed_row(message.observed[:count], covariance))
     for wrong, sentence in (([1.0], "6 rows of 6"), ((-covariance).tolist(), "eigenvalues of zero or more")):
@@ -410,7 +398,6 @@ def test_gauges_that_cannot_stand_beside_those_of_the_file(tmp_path):
     gauges = text[text.index("[[gauge]]") : text.index("[[displacement]]")]
     rows = 'gauge = [{ name = "end_1", point = [40, 50, -20], direction = [1, 0, 0] }]\n'
     inline = written(tmp_path, rows + edited(text, (gauges, "")), name="panel.toml")
-    assert isinstance(panel.belief, StructureBelief)
     believed = panel.belief.model_copy(update={"structure": str(inline)})
     with pytest.raises(MissionInputError, match=r"as tables \[\[gauge\]\], not in a list"):
         with_candidates(panel.model_copy(update={"belief": believed}), "3", tmp_path / "3")

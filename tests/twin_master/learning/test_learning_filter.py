@@ -16,7 +16,7 @@ from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
 from twin_master.scenario.tables import Learning
-from uav_twin import Estimate, GaussianSensorModel, GraphicalModel
+from uav_twin import GaussianSensorModel, GraphicalModel
 
 Float = NDArray[np.float64]
 
@@ -142,16 +142,6 @@ SETTINGS = 2.0, (-0.1, 0.1), 0.8, (2.0, 3.0)
 POLICY = np.array([[0.0, 1.0], [0.3, 0.7], [1.0, 0.0]])
 
 
-@pytest.fixture(scope="module")
-def turns() -> list[Estimate]:
-    return estimates_of(learner_of_all(), observations(), CONTROLS)
-
-
-@pytest.fixture(scope="module")
-def expectation() -> LearntExpectation:
-    return LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
-
-
 def moments(values: Float, weight: Float) -> tuple[Float, Float]:
     """Return mean and standard deviation of values (..., n) under weights (...)."""
     share = weight / weight.sum()
@@ -160,11 +150,12 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
 
 
 @pytest.mark.parametrize("other", [None, np.array([0.2, 0.7, 0.1])])
-def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation, other):
+def test_filtered_and_smoothed_are_sums_over_all_trajectories(other):
     """States, draws and transition factors; what is expected to be seen, also of another belief."""
-    carried, seen = [turn.carried for turn in turns], observations()
-    rewards = RewardModel(sensors(), *SETTINGS)
-    now, later = np.array([turn.filtered for turn in turns]), learner_of_all().smoothed(carried)
+    learner, seen, rewards = learner_of_all(), observations(), RewardModel(sensors(), *SETTINGS)
+    expectation, turns = LearntExpectation(learner, rewards, POLICY), estimates_of(learner, seen, CONTROLS)
+    carried = [turn.carried for turn in turns]
+    now, later = np.array([turn.filtered for turn in turns]), learner.smoothed(carried)
     value, whole, evidence = sensors().value_per_draw, enumerated(STEPS), 0.0
     for t, turn in enumerate(turns):
         until = enumerated(t + 1)
@@ -202,8 +193,10 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation
                 np.testing.assert_allclose(found.reward_standard_deviation[t, place], deviation[0], atol=1e-7)
 
 
-def test_predicted_follows_the_scenario_through_the_policy(turns, expectation):
-    found = expectation.predicted([turns[2].carried], [turns[2].filtered], [POLICY], 2)
+def test_predicted_follows_the_scenario_through_the_policy():
+    *_, turn = estimates_of(learner_of_all(), observations()[:3], CONTROLS[:3])
+    expectation = LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
+    found = expectation.predicted([turn.carried], [turn.filtered], [POLICY], 2)
     table = enumerated(3).sum(axis=(0, 1, 4))  # (S, E)
     table = table / table.sum()
     matrix, value = model().transition.matrix, sensors().value_per_draw
@@ -247,9 +240,8 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     assert (noise.lower, noise.upper) == pytest.approx(np.sqrt(squared.ppf([0.05, 0.95])))
     row = design[-1]
     rewards = RewardModel(sensor, 9.0, (0.0, 0.0), 0.8)
-    found = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]])).filtered(
-        carried, [turn.filtered for turn in estimates], seen[:, None]
-    )
+    expectation = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]]))
+    found = expectation.filtered(carried, [turn.filtered for turn in estimates], seen[:, None])
     spread = 0.5 * np.sqrt(scale2 * row @ covariance @ row)
     assert found.mean[-1, 0] == pytest.approx(shown[-1] + 0.5 * row @ mean)
     assert found.standard_deviation[-1, 0] == pytest.approx(spread)
@@ -278,9 +270,8 @@ def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
     joint = np.zeros((1, 3, 2))
     joint[0, 1, 1] = 1.0
     told = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}  # half way between draws on both sides
-    found = LearntExpectation(learner, rewards, np.full((3, 2), 0.5)).of_marginals(
-        told, joint, slice(None), None
-    )
+    expectation = LearntExpectation(learner, rewards, np.full((3, 2), 0.5))
+    found = expectation.of_marginals(told, joint, slice(None), None)
     value, weight = sensor.value_per_draw[:, 1, 1], np.array([0.25, 0.25, 0.5])
     np.testing.assert_allclose(found.mean[0], weight @ value, rtol=1e-12)
     spread = np.sqrt(weight @ (value - weight @ value) ** 2)

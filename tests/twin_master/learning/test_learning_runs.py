@@ -53,13 +53,8 @@ def folder(scenario: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(folder: Path) -> xr.DataTree:
-    return open_run(folder)
-
-
-@pytest.fixture(scope="module")
-def learnt(run: xr.DataTree) -> xr.Dataset:
-    return run["learnt"].to_dataset()
+def learnt(folder: Path) -> xr.Dataset:
+    return open_run(folder)["learnt"].to_dataset()
 
 
 def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
@@ -79,7 +74,8 @@ def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
         assert variable.attrs["long_name"]
 
 
-def test_prior_and_truth_are_those_of_the_scenario(learnt, run):
+def test_prior_and_truth_are_those_of_the_scenario(learnt, folder):
+    run = open_run(folder)
     draws = run["calibration"]["draw_value"].values
     mean, wide = (learnt[f"young_modulus_factor_prior_{name}"].item() for name in MOMENTS[:2])
     assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())  # between the draws as well
@@ -148,9 +144,10 @@ def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
     assert "posterior mean of the Young" not in text
 
 
-def test_the_view_shows_what_was_learnt(folder, run):
+def test_the_view_shows_what_was_learnt(folder):
     """From the posterior of each quantity alone, which the journal tells."""
-    flight, filtered = Flight(folder), run["filtered"].to_dataset()
+    flight, run = Flight(folder), open_run(folder)
+    filtered = run["filtered"].to_dataset()
     flight.update()
     shown = flight.believed(flight.seen(0, TURNS)).expected
     noise = filtered["noise_standard_deviation"].values

@@ -1,7 +1,6 @@
 """What is noticed, against sums over every course of events, an exact mean, and faults that are put in."""
 
 from dataclasses import replace
-from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from tests.twin_master.network.decision_oracles import trajectories
 from tests.twin_master.runs import changed_scenario, estimates_of
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import rivals
@@ -127,16 +127,11 @@ def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch
     first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of these turns, and of none of them
 
     def evidence(gauge: int, gain: float, begin: int) -> float:
-        total = 0.0
-        for draw, path in product(range(2), product(range(3), repeat=turns)):
-            probability = 0.5 * float(path[0] == 0)
-            for before, after in pairwise(path):
-                probability *= model.transition.matrix[0, before, after]
-            shown = sensors.value_per_draw[draw, list(path), 0].copy()
-            shown[begin:, gauge] *= 1.0 + gain
-            density = norm.pdf(seen, shown)
-            total += probability * np.prod(density[~np.isnan(seen)])
-        return total
+        shown = sensors.value_per_draw[:, :, 0].repeat(turns, axis=1).reshape(2, 3, turns, 3)
+        shown[:, :, begin:, gauge] *= 1.0 + gain
+        density = np.nansum(norm.logpdf(seen, shown), axis=-1).swapaxes(1, 2)  # (E, T, S)
+        paths = ([*trajectories(model, [0] * turns, row)][-1][1] for row in density)
+        return 0.5 * float(sum(joint.sum() for joint in paths))
 
     for gauge in range(3):
         each = [np.mean([evidence(gauge, gain, begin) for gain in GAINS]) for begin in range(turns + 1)]
@@ -291,9 +286,8 @@ def test_belief_and_decision_follow_what_holds_now(between):
             control = course[watched][-1].next_control if turn else 1
             row = known.sensor_model.mean[state, control] * np.where(wrong, 0.67, 1.0) + noise
             course[watched].append(twin.turn(row, control))
-    mean = {
-        watched: np.array([found.filtered @ states[:, 0] for found in course[watched]]) for watched in course
-    }
+    first = states[:, 0]
+    mean = {watched: np.array([found.filtered @ first for found in course[watched]]) for watched in course}
     assert np.abs(mean[True] - truth)[np.r_[14:20, 25:30, 35:90]].max() < 0.12
     assert mean[False][40:46].max() < 0.25  # the filter alone believes the gauge, flies on and wears the wing
     assert {found.next_control for found in course[False][32:46]} == {1}

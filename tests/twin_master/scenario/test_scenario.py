@@ -1,6 +1,5 @@
 """Scenario files: what is read, what is refused, kinds, format 1; what options and files change."""
 
-import itertools
 import json
 import re
 import shutil
@@ -32,7 +31,7 @@ from twin_master.scenario.section import AssetSection
 from uav_twin import fly, load_calibration, prepare_twin
 
 INPUTS = Inputs(__file__)
-EDITED = ("level_turns", "level_turns_learning", "inspected_wing", "model_mismatch")
+EDITED = ("level_turns", "failing_gauges", "level_turns_learning", "inspected_wing", "model_mismatch")
 
 
 @pytest.mark.parametrize(
@@ -45,10 +44,8 @@ def test_whatever_is_wrong_is_named_in_one_sentence(name, old, new, sentence, tm
 
 
 def test_files_that_are_none_or_name_what_is_not_there(tmp_path):
-    faults = text_of("failing_gauges", ("sensors = [12]", "sensors = [25]"))
-    for text, sentence in ((faults, "from 1 to 24, and 25 came"), ("format = = 1", "is not valid TOML")):
-        with refused(ScenarioError, sentence):
-            load_scenario(written(tmp_path, text))
+    with refused(ScenarioError, "is not valid TOML"):
+        load_scenario(written(tmp_path, "format = = 1"))
     with refused(ScenarioError, "level_turns"):
         load_scenario("level_turn")
 
@@ -75,7 +72,6 @@ def tables(*changed: list[float]) -> dict[str, Any]:
         )],
         *INPUTS.refused("tables"),
     ],
-    ids=itertools.count(),
 )  # fmt: skip
 def test_keys_that_do_not_fit_and_numbers_that_no_file_or_float_holds_are_refused(name, changes, words):
     with refused(ScenarioError, words):
