@@ -260,7 +260,7 @@ class Flights:
             for name in [*others, "instances"]:
                 yield name, "skipped", "It does not fly."
             return
-        step = self._binding.step_size
+        step = self._binding.interval
         yield "first flight", "ok", f"{_STEPS} steps of {step:g} s, {self._series.shape[1]} finite outputs."
         for name, check in others.items():
             with progress.stage(f"Checking {name}"):

@@ -1,6 +1,7 @@
-"""Decks of shells and beams as a user of CalculiX writes them, solved by it and stored as matrices."""
+"""A deck of shells as a user of CalculiX writes it, solved by it and stored as matrices."""
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,76 +29,33 @@ class Deck(NamedTuple):
     held: list[int]
 
 
-class _Nodes(dict[Point, int]):
-    def number(self, place: FloatArray) -> int:
-        x, y, z = (round(float(value), 6) for value in place)
-        return self.setdefault((x, y, z), len(self) + 1)
-
-
-def _deck(
-    nodes: _Nodes, elements: dict[str, list[list[int]]], kind: str, rest: Iterable[str], held: list[int]
-) -> Deck:
-    lines = ["*NODE, NSET=NALL", *(f"{n},{x},{y},{z}" for (x, y, z), n in nodes.items())]
-    count = 0
-    for name, members in elements.items():
-        lines.append(f"*ELEMENT, TYPE={kind}, ELSET={name}")
-        for own in members:
-            count += 1
-            lines.append(",".join(map(str, (count, *own))))
-    return Deck([*lines, *rest, "*BOUNDARY", *(f"{number},1,6" for number in held)], nodes, held)
-
-
-def _material(name: str, factor: float) -> list[str]:
-    return [f"*MATERIAL, NAME={name}", "*ELASTIC", f"{7e4 * factor!r},0.3", "*DENSITY", "2.7e-9"]
-
-
 def stiffened_skin(*, skin: float = 1.0, patch: float = 1.0) -> Deck:
     """A skin of 300 x 200 x 4 mm with an upright web along its middle, clamped at x = 0.
 
     `patch` is times the modulus of a patch of the skin, `skin` of the rest of it.
     """
-    nodes = _Nodes()
+    nodes, number = dict[Point, int](), itertools.count(1)
     elements: dict[str, list[list[int]]] = {"SKIN": [], "PATCH": [], "WEB": []}
 
     def quad(corner: Point, along: Point, across: Point) -> list[int]:
         first, a, b = np.array(corner), np.array(along), np.array(across)
-        middles = a / 2, a + b / 2, a / 2 + b, b / 2
-        return [nodes.number(first + part) for part in (0 * a, a, a + b, b, *middles)]
+        parts = 0 * a, a, a + b, b, a / 2, a + b / 2, a / 2 + b, b / 2
+        places: list[Point] = [tuple((first + part).tolist()) for part in parts]
+        return [nodes.setdefault(place, len(nodes) + 1) for place in places]
 
     for i in range(6):
         for j in range(4):
             name = "PATCH" if i in (1, 2) and j < 2 else "SKIN"
             elements[name].append(quad((50.0 * i, 50.0 * j, 0.0), (50.0, 0.0, 0.0), (0.0, 50.0, 0.0)))
         elements["WEB"].append(quad((50.0 * i, 100.0, 0.0), (50.0, 0.0, 0.0), (0.0, 0.0, 20.0)))
-    rest: list[str] = []
+    lines = ["*NODE, NSET=NALL", *(f"{n},{x},{y},{z}" for (x, y, z), n in nodes.items())]
     for name, factor in (("SKIN", skin), ("PATCH", patch), ("WEB", 1.0)):
-        rest += [*_material(name, factor), f"*SHELL SECTION, ELSET={name}, MATERIAL={name}", "4."]
+        lines += [f"*MATERIAL, NAME={name}", "*ELASTIC", f"{7e4 * factor!r},0.3", "*DENSITY", "2.7e-9"]
+        lines.append(f"*ELEMENT, TYPE=S8R, ELSET={name}")
+        lines += [",".join(map(str, (next(number), *own))) for own in elements[name]]
+        lines += [f"*SHELL SECTION, ELSET={name}, MATERIAL={name}", "4."]
     root = [number for place, number in nodes.items() if place[0] == 0.0]
-    return _deck(nodes, elements, "S8R", rest, root)
-
-
-def frame(*, skin: float = 1.0, patch: float = 1.0) -> Deck:
-    """A portal of 600 x 400 mm with an arm out of its plane, of beams 30 x 20 mm, clamped at its feet.
-
-    `patch` is times the modulus of the first column, `skin` of the other beams.
-    """
-    nodes = _Nodes()
-    elements: dict[str, list[list[int]]] = {}
-    members = {
-        "PATCH": ((0.0, 0.0, 0.0), (0.0, 0.0, 400.0)),
-        "TOP": ((0.0, 0.0, 400.0), (600.0, 0.0, 400.0)),
-        "COLUMN": ((600.0, 0.0, 400.0), (600.0, 0.0, 0.0)),
-        "ARM": ((600.0, 0.0, 400.0), (600.0, 300.0, 400.0)),
-    }
-    rest: list[str] = []
-    for name, (start, end) in members.items():
-        places = np.linspace(start, end, 9)
-        numbers = [nodes.number(place) for place in places]
-        elements[name] = [numbers[i : i + 3] for i in range(0, 8, 2)]
-        normal = "1.,0.,0." if name == "ARM" else "0.,1.,0."
-        rest += _material(name, patch if name == "PATCH" else skin)
-        rest += [f"*BEAM SECTION, ELSET={name}, MATERIAL={name}, SECTION=RECT", "30.,20.", normal]
-    return _deck(nodes, elements, "B32", rest, [nodes[0.0, 0.0, 0.0], nodes[600.0, 0.0, 0.0]])
+    return Deck([*lines, "*BOUNDARY", *(f"{number},1,6" for number in root)], nodes, root)
 
 
 def solved(deck: Deck, folder: Path, forces: Iterable[tuple[int, Point]]) -> list[dict[int, FloatArray]]:
@@ -117,7 +75,7 @@ def frequencies(deck: Deck, folder: Path) -> FloatArray:
     return read_frequencies(run_calculix(text, folder, "modes"))[:6]
 
 
-def write_structure(folder: Path, build: Callable[..., Deck], tables: str) -> Path:
+def write_structure(folder: Path, tables: str) -> Path:
     """Store the whole structure, with half of `skin` and with half of `patch`, and write its file.
 
     Its parameter e scales skin and patch, and the patch may lose its stiffness; `tables` are what loads and
@@ -125,7 +83,7 @@ def write_structure(folder: Path, build: Callable[..., Deck], tables: str) -> Pa
     """
     for name, factors in (("whole", {}), ("skin_half", {"skin": 0.5}), ("patch_half", {"patch": 0.5})):
         step = ["*STEP", "*FREQUENCY, SOLVER=MATRIXSTORAGE", "*END STEP"]
-        run_calculix("\n".join([*build(**factors).lines, *step]) + "\n", folder, name)
+        run_calculix("\n".join([*stiffened_skin(**factors).lines, *step]) + "\n", folder, name)
     file = folder / "structure.toml"
     file.write_text(Inputs(__file__).text("stored.toml") + tables, encoding="utf-8")
     return file

@@ -64,14 +64,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--list-not-quick", action="store_true", help=f"write {NOT_QUICK.name} anew")
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Let each worker begin with another file: the others read what it has compiled, which takes longest."""
-    if config.args_source is pytest.Config.ArgsSource.TESTPATHS and hasattr(config, "workerinput"):
-        files = sorted(Path(__file__).parent.rglob("test_*.py"))
-        first = len(files) * int(config.workerinput["workerid"][2:]) // config.workerinput["workercount"]
-        config.args[:] = map(str, files[first:] + files[:first])
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Let one worker run all tests that share what is made once.
@@ -332,7 +324,7 @@ def heat_exchanger(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def foreign_fmu(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Build FMUs of other conventions and misbehaviours from C: `foreign_fmu("ball2")` is a path."""
-    from tests.fmu_asset.foreign.workshop import Workshop
+    from tests.fmu_asset.making import Workshop
 
     return Workshop(tmp_path_factory.mktemp("foreign"))
 

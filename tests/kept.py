@@ -8,8 +8,6 @@ import hashlib
 import os
 import pickle
 import platform
-import shlex
-import shutil
 import subprocess
 import sys
 import time
@@ -22,7 +20,6 @@ from typing import Any, TypeVar
 
 from fe.reduction.built_once import built_once, cache_folder
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.compiled.package import COMPILERS
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 
@@ -44,11 +41,6 @@ if not os.environ.get("CI"):
     from numba.core.caching import UserProvidedCacheLocator
 
     UserProvidedCacheLocator.get_suitable_cache_subpath = classmethod(lambda cls, py_file: "")
-
-# It keeps the objects of the C sources that most of our FMUs share.
-if _compiler := next(filter(None, map(shutil.which, COMPILERS)), None):
-    _words = (sys.executable, "-SE", str(ROOT / "tests" / "compiler.py"), str(FOLDER / "objects"), _compiler)
-    os.environ.setdefault("CC", shlex.join(_words))
 
 _Made = TypeVar("_Made")
 
@@ -103,22 +95,6 @@ def exported(script: Path) -> Path:
     words = [sys.executable, "-m", "pythonfmu", "build", "-f", script.name]
     pack = partial(subprocess.run, words, cwd=script.parent, check=True, capture_output=True)
     return packed(path, pack, (script,), None)
-
-
-def kept_folder(
-    folder: Path, fill: Callable[[], _Made], places: tuple[Path, ...], inputs: object = None
-) -> _Made:
-    """Return what `fill` returns, which fills a folder unless that is kept; parameters as of `kept`."""
-
-    def filled() -> tuple[_Made, dict[str, bytes]]:
-        told, files = fill(), (path for path in folder.rglob("*") if path.is_file())
-        return told, {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
-
-    told, files = kept(folder.name, filled, places, inputs)
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-    return told
 
 
 def compiled_wing(model: ReducedModel, path: Path, **options: Any) -> Path:

@@ -2,10 +2,13 @@
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import Losses
 from fe.runtime.transient import ModalIntegrator
-from fe.wing.operators import AffineWing, solve_static
+from fe.wing.operators import ROOT_UNKNOWNS, AffineOperators, AffineWing, solve_static, upward
 
 
 def wing_integrator(
@@ -19,3 +22,12 @@ def tip_stiffness(wing: AffineWing, young_modulus_factor: float = 1.0, loss: Los
     """Stiffness [N/m] of the static test of the full wing: force near the tip over the displacement there."""
     found = solve_static(wing, young_modulus_factor, loss, load_factor=0.0, tip_force=1.0)
     return 1.0 / float(wing.load_tip @ found.displacement)
+
+
+def rigid(wing: AffineOperators, lever: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Free unknowns of a heave, or of a flap where the lever is that of the nodes."""
+    nodes = len(wing.wing_mesh.points)
+    free = np.asarray(wing.expansion.T @ upward(np.ones(nodes) if lever is None else lever))
+    if lever is None:
+        free[-ROOT_UNKNOWNS:] = 1.0, 0.0, 0.0
+    return free

@@ -129,7 +129,7 @@ def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str
         return missing
     if isinstance(value, str):
         return value
-    return f"{value:.5g} {unit}".strip()
+    return f"{value if isinstance(value, int) else f'{value:.5g}'} {unit}".strip()
 
 
 def guarded(application: Callable[[], None], *others: type[Exception]) -> None:

@@ -125,7 +125,7 @@ def _campaign(
         name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
     }
     whole = Trial.plain(
-        "turns", TrialKind.FLIGHT, names, _step_size(folder) * (observed["step"].values + 1.0),
+        "turns", TrialKind.FLIGHT, names, _ends(folder, observed["step"].values),
         values=np.where(used, strain, 0.0), used=used, temperature=temperature,
         load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
         run=str(run.attrs.get("scenario", "run")), health=np.asarray(smoothed["mean"].values, dtype=float),
@@ -229,11 +229,13 @@ def _run(folder: Path) -> xr.DataTree:
     return run
 
 
-def _step_size(folder: Path) -> float:
-    """Return the seconds of a turn, 1 where the run has no binding of its own."""
+def _ends(folder: Path, turns: FloatArray) -> FloatArray:
+    """Return when turns end [s]; each takes a second where the run has no binding of its own."""
     path = folder / BINDING_FILE
     with CampaignFileError.instead_of(FmuError, before="The binding of the run cannot be read: "):
-        return load_binding(path).binding.step_size if path.exists() else 1.0
+        bound = load_binding(path) if path.exists() else None
+    start, interval = (0.0, 1.0) if bound is None else (bound.binding.start_time, bound.interval)
+    return np.asarray(start + interval * (turns + 1.0))
 
 
 def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[FloatArray, bool]:

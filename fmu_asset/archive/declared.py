@@ -312,6 +312,10 @@ def read_declared(
     for variable in declared.modelVariables:
         if (element := unsigned.get(variable.name)) is not None:
             variable.min, variable.max = element.get("min"), element.get("max")
+    # And takes a display unit of FMI 3 that is one over the value, as s of Hz, for one that is not.
+    inverse = {shown.get("name") for shown in root.iterfind(".//DisplayUnit[@inverse='true']")}
+    for unit in declared.unitDefinitions:
+        unit.displayUnits = [shown for shown in unit.displayUnits if shown.name not in inverse]
     known = {
         unknown.variable.name: tuple(str(variable.name) for variable in unknown.dependencies)
         for unknown in declared.outputs

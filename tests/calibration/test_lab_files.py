@@ -13,29 +13,9 @@ from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import published_lengths, read_lengths, tailored_design, tailored_geometry
 from calibration.joint.wing_table import weighed
 from calibration.paper.procedure import read_published_results
-from calibration.static.experiments import (
-    LOAD_STANDARD_DEVIATION,
-    LoadDisplacementData,
-    published_measurements,
-    read_measurements,
-)
-from calibration.virtual_wing import (
-    RECORDED_GAUGE,
-    SENSITIVITY,
-    VirtualWing,
-    check_recorded,
-    measure_lengths,
-    measure_load_test,
-    measure_ring_down,
-    weigh,
-)
-from calibration.wing.lab_data import (
-    WEIGHED_MASS_FILE,
-    published_data,
-    read_lab_folder,
-    read_weighed_mass,
-    write_lab_folder,
-)
+from calibration.static.experiments import published_measurements, read_measurements
+from calibration.virtual_wing import VirtualWing, measure_lengths, measure_load_test, measure_ring_down, weigh
+from calibration.wing.lab_data import published_data, read_lab_folder, read_weighed_mass, write_lab_folder
 from fe.runtime.errors import InvalidDesignError, OutsideModelError
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
 from fe.wing.design import load_design
@@ -49,7 +29,7 @@ INPUTS = Inputs(__file__)
 def test_columns_and_runs_of_a_load_test(tmp_path):
     """A run begins where the load falls; equal readings of two runs, or numbered ones, may be."""
 
-    def read(text: str) -> LoadDisplacementData:
+    def read(text):
         (tmp_path / "pairs.csv").write_text(text, encoding="utf-8")
         return read_measurements(tmp_path / "pairs.csv")
 
@@ -68,7 +48,10 @@ def test_columns_and_runs_of_a_load_test(tmp_path):
 def test_the_hash_of_a_load_test_sees_figures_and_not_names():
     data = published_measurements()
     assert replace(data, source="another name").sha256 == data.sha256
-    for other in ({"load": data.load + 1e-12}, {"load_standard_deviation": 2 * LOAD_STANDARD_DEVIATION}):
+    for other in (
+        {"load": data.load + 1e-12},
+        {"load_standard_deviation": 2.0 * data.load_standard_deviation},
+    ):
         assert replace(data, **other).sha256 != data.sha256
     with pytest.raises(ExperimentDataError, match="load of reading 2 is 0"):
         replace(data, load=np.where(np.arange(8) == 1, 0.0, data.load))
@@ -118,7 +101,7 @@ BAD = [pytest.param(name, *row, id=f"{name}: {row[-1]}") for name in READERS for
 
 @pytest.mark.parametrize(("name", "old", "new", "kind", "sentence"), BAD)
 def test_a_bad_file_is_one_sentence(tmp_path, name, old, new, kind, sentence):
-    file = tmp_path / WEIGHED_MASS_FILE
+    file = tmp_path / "step3" / "weighed_mass.csv"
     file.parent.mkdir()
     file.write_text(INPUTS.text(f"{name}.csv", (old, new)), encoding="utf-8")
     with refused(ERRORS[kind], sentence):
@@ -203,18 +186,18 @@ def test_the_release_is_the_integrators(wing):
         wing, young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), damping_alpha=1.03,
         damping_beta=7.66e-4, **MASSES,
     )  # fmt: skip
-    state = integrator.released(0.03, (0.0, 0.0), TIP_FORCE)
-    strain = [integrator.outputs(state)[:-1][RECORDED_GAUGE - 1]]
+    gauge, states = virtual_wing.RECORDED_GAUGE - 1, [integrator.released(0.03, (0.0, 0.0), TIP_FORCE)]
     for _ in time[1:]:
-        state = integrator.advance(state, 1e-3, (0.0, 0.0))
-        strain.append(integrator.outputs(state)[:-1][RECORDED_GAUGE - 1])
-    np.testing.assert_allclose(signal, SENSITIVITY * np.array(strain), atol=1e-12)
+        states.append(integrator.advance(states[-1], 1e-3, (0.0, 0.0)))
+    strain = np.array([integrator.outputs(state)[gauge] for state in states])
+    np.testing.assert_allclose(signal, virtual_wing.SENSITIVITY * strain, atol=1e-12)
     held = wing.static_response(
         young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), load_factor=0.0, tip_force=1.0
     )
     holding_force = 0.03 / held.displacement[0]
     # What six modes leave out of the static strain is small.
-    assert signal[0] == pytest.approx(SENSITIVITY * holding_force * held.strain[RECORDED_GAUGE - 1], rel=0.02)
+    static = virtual_wing.SENSITIVITY * holding_force * held.strain[gauge]
+    assert signal[0] == pytest.approx(static, rel=0.02)
     # overdamped and critical modes
     modes = wing.modes(young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), **MASSES)
     for beta in (0.03, 1.0 / (math.pi * modes.frequency[3])):
@@ -237,7 +220,7 @@ def test_records_give_back_the_truth(wing):
         assert average(trials, name, mode).mean == pytest.approx(value, rel=error)
     assert bench.tip_displacement(9.81) == pytest.approx(9.81 / wing.tip_stiffness(1.0073), rel=1e-12)
     with pytest.raises(ExperimentDataError, match="has 22 gauges, but a release is recorded at gauge 23"):
-        check_recorded(22)
+        virtual_wing.check_recorded(22)
     with pytest.raises(ExperimentDataError, match="frequency error"):
         VirtualWing(wing, TRUTH, frequency_error=(-1.0, 0.0))
     with pytest.raises(OutsideModelError, match="servo_mass"):

@@ -2,7 +2,7 @@
 
 import shutil
 import tomllib
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from discrepancy.document import Origin
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
-from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import collect_provenance
@@ -102,19 +102,21 @@ def hiding(
     return chosen(identifier)[0].patch(setting_of(campaign, model), values, place)
 
 
-def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:
-    """A simulated campaign of the single-mass rig."""
-    model = LumpedModel.load(MODEL)
-    outputs = tuple(item.name for item in model.description.output)
-    plan = plan_for(model, outputs, model.description.input[0].name)
+def simulated(model: Model, kind: Any, seed: int, hidden: Any = None, folder: Path | None = None) -> Campaign:
+    """Return an example that hides a patch, or an effect by name, values and place; half as long as usual."""
+    plan = plan_of(model)
     plan = replace(plan, duration=0.5 * plan.duration)
-    bare, patch = example_campaign(model, kind, 4, plan), ModelPatch()  # type: ignore[arg-type]
-    if hidden:
-        (effect,) = chosen(hidden)
-        values = {item.name: item.prior.value(0.0) for item in effect.parameters}
-        values[effect.parameters[0].name] = value
-        patch = hiding(bare, model, hidden, values, effect.places(setting_of(bare, model))[0])
-    return example_campaign(model, kind, 4, plan, patch), model  # type: ignore[arg-type]
+    if isinstance(hidden, tuple):
+        hidden = hiding(example_campaign(model, kind, seed, plan), model, *hidden)
+    if folder is not None:
+        return write_example(model, folder, kind, seed, plan, hidden)
+    return example_campaign(model, kind, seed, plan, hidden)
+
+
+def measured(drag: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:
+    """A simulated campaign of the single-mass rig, which may hide a drag."""
+    model, values = LumpedModel.load(MODEL), {"equivalent_damping_ratio": drag}
+    return simulated(model, kind, 4, ("quadratic_damping", values, "slide") if drag else None), model
 
 
 FEW = chosen(
@@ -126,7 +128,7 @@ FEW = chosen(
 @cache
 def drag_found() -> Investigation:
     """Quadratic damping, hidden in ring-downs and static trials of the rig, and found; group `verdict`."""
-    return investigate(*measured("quadratic_damping", 0.01), FEW, seed=3)
+    return investigate(*measured(0.01), FEW, seed=3)
 
 
 # ---------------------------------------------------------------- what is asked of models
@@ -137,7 +139,7 @@ Outputs = dict[str, Quantity] | tuple[tuple[str, Quantity], ...]
 def asked(kind: TrialKind, time: Any, **said: Any) -> Trial:
     """Return a trial at times [s], or of so many samples each 10 ms."""
     stamps = 0.01 * np.arange(time) if isinstance(time, int) else np.asarray(time, dtype=np.float64)
-    return Trial.plain("a trial", kind, said.pop("channels", ()), stamps, **said)
+    return Trial.plain(said.pop("name", "a trial"), kind, said.pop("channels", ()), stamps, **said)
 
 
 def seen(model: Model, what: Trial, outputs: Outputs, *items: Primitive, **given: Any) -> FloatArray:
@@ -161,3 +163,20 @@ def integrated(rate: Any, time: FloatArray, first: Any, parts: bool = False, **o
         moved = solve_ivp(rate, (time[k], time[k + 1]), states[-1], args=(k,), **limits)
         states.append(moved.y[:, -1])
     return np.array(states)
+
+
+def same(one: Any, other: Any, rtol: float = 0.0) -> bool:
+    """Compare records to the last bit in all they hold, or to rounding but for what files do not keep."""
+    if is_dataclass(one):
+        kept = [item.name for item in fields(one) if not rtol or (item.compare and item.name != "data_hash")]
+        return all(same(getattr(one, name), getattr(other, name), rtol) for name in kept)
+    if isinstance(one, dict):
+        return list(one) == list(other) and same(tuple(one.values()), tuple(other.values()), rtol)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(same(*pair, rtol) for pair in zip(one, other, strict=True))
+    if isinstance(one, np.ndarray | float):
+        first, second = np.asarray(one), np.asarray(other)
+        largest = np.abs(first).max(initial=0.0, where=np.isfinite(first)) if rtol else 0.0
+        alike = (first.dtype, first.shape) == (second.dtype, second.shape)
+        return alike and np.allclose(first, second, rtol=rtol, atol=rtol * largest, equal_nan=True)
+    return bool(one == other)

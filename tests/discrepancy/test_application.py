@@ -24,7 +24,7 @@ from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.sensing import observe
 from discrepancy.report.figures import ReportInput
 from discrepancy.search.strategy import search
-from discrepancy.sources.examples import example_campaign, plan_of, write_example
+from discrepancy.sources.examples import example_campaign, plan_of
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
@@ -34,7 +34,7 @@ from reporting.errors import FileNotWrittenError
 from reporting.files import collect_provenance
 from tests import command_line
 from tests.discrepancy.core.kit import problem_of
-from tests.discrepancy.rigs import chosen, fmu_rig, hiding
+from tests.discrepancy.rigs import chosen, fmu_rig, hiding, simulated
 
 
 def run(*words, failed=False):
@@ -57,13 +57,6 @@ def verdict_of(choice, campaign, effects, folder, *, replace_it=False):
     )  # fmt: skip
     write_verdict_folder(folder, ReportInput(found, origin), report=False, replace_it=replace_it)
     return found
-
-
-def example(choice, kind, seed, folder, effect, values, place):
-    """Write an example that hides an effect; what moves is half as long as usual."""
-    plan = replace(plan_of(choice.model), duration=0.5 * plan_of(choice.model).duration)
-    patch = hiding(example_campaign(choice.model, kind, seed, plan), choice.model, effect, values, place)
-    return write_example(choice.model, folder, kind, seed, plan, patch)
 
 
 # ---------------------------------------------------------------- round trips
@@ -135,7 +128,8 @@ def test_there_and_back_from_python(kind, foreign_fmu, write_beam, tmp_path):
     choice = choose_model(None if kind == "wing" else file)
     ports = choice.model.ports
     port = "tip" if "tip" in ports else ports[0]
-    campaign = example(choice, "static", 3, tmp_path / "campaign", "cubic_stiffness", CUBIC, port)
+    hidden = "cubic_stiffness", CUBIC, port
+    campaign = simulated(choice.model, "static", 3, hidden, tmp_path / "campaign")
     found = verdict_of(choice, campaign, SPRING, tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
     applied = uav_twin.apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
@@ -178,8 +172,8 @@ def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     choice = choose_model("three_mass_chain")
     effects = chosen("root_compliance", "breathing_crack")
-    share = {"compliance_share": 0.11}
-    campaign = example(choice, "static", 3, tmp_path / "campaign", "root_compliance", share, "")
+    hidden = "root_compliance", {"compliance_share": 0.11}, ""
+    campaign = simulated(choice.model, "static", 3, hidden, tmp_path / "campaign")
     verdict = verdict_of(choice, campaign, effects, tmp_path / "verdict").verdict
     assert verdict.kind is VerdictKind.GROUP, verdict.sentence
     assert set(verdict.group) == {"root_compliance", "breathing_crack"}
@@ -205,7 +199,8 @@ def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
 def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     """A hardening spring with nothing but a stiffness that drifts to explain it."""
     choice = choose_model("single_mass_rig")
-    campaign = example(choice, "ringdown", 4, tmp_path / "campaign", "cubic_stiffness", CUBIC, "slide")
+    hidden = "cubic_stiffness", CUBIC, "slide"
+    campaign = simulated(choice.model, "ringdown", 4, hidden, tmp_path / "campaign")
     found = verdict_of(choice, campaign, chosen("stiffness_drift"), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
     assert gives(found.verdict)
@@ -283,7 +278,7 @@ def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
     assert len(first.model.patch)
     drag = "quadratic_damping", {"equivalent_damping_ratio": 0.02}, "slide"
-    campaign = example(first, "ringdown", 5, tmp_path / "campaign", *drag)
+    campaign = simulated(first.model, "ringdown", 5, drag, tmp_path / "campaign")
     found = verdict_of(first, campaign, chosen("quadratic_damping"), tmp_path / "verdict")
     assert [item.identifier for item in found.verdict.effects] == ["quadratic_damping"]
     beneath = (str(laboratory / "rig.toml"), str(tmp_path / "first.json"))
@@ -317,10 +312,9 @@ def test_a_built_in_sensor_is_that_of_its_channel():
 def test_friction_in_the_model_is_fitted_from_the_beginnings():
     """A motion that friction ends has many optima; from the prior means the fit ends far off in one."""
     model = uav_twin.load_model("single_mass_rig")
-    plan = plan_of(model)
-    bare = example_campaign(model, "ringdown", 1, plan)
-    patch = hiding(bare, model, "coulomb_friction", {"friction_ratio": 0.04}, "slide")
-    campaign, patched = example_campaign(model, "ringdown", 1, plan, patch), model.patched(patch)
+    friction = "coulomb_friction", {"friction_ratio": 0.04}, "slide"
+    campaign = simulated(model, "ringdown", 1, friction)
+    patched = model.patched(hiding(campaign, model, *friction))
     problem = problem_of(campaign, patched)
     count = problem.counts.sum()
     assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count

@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 
 from evidence.sandwich_plate import __main__ as command
+from evidence.sandwich_plate import plate_known_answers as plates
 from evidence.sandwich_plate.plate import FIELDS, B, W
 from evidence.sandwich_plate.plate_comparison import compare_with_plate, gauges_at_edges
 from evidence.sandwich_plate.plate_frame import strip_stiffness
-from evidence.sandwich_plate.plate_known_answers import (
-    FlatSandwich,
-    cantilever_strip,
-    square_plate_deflection,
-    square_plate_frequency,
-)
 from evidence.sandwich_plate.plate_layout import PlateLayout
 from evidence.sandwich_plate.sandwich_plate import assemble_plate
 from evidence.verification import calculix_examples as examples
@@ -27,7 +22,7 @@ from fe.wing.operators import point_masses
 from tests import command_line
 from tests.calculix_decks import needs_calculix
 
-CHECKS = (square_plate_deflection, square_plate_frequency, cantilever_strip)
+CHECKS = (plates.square_plate_deflection, plates.square_plate_frequency, plates.cantilever_strip)
 
 
 @pytest.mark.parametrize("check", CHECKS)
@@ -37,7 +32,8 @@ CHECKS = (square_plate_deflection, square_plate_frequency, cantilever_strip)
 )
 def test_closed_forms_are_met_with_the_order_of_the_element(check, core_shear, cells, error, orders):
     """Four where the core shears as much as the plate bends; one that hardly shears locks mildly."""
-    plate = FlatSandwich(core_shear=core_shear, poisson_ratio=0.0 if check is cantilever_strip else 0.3)
+    ratio = 0.0 if check is plates.cantilever_strip else 0.3
+    plate = plates.FlatSandwich(core_shear=core_shear, poisson_ratio=ratio)
     errors = [abs(check(count, plate).relative_error) for count in cells]
     assert errors[-1] < error
     assert all(orders[0] < np.log2(coarse / fine) < orders[1] for coarse, fine in itertools.pairwise(errors))

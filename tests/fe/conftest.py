@@ -3,9 +3,7 @@ from threadpoolctl import threadpool_limits
 
 from fe.reduction.model_cache import WingFields, field_basis
 from fe.reduction.reduced_basis import Reduction, reduce_structure
-from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators
 from tests.kept import FE, kept
@@ -21,11 +19,6 @@ def coarse_reduction(coarse_design: WingDesign, coarse_operators: AffineOperator
 def coarse_fields(coarse_operators: AffineOperators, coarse_reduction: Reduction) -> WingFields:
     with threadpool_limits(1):
         return field_basis(coarse_operators, coarse_reduction)
-
-
-@pytest.fixture(scope="session")
-def coarse_patched_wing(coarse_patch_arrays: PatchArrays) -> PatchedWing:
-    return PatchedWing(coarse_patch_arrays)
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,7 @@
-"""What these tests make things with: archives, changed FMUs, bindings, systems, other processes."""
+"""What these tests make things with: archives, changed FMUs, bindings, systems, others' FMUs, processes."""
 
+import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -8,12 +10,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import fmpy
+import pytest
+
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.structure import Component, Connection, Connector, SystemStructure, expand_connection
 from fmu_asset.door.binding import Binding, parse_binding
+from tests.kept import packed
 
 ROOT = Path(__file__).parents[2]
-DESCRIPTION = "modelDescription.xml"
+DESCRIPTION, XML = "modelDescription.xml", (".xml", ".ssd", ".ssv", ".ssm")
 
 
 def tables(test: str, name: str = "refused") -> dict[str, Any]:
@@ -35,14 +41,14 @@ def archive_of(path: Path, contents: Mapping[str, str | bytes]) -> Path:
     return path
 
 
-def edited(fmu: Path, target: Path, *changes: tuple[str, str], entry: str = DESCRIPTION) -> Path:
-    """Write a copy of an FMU with texts of one entry, its model description, replaced."""
-    contents = members(fmu)
-    text = contents[entry].decode()
+def edited(archive: Path, target: Path, *changes: tuple[str, str]) -> Path:
+    """Write a copy of an FMU, or of an SSP file, with texts of its XML files replaced."""
+    contents = members(archive)
     for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    return archive_of(target, contents | {entry: text.encode()})
+        there = [name for name in contents if name.endswith(XML) and old.encode() in contents[name]]
+        assert there
+        contents |= {name: contents[name].replace(old.encode(), new.encode()) for name in there}
+    return archive_of(target, contents)
 
 
 def parameters_of(fmu: Path) -> dict[str, float]:
@@ -100,3 +106,58 @@ def watch(*names: str, step_size: float = 1.0, inputs: Sequence[str] = (), **hea
     """Return a binding that observes ends of a system, all without unit."""
     control = {name: (name, "1") for name in inputs}
     return bound(step_size, {"all": (list(names), "1")}, control=control, header={"name": "watch", **header})
+
+
+# ---------------------------------------------------------------- others' FMUs
+
+FOREIGN = Path(__file__).with_name("foreign")
+MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
+"""One of each version and interface."""
+HEADERS = Path(fmpy.__file__).parent / "c-code"
+
+
+class Workshop:
+    """Builds small FMUs of FMI 1, 2 and 3 from C sources, as others' tools export them; each model once.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the FMUs are put.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._built: dict[tuple[str, tuple[str, ...]], Path] = {}
+
+    def __call__(self, model: str, *defines: str) -> Path:
+        """Return the FMU of a model, such as `ball2`, compiled with preprocessor definitions."""
+        key = (model, defines)
+        if key not in self._built:
+            path = self._folder / f"{'_'.join([model, *defines]).lower()}.fmu"
+            self._built[key] = packed(path, lambda: self._build(path, model, defines), (FOREIGN,), defines)
+        return self._built[key]
+
+    def _build(self, path: Path, model: str, defines: tuple[str, ...]) -> None:
+        compiler = shutil.which("gcc") or shutil.which("cc")
+        if compiler is None:
+            pytest.skip("there is no C compiler (gcc or cc), which the foreign FMUs are built with")
+        version = re.fullmatch(r"[a-z]+(\d)", model)
+        assert version is not None
+        description = (FOREIGN / f"{model}.xml").read_text(encoding="utf-8")
+        exchange = ["-DMODEL_EXCHANGE"] if "<Implementation>" not in description else []
+        library = path.with_suffix(".so")
+        subprocess.run(
+            [
+                compiler, "-shared", "-fPIC", "-O1", "-w", f"-I{HEADERS}", f"-I{FOREIGN}", *exchange,
+                f"-DIDENTIFIER={model}", *(f"-D{define}" for define in defines),
+                str(FOREIGN / f"{model}.c"), str(FOREIGN / f"frame{version[1]}.c"), "-o", str(library), "-lm",
+            ],
+            check=True,
+        )  # fmt: skip
+        platform = fmpy.platform_tuple if version[1] == "3" else fmpy.platform
+        binary = f"binaries/{platform}/{model}.so"
+        archive_of(path, {DESCRIPTION: description, binary: library.read_bytes()})
+
+    def changed(self, model: str, name: str, *changes: tuple[str, str]) -> Path:
+        """Return a copy of a model's FMU with texts of its model description replaced."""
+        return edited(self(model), self._folder / f"{name}.fmu", *changes)

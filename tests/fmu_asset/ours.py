@@ -6,10 +6,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
 from threadpoolctl import threadpool_limits
 
-from fe.reduction import patch_basis
 from fe.reduction.model_cache import build_patch_arrays
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.reduced import ReducedModel
@@ -19,14 +17,11 @@ from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import companion_bytes
-from fmu_asset.compiled.package import find_compiler
-from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
-from tests.conftest import BEAM
 from tests.fmu_asset.making import tables
 from tests.kept import FE, ROOT, compiled_wing, exported, kept
 
@@ -54,15 +49,8 @@ def wing_model(name: str = "wing") -> ReducedModel:
 
 @cache
 def wing_arrays() -> PatchArrays:
-    """Return the wing for patches, in few vectors: what they hold is the same on both sides of a test."""
-
-    def few() -> PatchArrays:
-        with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
-            patch.setattr(patch_basis, "VECTORS", 60)
-            patch.setattr(patch_basis, "STATES", 40)
-            return build_patch_arrays(DESIGNS["wing"])
-
-    return kept("few-patches", few, FE)
+    """Return that wing for patches."""
+    return kept("coarse-patches", lambda: build_patch_arrays(DESIGNS["wing"]), FE, DESIGNS["wing"].hash)
 
 
 class OurFmus:
@@ -88,10 +76,7 @@ class OurFmus:
         options = self.options(name)
         if options.get("kind") != "compiled":
             return build_fmu(self.model(name), path, **options).path
-        try:
-            find_compiler()
-        except FmuBuildError as error:
-            pytest.skip(f"no C compiler: {error}")
+        self._fixture("compiler")  # skips where there is none
         return compiled_wing(self.model(name), path, **options)
 
     def model(self, name: str) -> ReducedModel:
@@ -99,7 +84,7 @@ class OurFmus:
         which = STRUCTURES[name]["model"]
         if which in DESIGNS:
             return wing_model(which)
-        return kept("beam", lambda: self._fixture("beam_reduction").model, FE, BEAM)
+        return self._fixture("beam_reduction").model
 
     def options(self, name: str) -> dict[str, Any]:
         """Return the options of `build_fmu` for a structure's FMU."""

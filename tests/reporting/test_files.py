@@ -1,13 +1,22 @@
-"""Files are whole or not there; NetCDF is written for xarray without it, and read whatever HDF5 does."""
+"""Files are whole or not there; NetCDF is written for xarray without it, and read whatever HDF5 does.
+
+Provenance names what made a result and nothing else; records as plain data; what is kept in memory.
+"""
 
 import errno
 import gc
+import json
+import math
 import os
+import pickle
+import socket
 import stat
 import subprocess
 import sys
 import time
 import warnings
+from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +24,12 @@ import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from reporting import files, netcdf
 from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
+from reporting.json_file import plain
+from reporting.memory import Memory
 from reporting.netcdf import Group, Variable, read_groups, write_groups
 from tests.refusals import refused
 
@@ -155,21 +167,6 @@ def test_xarray_and_we_read_what_was_written(groups, tmp_path_factory):
                 assert variable.values.dtype.kind == "U" or values.tobytes() == variable.values.tobytes()
 
 
-def test_a_run_is_flown_and_stored_without_heavy_libraries():
-    """`uav-twin run --no-report` reads the program's modules and none of these."""
-    code = (
-        "import sys, twin_master.workflow, twin_master.assets.design_source\n"
-        "import calibration.paper.load_test\n"
-        "import calibration.static.errors_in_variables, calibration.static.experiments\n"
-        "import calibration.static.posterior\n"
-        "heavy = {'xarray', 'pandas', 'dask', 'distributed', 'zarr', 'matplotlib', 'bokeh', 'skfem', 'pymor',"
-        " 'meshio', 'scipy.interpolate', 'scipy.optimize', 'scipy.sparse'}\n"
-        "print(*sorted(heavy & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     begin = Variable(("trial",), np.array([0.0, 1.0]), {"units": "hours since 2020-01-01"})
@@ -269,3 +266,77 @@ def test_the_fork_holds_no_file_of_this_process(path, monkeypatch):
     assert {"0", "1", "2"} < set(listed)
     assert number not in listed
     assert len(listed) <= 6  # the pipe, the null device beside its place as 2, and this listing
+
+
+# ---------------------------------------------------------------- provenance, plain data, memory
+
+
+def test_a_record_names_versions_and_sources_and_no_machine():
+    def collected(**hashes: str) -> files.Provenance:
+        names = ["numpy", "no-such-distribution"]
+        return files.collect_provenance(7, input_hashes=hashes, distributions=names)
+
+    record = collected(z="1", a="2")
+    assert record == collected(a="2", z="1")
+    told = record.as_dict()
+    python = told["versions"].pop("python")
+    assert python.count(".") == 2
+    assert told["versions"] == {"numpy": np.__version__, "no-such-distribution": "not installed"}
+    assert (told["seed"], list(told["input_hashes"])) == (7, ["a", "z"])
+    assert {len(value) for value in told["source_hashes"].values()} == {64}
+    assert len({*told["source_hashes"].values()}) == len(files.SOURCE_PACKAGES)
+    assert "/" not in json.dumps(told)
+    assert socket.gethostname() not in json.dumps(told)
+    with pytest.raises(ValueError, match="no package"):
+        files.source_hash("no_such_package")
+
+
+def test_hashes_see_names_and_contents_but_neither_line_ends_nor_order(tmp_path):
+    def hashed(**contents: bytes) -> str:
+        for path in tmp_path.iterdir():
+            path.unlink()
+        for name, content in contents.items():
+            (tmp_path / f"{name}.py").write_bytes(content)
+        (tmp_path / "ignored.pyc").write_bytes(b"cache")
+        return files.hash_tree(tmp_path, suffixes=[".py"])
+
+    reference = hashed(a=b"x\n", b=b"y\n")
+    assert reference == hashed(b=b"y\n", a=b"x\r\n")
+    assert reference != hashed(a=b"x\n", c=b"y\n")
+    assert reference != hashed(a=b"x\ny\n", b=b"")
+    assert hashed(a=b"x", b=b"y") != hashed(a=b"xy", b=b"")
+    one, other = {"a": 1, "b": [1.5, "µ"]}, {"b": [1.5, "µ"], "a": 1}
+    assert files.hash_record(one) == files.hash_record(other)
+    with pytest.raises(ValueError, match=r"[Oo]ut of range|not JSON"):
+        files.hash_record({"a": float("nan")})
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    value: float
+    inner: "tuple[Record, ...]" = ()
+    words: tuple[str, ...] = ("x",)
+    values: NDArray[np.float64] | None = None
+
+
+def test_a_record_is_plain_data_of_json():
+    record = Record(math.nan, (Record(0.1), Record(2)), values=np.array([0.1, 2.0]))
+    own = {"inner": [], "words": ["x"], "values": None}
+    expected = {"value": None, "inner": [{"value": 0.1} | own, {"value": 2} | own], "words": ["x"]}
+    assert json.loads(json.dumps(plain(record), allow_nan=False)) == expected | {"values": [0.1, 2.0]}
+    assert plain({7: HTTPStatus.NOT_FOUND}) == {"7": 404}
+
+
+def test_the_least_recently_used_are_forgotten_where_there_is_no_room():
+    ended = list[str]()
+    kept = Memory(6, weight=len, end=ended.append)
+    for text in ("one", "two", "one", "four"):  # seven letters do not fit
+        assert kept.get(text, lambda text=text: text) == text
+    assert ended == ["two", "one"]
+    kept.get("a", lambda: "a")
+    assert kept.get("four", lambda: "made anew") == "four"
+    assert (
+        pickle.loads(pickle.dumps(kept)).get("a", lambda: "anew") == "anew"
+    )  # another process is handed nothing
+    kept.clear()
+    assert ended == ["two", "one", "a", "four"]

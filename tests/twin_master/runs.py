@@ -2,14 +2,15 @@
 
 import json
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-import uav_twin
+from fe.runtime.patch import ModelPatch, Primitive
+from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
@@ -20,9 +21,10 @@ from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.turns import History, Turn
+from twin_master.network.estimator import Estimator
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from uav_twin import load_scenario, reduced_model
+from uav_twin import Estimate, load_scenario, reduced_model
 
 
 def edited(text: str, *changes: tuple[str, str]) -> str:
@@ -106,6 +108,21 @@ def flight_of(
     return fly(knowledge.scenario, knowledge.twin(), plant, *sinks)
 
 
+def estimates_of(estimator: Estimator, seen: Any, controls: Sequence[int] | None = None) -> list[Estimate]:
+    """Return what an estimator makes of turns, under their controls or always the first one."""
+    estimates: list[Estimate] = []
+    for turn, (row, control) in enumerate(zip(seen, controls or [0] * len(seen), strict=True)):
+        before = estimates[-1].carried if estimates else None
+        estimates.append(estimator.turn(before, row, control, turn))
+    return estimates
+
+
+def patch_record(*primitives: Primitive, channel: str = "g5") -> dict[str, Any]:
+    """Return a patch of hidden effects, in which a gauge has a name."""
+    effects = [{"id": "hidden", "primitives": ModelPatch(primitives).to_list()}]
+    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
+
+
 def figures_of(folder: Path) -> dict[str, Any]:
     """Return the figures in the summary of a run."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
@@ -144,11 +161,3 @@ def check_same(first: Path, second: Path, *names: str) -> None:
     """Compare files of two folders to the last bit."""
     for name in names:
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
-
-
-def check_resumed(whole: Path, loaded: LoadedScenario, part: Path, turns: int, *names: str) -> None:
-    """Fly a mission again, cut off after some turns, and resume it: `whole`, to the last bit."""
-    with cut_off_after(turns):
-        uav_twin.fly(loaded, part, report=False)
-    uav_twin.resume(part, report=False)
-    check_same(part, whole, "run.nc", "config.json", "summary.json", "journal.jsonl", *names)

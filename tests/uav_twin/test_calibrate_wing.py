@@ -24,7 +24,6 @@ from fe.wing.design import SHIPPED_DESIGN
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.structure_fmu import build_fmu
 from tests.command_line import refused, said
-from tests.kept import FE, ROOT, kept_folder
 from tests.twin_master.runs import check_same, written
 from twin_master.assets.virtual_experiments import FmuTestBench
 from uav_twin import FmiAsset, load_calibration, reduced_model
@@ -126,9 +125,7 @@ def soft(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
         total_mass=weighed(2.0 * SOFT.servo_mass + SOFT.pitot_mass, 1e-3),
     )
     words, out = ("calibrate", "--data", lab, "--asset", "soft", "--fitted"), lab.with_name("calibrated")
-    measured = [path.read_bytes() for path in sorted(lab.rglob("*")) if path.is_file()]
-    places = (*FE, ROOT / "calibration", ROOT / "uav_twin")
-    told = kept_folder(out, lambda: said(*words, "--out", out), places, measured)
+    told = said(*words, "--out", out)
     return Calibrated(words, out, told, load_calibration(out / "calibration.nc"))
 
 

@@ -4,7 +4,6 @@ import csv
 import json
 import math
 import re
-import zipfile
 from contextlib import closing
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from scenarios import binding_files
 from tests.command_line import command, refused, said
+from tests.fmu_asset.making import DESCRIPTION, archive_of, edited, members
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
@@ -156,9 +156,7 @@ def test_the_version_and_interface_are_those_that_were_asked_for(tmp_path):
     ):
         path = tmp_path / f"{options[1]}.fmu"
         said("fmu", "build", "--kind", "source", *options, "--out", path)
-        with zipfile.ZipFile(path) as archive:
-            text = archive.read("modelDescription.xml").decode()
-        assert all(part in text for part in expected)
+        assert all(part in members(path)[DESCRIPTION].decode() for part in expected)
 
 
 def test_an_fmu_is_bound_and_checked(foreign_fmu, tmp_path):
@@ -194,9 +192,8 @@ def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
     foreign_fmu, tmp_path, monkeypatch
 ):
     fmu, elsewhere = foreign_fmu("ball2"), tmp_path / "elsewhere.fmu"
-    with zipfile.ZipFile(fmu) as old, zipfile.ZipFile(elsewhere, "w") as new:
-        for name in old.namelist():
-            new.writestr(name.replace("linux64", "win64").replace(".so", ".dll"), old.read(name))
+    for_windows = {n.replace("linux64", "win64").replace(".so", ".dll"): c for n, c in members(fmu).items()}
+    archive_of(elsewhere, for_windows)
     record, other = (json.loads(said("fmu", "info", file, "--json")) for file in (fmu, elsewhere))
     assert (record["file"], record["obstacle"]) == (str(fmu), "")
     assert "no binary for this platform" in other["obstacle"]
@@ -239,36 +236,20 @@ END = "</ssm:ParameterMapping>"
 
 
 @pytest.fixture(scope="module")
-def scenario(heat_exchanger: Path) -> Path:
-    return heat_exchanger / "fouling.toml"
-
-
-@pytest.fixture(scope="module")
-def system(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def system(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The heat exchanger as an SSP file."""
     place = tmp_path_factory.mktemp("system") / "x.ssp"
-    assert "x.ssp: " in said("ssp", "export", scenario, "--out", place)
+    assert "x.ssp: " in said("ssp", "export", heat_exchanger / "fouling.toml", "--out", place)
     return place
 
 
-def changed(system: Path, target: Path, **pairs: str) -> Path:
-    """Write a system with texts of its XML files replaced."""
-    with zipfile.ZipFile(system) as old, zipfile.ZipFile(target, "w") as new:
-        for name in old.namelist():
-            content = old.read(name)
-            for before, after in pairs.items() if not name.endswith(".fmu") else ():
-                content = content.replace(before.encode(), after.encode())
-            new.writestr(name, content)
-    return target
-
-
-def mapped(*entries: tuple[str, str]) -> dict[str, str]:
+def mapped(*entries: tuple[str, str]) -> tuple[str, str]:
     """What adds entries, sources and targets, to the mapping of parameters."""
     texts = (f'<ssm:MappingEntry source="{one}" target="heat_exchanger.{other}" />' for one, other in entries)
-    return {END: "".join(texts) + END}
+    return END, "".join(texts) + END
 
 
-def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(scenario, system, tmp_path):
+def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(heat_exchanger, system, tmp_path):
     """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
     text = said("ssp", "check", system)
     assert "no problem found; 7 connections, 2 parameters" in text
@@ -291,34 +272,36 @@ def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(scenario, syst
     asked = "asks for linear interpolation of inputs, but no component"
     assert asked in refused(*simulate, "--interpolation", "linear")
     out = tmp_path / "run"
-    said("run", system, "--scenario", scenario, "--out", out, "--in-process", "--no-report", "-q")
+    options = "--out", out, "--in-process", "--no-report", "-q"
+    said("run", system, "--scenario", heat_exchanger / "fouling.toml", *options)
     assert (out / "asset" / "system.ssp").read_bytes() == system.read_bytes()
     assert (out / "csv" / "observed.csv").is_file()
 
 
-def test_what_nothing_takes_is_a_warning_and_not_flown(scenario, system, tmp_path):
+def test_what_nothing_takes_is_a_warning_and_not_flown(heat_exchanger, system, tmp_path):
     """The nearest name is said; what another entry gives is not missed."""
-    file = changed(system, tmp_path / "more.ssp", **mapped(("conductance", "baffle")))
+    file = edited(system, tmp_path / "more.ssp", mapped(("conductance", "baffle")))
     named = f"{file} sets parameters that nothing takes: heat_exchanger.baffle; correct"
     for words in (("check", file), ("simulate", file, "--stop-time", "1", "--in-process")):
         assert f"warning: {named}" in " ".join(said("ssp", *words).split())
     assert json.loads(said("ssp", "check", file, "--json"))["unused"] == ["heat_exchanger.baffle"]
     more = mapped(("conductance", "conductanse"), ("cold", "wall_temperature"))
-    file = changed(system, tmp_path / "misspelt.ssp", **more)
+    file = edited(system, tmp_path / "misspelt.ssp", more)
     meant = "heat_exchanger.conductanse (did you mean 'heat_exchanger.conductance'?)"
     named = f"{file} sets parameters that nothing takes: {meant}"
     assert f"warning: {named}" in " ".join(said("ssp", "check", file).split())
     out = tmp_path / "run"
-    assert named in refused("run", file, "--scenario", scenario, "--out", out, "-q")
+    assert named in refused("run", file, "--scenario", heat_exchanger / "fouling.toml", "--out", out, "-q")
     assert not out.exists()
 
 
 def test_the_words_of_ssp_2_are_read(system, tmp_path):
     """The numbers of FMI 3, metadata and the version; what 1.0 has no word for is refused."""
     meta = '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />'
-    words = {'version="1.0" name=': 'version="2.0" name=', "</ssd:SystemS": f"{meta}</ssd:SystemS"}
-    words |= {"ssc:Real": "ssc:Float64", "ssv:Real": "ssv:Float64"}
-    newer, tables = changed(system, tmp_path / "newer.ssp", **words), [tmp_path / "0.csv", tmp_path / "1.csv"]
+    words = ('version="1.0" name=', 'version="2.0" name='), ("</ssd:SystemS", f"{meta}</ssd:SystemS")
+    numbers = ("ssc:Real", "ssc:Float64"), ("ssv:Real", "ssv:Float64")
+    newer = edited(system, tmp_path / "newer.ssp", *words, *numbers)
+    tables = [tmp_path / "0.csv", tmp_path / "1.csv"]
     for file, table in zip((system, newer), tables, strict=True):
         said("ssp", "simulate", file, "--out", table, "--step-size", "0.25", "--in-process")
     assert tables[0].read_bytes() == tables[1].read_bytes()
@@ -328,7 +311,7 @@ def test_the_words_of_ssp_2_are_read(system, tmp_path):
         ('kind="parameter"', 'kind="structuralParameter"', "a connector of the kind structuralParameter"),
         (' source="resources/heat_exchanger.fmu"', "", "'heat_exchanger' without a source"),
     ):
-        bad = changed(newer, tmp_path / "bad.ssp", **{what: by})
+        bad = edited(newer, tmp_path / "bad.ssp", (what, by))
         assert sentence in refused("ssp", "simulate", bad)
 
 

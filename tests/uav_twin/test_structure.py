@@ -73,9 +73,12 @@ def test_a_structure_is_reduced_and_compared(write_beam, tmp_path, monkeypatch):
     """`structure reduce` says ranges and measured errors; a second call finds the model in the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     file = str(write_beam(tmp_path))
-    record = json.loads(said("structure", "reduce", file, "--json", "--states", "2", "--quiet"))
+    record = json.loads(said("structure", "reduce", file, "--json", "--states", "4", "--quiet"))
     assert record["ranges"]["z1"] == [0.0, 0.8]
-    assert record["errors"]["strain"] < record["errors"]["bound"] < 1e-3
+    errors = record["errors"]  # the bound holds, nearly as asked for, and tells the error within a few times
+    assert max(errors["strain"], errors["displacement"]) < errors["bound"] < min(1e-3, 15 * errors["strain"])
+    assert (errors["broken"], errors["states"]) == (0, 4)
+    assert errors["frequency"] < 2e-5
     kept = list((tmp_path / "cache" / "uav-twin").glob("structure-*.npz"))
     before = kept[0].stat().st_mtime_ns
     assert "load_factor" in said("structure", "reduce", file, "--states", "0")
@@ -95,32 +98,16 @@ def test_the_field_is_written_for_paraview(file, tmp_path):
 
 SKIN = stiffened_skin()
 CORNER = SKIN.node[300.0, 0.0, 0.0]
-GAUGES = {"patch": ((50.0, 50.0), (150.0, 50.0)), "skin": ((50.0, 150.0), (150.0, 150.0))}
-LENGTH = 100.0  # mm
-
-
-def ends(name: str) -> list[int]:
-    """Nodes of a gauge."""
-    return [SKIN.node[x, y, 0.0] for x, y in GAUGES[name]]
-
-
-def calculix(folder: Path, e: float, loss: float) -> tuple[dict[str, float], float]:
-    """Strains of the gauges and deflection of the corner [mm] under 1 N, by CalculiX."""
-    deck = stiffened_skin(skin=e, patch=e * (1.0 - loss))
-    (found,) = solved(deck, folder, [(CORNER, (0.0, 0.5, 1.0))])
-    strain = {}
-    for name in GAUGES:
-        first, last = ends(name)
-        strain[name] = float(found[last][0] - found[first][0]) / LENGTH
-    return strain, float(found[CORNER][2])
+PATCH, OTHER = ([SKIN.node[x, y, 0.0] for x in (50.0, 150.0)] for y in (50.0, 150.0))
+"""Nodes at the ends of two gauges of 100 mm, on the patch and beside it."""
 
 
 @pytest.fixture(scope="module")
 def matrices(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The structure file beside the matrices that CalculiX stored."""
-    places = ("PATCH", ends("patch")), ("SKIN", ends("skin")), ("CORNER", CORNER), ("CORNER", CORNER)
+    places = ("PATCH", PATCH), ("SKIN", OTHER), ("CORNER", CORNER), ("CORNER", CORNER)
     tables = INPUTS.text("skin.toml", *((place, str(nodes)) for place, nodes in places))
-    return write_structure(tmp_path_factory.mktemp("skin"), stiffened_skin, tables)
+    return write_structure(tmp_path_factory.mktemp("skin"), tables)
 
 
 @needs_calculix
@@ -141,32 +128,6 @@ def test_every_command_takes_it(matrices, tmp_path):
 
 
 @needs_calculix
-def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(matrices, tmp_path):
-    """What CalculiX answers with 0.96 times the modulus, read with noise."""
-    strain, corner = calculix(tmp_path, 0.96, 0.0)
-    random = np.random.default_rng(7)
-    lines = [
-        f"{force},{1e6 * strain['patch'] * force + 0.5 * random.standard_normal()!r},"
-        f"{corner * force + 0.02 * random.standard_normal()!r}"
-        for force in range(100, 1001, 100)
-    ]
-    lab = tmp_path / "lab"
-    lab.mkdir()
-    (lab / "pushes.csv").write_text("\n".join(["force,patch,corner", *lines]) + "\n", encoding="utf-8")
-    (lab / "campaign.toml").write_text(INPUTS.text("skin_campaign.toml"), encoding="utf-8")
-    rig = tmp_path / "rig.toml"
-    said("structure", "fmu", matrices, "--out", tmp_path / "s.fmu", "--rig", rig)
-    words = ("--model", rig, "--asset", "skin 1", "--out", tmp_path / "out", "--no-report")
-    said("calibrate", "campaign", lab, *words)
-    found = load_calibration(tmp_path / "out" / "calibration.nc")
-    assert abs(found.mean("e") - 0.96) < 3.0 * found.standard_deviation("e") < 0.01
-    told = said(
-        "discrepancy", "run", lab, "--model", matrices, "--out", tmp_path / "verdict", "--no-report", "--json"
-    )
-    assert json.loads(told)["verdict"]["kind"] == "nothing missing"
-
-
-@needs_calculix
 def test_a_twin_finds_the_patch_that_calculix_weakened(matrices, tmp_path):
     """The strains flown are CalculiX' with that patch."""
     scenario = parse_scenario(INPUTS.table("skin_mission.toml"), "mission")
@@ -174,12 +135,11 @@ def test_a_twin_finds_the_patch_that_calculix_weakened(matrices, tmp_path):
     folder = fly(loaded, tmp_path / "run", report=False).folder
     tree = open_run(folder)
     assert tree["truth"]["state"].values[-1] == pytest.approx([0.4])
-    strain, _ = calculix(tmp_path / "calculix", 1.03, 0.4)
-    wanted, flown = (
-        float(tree["observed"]["push"][-1]) * np.array([*strain.values()]),
-        tree["truth"]["strain"],
-    )
-    np.testing.assert_allclose(flown.values[-1], wanted, rtol=0.0, atol=1e-3 * np.abs(wanted).max())
+    deck = stiffened_skin(skin=1.03, patch=1.03 * (1.0 - 0.4))
+    (found,) = solved(deck, tmp_path / "calculix", [(CORNER, (0.0, 0.5, 1.0))])  # by 1 N
+    strain = np.array([float(found[last][0] - found[first][0]) / 100.0 for first, last in (PATCH, OTHER)])
+    wanted, flown = float(tree["observed"]["push"][-1]) * strain, tree["truth"]["strain"].values[-1]
+    np.testing.assert_allclose(flown, wanted, rtol=0.0, atol=1e-3 * np.abs(wanted).max())
     assert tree["filtered"]["mean"].values[-1] == pytest.approx([0.4], abs=0.1)
     copies = {path.name for path in (folder / "asset" / "flown").iterdir()}
     assert {"whole.sti", "whole.mas", "whole.dof", "patch_half.sti", "skin_half.sti"} <= copies

@@ -377,7 +377,7 @@ class RecordedStructure(Asset):
         assert scenario.truth.record is not None
         self._scenario, self._model = scenario, model
         self._section, self._record = scenario.observation.modes, scenario.truth.record
-        bound = binding.with_header(step_size=1.0 / self._record.sampling_rate)
+        bound = binding.with_header(step_size=1.0 / self._record.sampling_rate, decimation=1)
         self._parameters = {**parameters, "response": 2.0}
         self._session = session(bound, self._parameters)
         begin, names = bound.observation_slice("acceleration").start, self._section.accelerometers

@@ -70,7 +70,7 @@ def export_scenario(
             binding = _with_own_names(binding, source.path(FMU_COPY), source.parameters())
             wiring = single_system(scenario.mission.name, source.path(FMU_COPY), binding)
         wiring, names = _with_values(wiring, binding, source.parameters(), scenario.asset.constant_load)
-        stop = scenario.mission.steps * binding.step_size
+        stop = binding.binding.start_time + scenario.mission.steps * binding.interval
         return write_ssp(wiring, out, parameter_names=names, stop_time=stop, replace=replace_file)
 
 
@@ -140,4 +140,5 @@ def _with_values(
         for name, item in table.items()
         if len(system.ends[item.variable]) == 1
     }
-    return Wiring(replace(wiring.structure, components=components)), names
+    span = binding.binding.start_time, None
+    return Wiring(replace(wiring.structure, components=components, span=span)), names

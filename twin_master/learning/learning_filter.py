@@ -152,7 +152,8 @@ class LearningFilter:
         model if left out.
     name : str
         Name of the twin, for messages.
-
+    sensor_units : sequence of str, optional
+        Of each sensor; "1" if left out.
     """
 
     def __init__(
@@ -163,12 +164,13 @@ class LearningFilter:
         draws: tuple[str, ArrayLike] | None = None,
         transitions: Mapping[float, TransitionModel] | None = None,
         name: str = "twin",
-        sensor_unit: str = "1",
+        sensor_units: Sequence[str] = (),
     ) -> None:
         moves = transitions or {1.0: model.transition}
         self.model, self.sensor_model, self._name = model, sensor_model, name
-        self.draws, self._factors, self._unit = draws, np.array([*moves]), sensor_unit
+        self.draws, self._factors = draws, np.array([*moves])
         count, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
+        self._units = sensor_units or ("1",) * sensors
         blocks = zip(*(move.blocks for move in moves.values()), strict=True)
         self._transition = TransitionModel(tuple(map(np.concatenate, blocks)))  # one factor after the other
         self._draw: Index = np.tile(np.arange(count), factors)
@@ -312,16 +314,15 @@ class LearningFilter:
             deviation = np.sqrt(np.maximum(weight @ left / (shape - 1.0) - mean**2, 0.0))
             for g, figures in enumerate(np.column_stack([mean, deviation, low, high]).tolist(), 1):
                 result[f"noise_scale[{g}]"] = Learnt(*figures)
-        for column, prior, name, unit in (
-            (0, self._gauges.offset, "gauge_offset", self._unit),
-            (1, self._gauges.gain, "gauge_gain", "1"),
+        for column, prior, name, units in (
+            (0, self._gauges.offset, "gauge_offset", self._units),
+            (1, self._gauges.gain, "gauge_gain", ("1",) * len(self._units)),
         ):
             mean = weight @ fitted[..., column]
             spread = weight @ (fitted[..., column] ** 2 + scale2 * fitted[..., 2 + 2 * column]) - mean**2
             deviation = np.sqrt(np.maximum(spread, 0.0))
             for g in np.flatnonzero(prior > 0.0).tolist():
                 own, wide = float(mean[g] * prior[g]), float(deviation[g] * prior[g])
-                result[f"{name}[{g + 1}]"] = Learnt(
-                    own, wide, own - _NORMAL * wide, own + _NORMAL * wide, unit
-                )
+                low, high = own - _NORMAL * wide, own + _NORMAL * wide
+                result[f"{name}[{g + 1}]"] = Learnt(own, wide, low, high, units[g])
         return result

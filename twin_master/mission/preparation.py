@@ -150,13 +150,12 @@ class Knowledge:
         scenario, learning = self.scenario, self.scenario.learning
         if learning is None:
             return None
-        units = set(scenario.observation.sensor_units)
         draws = (scenario.calibration.parameter, self.draws.values) if learning.parameter else None
         factors = learning.transition_factors
         moves = {factor: build_graphical_model(scenario, factor).transition for factor in factors}
         return LearningFilter(
             self.model, self.sensor_model, learning, draws, moves, scenario.mission.name,
-            sensor_unit=units.pop() if len(units) == 1 else "",
+            scenario.observation.sensor_units,
         )  # fmt: skip
 
     @cached_property

@@ -288,13 +288,8 @@ class Words:
     def of(cls, scenario: Scenario) -> "Words":
         """Return how sentences speak of the turns and sensors of a scenario."""
         observation = scenario.observation
-        more: dict[str, Any] = {"names": observation.titles} | (
-            {} if scenario.searchable else {"command": ""}
-        )
-        if observation.role == "strain" and set(observation.sensor_units) == {"1"}:
-            return cls(scenario.mission.step_name, "gauge", 1e6, ("microstrain",) * observation.count, **more)
-        sensor = "gauge" if observation.role == "strain" else "sensor"
-        return cls(scenario.mission.step_name, sensor, 1.0, observation.sensor_units, **more)
+        own = scenario.mission.step_name, observation.word, *observation.printed, observation.titles
+        return cls(*own) if scenario.searchable else cls(*own, command="")
 
     def value(self, sensor: int, *values: float) -> list[str]:
         """Return values of a sensor as they are printed."""

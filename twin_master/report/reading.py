@@ -100,10 +100,9 @@ def printed_factors(scenario: Scenario) -> tuple[PrintedFactor, ...]:
 
 def printed_sensors(scenario: Scenario) -> PrintedSensors:
     """Return the sensors, as printed."""
-    section = scenario.observation
-    word, units, scale = "gauge" if section.role == "strain" else "sensor", section.sensor_units, 1.0
-    if section.role == "strain" and set(units) <= {"1", ""}:
-        units, scale = ("µε",) * section.count, 1.0e6
+    section, word = scenario.observation, scenario.observation.word
+    scale, named = section.printed
+    units = tuple("µε" if unit == "microstrain" else unit for unit in named)
     titles = section.titles or tuple(f"{word} {number}" for number in range(1, section.count + 1))
     return PrintedSensors(word, titles, section.role, units, scale, bool(section.titles))
 
@@ -241,7 +240,7 @@ class Run:
             name = str(variable).removesuffix(f"_prior_{MOMENTS[0]}")
             if name == variable:
                 continue
-            scale, unit = printed_learnt(name, str(stored.attrs["units"]))
+            scale, unit = printed_learnt(name, str(stored.attrs["units"]), self.scenario)
             course, prior = (
                 scale * np.stack([self[f"learnt/{name}{part}_{moment}"] for moment in MOMENTS], axis=-1)
                 for part in ("", "_prior")

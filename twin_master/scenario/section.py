@@ -288,6 +288,18 @@ class ObservationSection(Section):
         """Unit of each sensor."""
         return (self.unit,) * self.count if isinstance(self.unit, str) else self.unit
 
+    @property
+    def word(self) -> str:
+        """What one sensor is called."""
+        return "gauge" if self.role == "strain" else "sensor"
+
+    @property
+    def printed(self) -> tuple[float, tuple[str, ...]]:
+        """Factor from the stored values to the printed ones, and the printed unit of each sensor."""
+        if self.role == "strain" and {*self.sensor_units} <= {"1", ""}:
+            return 1e6, ("microstrain",) * self.count
+        return 1.0, self.sensor_units
+
     def faults(self) -> Iterator[Fault]:
         """Yield keys that are given neither once nor for each sensor."""
         for key in ("unit", "standard_deviation", "titles"):

@@ -140,21 +140,21 @@ def _true_factor(scenario: Scenario) -> Float | None:
     return np.asarray(factor) if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0) else None
 
 
-def printed_learnt(name: str, unit: str) -> tuple[float, str]:
+def printed_learnt(name: str, unit: str, scenario: Scenario) -> tuple[float, str]:
     """Return the factor from the stored unit of a learnt quantity to the printed one, and its name."""
+    factor, units = scenario.observation.printed if name == "gauge_offset" else (1.0, (unit,))
     if name == "gauge_gain":
         return 100.0, "%"
-    if name == "gauge_offset" and unit == "1":
-        return 1e6, "microstrain"
-    return 1.0, "" if unit == "1" else unit
+    unit = units[0] if len({*units}) == 1 else "unit of each sensor"
+    return factor, "" if unit == "1" else unit
 
 
-def learnt_record(quantities: Sequence[LearntQuantity]) -> dict[str, Any]:
+def learnt_record(quantities: Sequence[LearntQuantity], sensor_units: Sequence[str]) -> dict[str, Any]:
     """Return what was learnt for the summary, a list where each sensor has its own; nothing without any."""
     told = {
         quantity.name: {
             "title": quantity.title,
-            "unit": quantity.unit,
+            "unit": sensor_units if quantity.unit == SEVERAL_UNITS else quantity.unit,
             "prior": {name: quantity.prior[..., k] for k, name in enumerate(MOMENTS)},
             "posterior": {name: quantity.course[-1, ..., k] for k, name in enumerate(MOMENTS)},
             "truth": quantity.truth,

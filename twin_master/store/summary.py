@@ -12,7 +12,7 @@ from reporting.words import counted, parameter_title
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.store.mission_result import MissionResult, printed_learnt, titles_of
+from twin_master.store.mission_result import SEVERAL_UNITS, MissionResult, printed_learnt, titles_of
 
 _CHANGES_SAID = 3
 
@@ -203,15 +203,17 @@ def _of_the_parameter(result: MissionResult) -> Iterator[Told]:
 
 def _learnt(result: MissionResult) -> Iterator[Told]:
     """Yield what was learnt beside the parameter; the sensor that departs most stands for all of them."""
-    sensor = "gauge" if result.scenario.observation.role == "strain" else "sensor"
+    observation = result.scenario.observation
     for quantity in result.learnt:
-        factor, unit = printed_learnt(quantity.name, quantity.unit)
+        factor, unit = printed_learnt(quantity.name, quantity.unit, result.scenario)
         last, title = factor * quantity.course[-1], titles_of(quantity.name)[2]
-        words = {"quantity": quantity.name, "title": title, "unit": unit, "sensor": sensor}
+        words = {"quantity": quantity.name, "title": title, "unit": unit, "sensor": observation.word}
         if quantity.of_sensors:
             departure = np.abs(last[:, 0] - factor * quantity.prior[:, 0]) / last[:, 1]
             most = int(np.nanargmax(departure))
             values = [float(np.nanmean(last[:, 0])), *last[most, :2].tolist()]
+            if quantity.unit == SEVERAL_UNITS:  # they have no mean
+                words["unit"], values[0] = observation.sensor_units[most], None
             yield "learnt_of_sensors", words | {"most": f"{most + 1}"}, values
         elif quantity.name != result.scenario.calibration.parameter:
             yield "learnt", words, last[:2].tolist()

@@ -136,7 +136,7 @@ def store_flight(
         "control": control_changes(controls, flight.control_index, mission.step_name, flight.first_turn),
         **flown,
         "asset_and_model_differ": origin.differ,
-        **learnt_record(result.learnt),
+        **learnt_record(result.learnt, result.scenario.observation.sensor_units),
         **noticed(result),
     }
     rewards = groups["filtered"]["reward_mean"].values

@@ -10,12 +10,7 @@ from scipy import stats
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import amplitude_dependence, fit_trials
 from calibration.errors import ExperimentDataError, OutsideValidityError
-from calibration.joint.posterior import (
-    PUBLISHED_MODES,
-    joint_posterior,
-    measured_modes,
-    modal_readings,
-)
+from calibration.joint.posterior import PUBLISHED_MODES, joint_posterior, measured_modes, modal_readings
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, weighed, wing_priors
 from calibration.result.record import STATE
 from calibration.static.experiments import published_measurements
@@ -108,10 +103,7 @@ def test_enumeration_finds_mean_and_deviation():
 
 
 SHARP = modes(frequency_1=0.001, frequency_2=0.03)
-
-
 SOFT = replace(STATIC, displacement=STATIC.displacement * 0.7)
-
 OVERDAMPED = modal_readings((5.6492, 29.9699, 0.01, 0.3), (0.06, 0.3, 1e-4, 1e-3))
 
 

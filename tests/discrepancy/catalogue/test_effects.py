@@ -17,7 +17,6 @@ from benchmarks.effect_pages import FOLDER, pages
 from benchmarks.effect_pictures import FLOWS, draw, picture_setting
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
-from discrepancy.catalogue.effect_file import loss_integral
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import mains_lines
@@ -143,13 +142,6 @@ def test_all_but_the_filter_vanish_with_a_magnitude(setting):
     pushed = next(trial for trial in setting.campaign.trials if trial.name == "pushed")
     slow = other.patch(setting, {"corner_ratio": 1e-9}, "tip")
     np.testing.assert_allclose(shown(setting, pushed, slow), pushed.values, atol=1e-8)
-
-
-@pytest.mark.parametrize(("p", "a"), [(0.0, 0.0), (0.0, 1.0), (2.0, 0.0), (1.3, 0.7)])
-def test_the_loss_of_a_cycle(p, a):
-    angle = (np.arange(400_000) + 0.5) * 2.0 * pi / 400_000
-    loss = np.mean(np.abs(np.cos(angle)) ** (p + 1.0) * np.abs(np.sin(angle)) ** a) * 2.0 * pi
-    assert loss == pytest.approx(2.0 * loss_integral(p, a), rel=1e-5)
 
 
 def test_sizes_in_closed_form(setting):

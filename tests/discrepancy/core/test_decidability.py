@@ -22,14 +22,7 @@ from discrepancy.judgement.next_experiment import (
 )
 from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
 from discrepancy.report.text import group_lines
-from discrepancy.self_calibration import (
-    NOTHING,
-    Simulator,
-    outcome_of,
-    self_calibrate,
-    wilson,
-    write_self_calibration,
-)
+from discrepancy.self_calibration import Simulator, outcome_of, self_calibrate, wilson, write_self_calibration
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import FEW, ORIGIN, measured, model_of
@@ -153,25 +146,19 @@ def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range():
 HALF = np.array([0.5, 0.5])
 
 
-def one_reading(shift):
-    """One reading of unit noise; two hypotheses: nothing, or an offset of `shift` noise deviations."""
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("weight", [0.5, 0.2])
+def test_information_of_one_reading_against_quadrature(shift, weight):
+    """Of unit noise; two hypotheses: nothing, or an offset of `shift` noise deviations."""
     channel = Channel("y1", Quantity.DISPLACEMENT, "y1", kit.NOISE)
     trial = kit.blank_trial("one", TrialKind.STATIC, ("y1",), np.array([1.0]))
     trial = replace(trial, values=np.full((1, 1), 1.5))
     tight = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
     problem = kit.problem_of(Campaign("", {"y1": channel}, (trial,), None, tight, ""), kit.ClosedForm())
-    none = kit.fitted(problem)
-    other = kit.fitted(problem, Term(kit.offset_effect(deviation=0.02), "y1"))
+    none, other = kit.fitted(problem), kit.fitted(problem, Term(kit.offset_effect(deviation=0.02), "y1"))
     point = replace(none.point, effect=np.array([shift]))
-    known = replace(other, point=point, covariance=np.diag([1.0, 1.0, 1e-12]))
-    return problem, Proposal(trial, "", "", 1.0), [none, known]
-
-
-@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 4.0])
-@pytest.mark.parametrize("weight", [0.5, 0.2])
-def test_information_of_one_reading_against_quadrature(shift, weight):
-    problem, proposal, fits = one_reading(shift)
-    weights = np.array([weight, 1.0 - weight])
+    fits = [none, replace(other, point=point, covariance=np.diag([1.0, 1.0, 1e-12]))]
+    proposal, weights = Proposal(trial, "", "", 1.0), np.array([weight, 1.0 - weight])
     got = mutual_information(problem, proposal, fits, weights)
 
     def density(y):
@@ -244,8 +231,8 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
 @pytest.mark.parametrize(
     ("hidden", "kind", "named", "group", "outcome"),
     [
-        (NOTHING, VerdictKind.NOTHING_MISSING, (), (), "right"),
-        (NOTHING, VerdictKind.NAMED, ("a",), (), "wrong"),
+        ("nothing", VerdictKind.NOTHING_MISSING, (), (), "right"),
+        ("nothing", VerdictKind.NAMED, ("a",), (), "wrong"),
         ("a", VerdictKind.NAMED, ("a",), (), "right"),
         ("a", VerdictKind.NAMED, ("b",), (), "wrong"),
         ("a", VerdictKind.NAMED, ("a", "b"), (), "wrong"),
@@ -297,8 +284,8 @@ def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     steps = []
     found = self_calibrate(campaign, model, FEW, 6, seed=2, workers=1, advance=lambda: steps.append(1))
     assert len(steps) == len(found.cases) == 6
-    assert [case.hidden == NOTHING for case in found.cases] == [True, False, False] * 2
-    assert all(case.distance >= 25.0 for case in found.cases if case.hidden != NOTHING)
+    assert [case.hidden == "nothing" for case in found.cases] == [True, False, False] * 2
+    assert all(case.distance >= 25.0 for case in found.cases if case.hidden != "nothing")
     assert sum(found.confusion()[2].ravel()) == 6
     assert found.share("right", null=True).total == 2
     none, square = wilson(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)

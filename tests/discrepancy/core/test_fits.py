@@ -235,7 +235,7 @@ def softening(coefficient, reference):
 
 @pytest.fixture(scope="module")
 def problem():
-    return kit.problem_of(*measured("quadratic_damping", 0.02))
+    return kit.problem_of(*measured(0.02))
 
 
 @given(
@@ -259,7 +259,7 @@ def test_a_fit_ends_with_finite_numbers_or_a_sentence(problem, u, coefficient, r
 
 def test_a_search_tells_what_could_not_be_fitted_and_goes_on():
     effects = [*kit.chosen("quadratic_damping"), *effects_of_file(Inputs(__file__).folder / "explosive.toml")]
-    campaign, model = measured("quadratic_damping", 0.02)
+    campaign, model = measured(0.02)
     verdict = investigate(campaign, model, effects, thorough=False).verdict
     assert verdict.kind is VerdictKind.NAMED
     assert [effect.identifier for effect in verdict.effects] == ["quadratic_damping"]

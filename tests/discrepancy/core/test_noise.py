@@ -8,13 +8,7 @@ from scipy import stats
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from discrepancy.campaign.noise import (
-    MAINS_DEVIATION,
-    NoiseModel,
-    autoregression,
-    noise_model,
-    without_lines,
-)
+from discrepancy.campaign.noise import MAINS_DEVIATION, NoiseModel, autoregression, noise_model, without_lines
 from discrepancy.campaign.noise_tests import (
     cumulative_periodogram,
     fisher_g,

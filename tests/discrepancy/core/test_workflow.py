@@ -72,7 +72,7 @@ def test_an_effect_is_named_and_proved_on_trials_not_used():
     )
     assert values.std() == pytest.approx(0.5 * (high - low), rel=0.2)
 
-    other = investigate(*measured("quadratic_damping", 0.01), FEW, seed=3, thorough=False)
+    other = investigate(*measured(0.01), FEW, seed=3, thorough=False)
     assert other.verdict.sentence == found.verdict.sentence
     assert other.verdict.probability == found.verdict.probability
     assert other.proof.gap_closed == found.proof.gap_closed

@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from benchmarks.cantilever import Cantilever
@@ -102,6 +100,8 @@ def test_sound_data_have_no_fault(seed):
 def test_examples_are_sound_and_repeat_whatever_effect_they_hide(tmp_path, seed):
     """And say what is held out."""
     chain = LumpedModel.load("three_mass_chain")
+    with pytest.raises(ModelError, match="has no output 'x9'"):
+        plan_for(chain, ("x9",), "end")
     plan = plan_for(chain, ("x3", "x1", "base_strain", "joint_strain"), "end")
     one, two = (write_example(chain, tmp_path / name, "laboratory", seed, plan) for name in "ab")
     assert one.data_hash == two.data_hash
@@ -120,11 +120,6 @@ def test_examples_are_sound_and_repeat_whatever_effect_they_hide(tmp_path, seed)
         assert [fault for fault in check_data(campaign) if fault.fatal or not items] == []
         assert check_against_model(campaign, chain) == ()
         assert sum(int((~trial.used).sum()) for trial in mark_outliers(campaign).trials) <= 2
-
-
-def test_an_example_of_an_output_that_is_none_is_refused():
-    with pytest.raises(ModelError, match="has no output 'x9'"):
-        plan_for(LumpedModel.load("three_mass_chain"), ("x9",), "end")
 
 
 # ---------------------------------------------------------------- units, signs, exchanged channels
@@ -329,16 +324,6 @@ def test_clipped_and_dead_channels(campaign):
     unplugged = shown(campaign, limited(1e-6, 1e-6, 2), name="loading")
     assert check_data(unplugged) == ()  # a load may do nothing there
     assert kinds_of(check_against_model(unplugged, CANTILEVER)) == {(FaultKind.DEAD, "g1")}
-
-
-@given(st.floats(1e-7, 3e-5), st.floats(0.0, 1.0))
-@settings(max_examples=30, deadline=None)
-def test_few_digits_are_not_clipping(campaign, digit, shift):
-    def rounded(_, values):
-        values[:, 1:] = np.round(values[:, 1:] / digit + shift) * digit
-        return values
-
-    assert FaultKind.CLIPPED not in {kind for kind, _ in kinds_of(check_data(shown(campaign, rounded)))}
 
 
 def test_slow_records_of_few_digits_are_not_clipped():

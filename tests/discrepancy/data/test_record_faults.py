@@ -7,22 +7,12 @@ import pytest
 from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import pre_trigger_record
-from discrepancy.campaign.records import (
-    Campaign,
-    Channel,
-    Hold,
-    NoiseRecord,
-    Quantity,
-    RecordedInput,
-    Start,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.records import Channel, Hold, NoiseRecord, Quantity, RecordedInput, Start, TrialKind
 from discrepancy.checks.fault import FaultKind, slip_between
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
 from discrepancy.checks.quality import check_data, held_spans, moves
-from tests.discrepancy.rigs import model_of
+from tests.discrepancy.rigs import asked, campaign, model_of
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
@@ -44,14 +34,14 @@ def campaign_of(ring=None, rest=None, digit=1e-6, trials=2):
         if ring:
             ring(values)
         given = {"values": np.round(values / digit) * digit * 1e-3, "begins": Start.UNKNOWN}
-        file = f"{number}.csv"
-        made.append(Trial.plain(f"ring {number}", TrialKind.DRIVEN, ("x", "y"), TIME, file=file, **given))
+        given |= {"name": f"ring {number}", "channels": ("x", "y"), "file": f"{number}.csv"}
+        made.append(asked(TrialKind.DRIVEN, TIME, **given))
     noise = (pre_trigger_record(1e-3 * column, 0.005, "rest", "rest.csv") for column in still.T)
     channels = {
         name: Channel(name, Quantity.DISPLACEMENT, name, record, column=f"{name} [mm]", unit="mm")
         for name, record in zip("xy", noise, strict=True)
     }
-    return Campaign("rings", channels, tuple(made), None, {}, "")
+    return campaign(*made, **channels)
 
 
 def only(faults, kind):
@@ -246,7 +236,6 @@ def test_a_noise_record_that_moves_is_a_limit(motion, what):
 )
 def test_sound_samples_of_records_with_gaps_or_few_digits_stay(share, rate, noise, digit):
     rng, counts = np.random.default_rng(3), np.zeros(3, dtype=int)
-    channels = {"x": Channel("x", Quantity.DISPLACEMENT, "x")}
     for _ in range(10):
         time = np.sort(rng.permutation(1000)[: int(1000 * share)]) / rate
         values = np.exp(-0.4 * time) * np.cos(2.0 * np.pi * time) + noise * rng.normal(size=len(time))
@@ -254,8 +243,11 @@ def test_sound_samples_of_records_with_gaps_or_few_digits_stay(share, rate, nois
         spoilt, places = values.copy(), np.arange(20, len(time) - 20, 120)
         spoilt[places] += 40.0 * noise * rng.choice([-1.0, 1.0], len(places))
         records = {"a": values, "b": spoilt}.items()
-        trials = (Trial.plain(n, TrialKind.RINGDOWN, ("x",), time, values=v[:, None]) for n, v in records)
-        sound, other = mark_outliers(Campaign("", channels, tuple(trials), None, {}, "")).trials
+        trials = (
+            asked(TrialKind.RINGDOWN, time, name=name, channels=("x",), values=column[:, None])
+            for name, column in records
+        )
+        sound, other = mark_outliers(campaign(*trials, x=Channel("x", Quantity.DISPLACEMENT, "x"))).trials
         counts += (~sound.used).sum(), (~other.used[places]).sum(), len(places)
     assert counts[0] <= 1
     assert counts[1] >= 0.65 * counts[2]
@@ -293,8 +285,8 @@ def test_rows_of_static_trials():
         )
         if spoilt is not None:
             values[spoilt] += by
-        zeros, column = np.zeros(count), values[:, None]
-        return Trial.plain(name, TrialKind.STATIC, ("x",), zeros, values=column, force=load, run="A")
+        given = {"channels": ("x",), "values": values[:, None], "force": load, "run": "A"}
+        return asked(TrialKind.STATIC, np.zeros(count), name=name, **given)
 
     pair = (levels(6, name="a"), levels(6, name="b"))
     for trials, noise, left_out in (
@@ -309,7 +301,7 @@ def test_rows_of_static_trials():
         ((*pair, levels(6, 3, "c", shift=1e-3)), 5e-6, [[], [], []]),
     ):
         channel = Channel("x", Quantity.DISPLACEMENT, "x", noise and NoiseRecord(noise, 100.0))
-        marked = mark_outliers(Campaign("", {"x": channel}, trials, None, {}, ""))
+        marked = mark_outliers(campaign(*trials, x=channel))
         assert [np.flatnonzero(~trial.used[:, 0]).tolist() for trial in marked.trials] == left_out
 
 
@@ -369,9 +361,8 @@ def of_cart(time, values, drive, hold=None, forced=False):
     if not forced:
         given = {"inputs": (RecordedInput("motor", Quantity.FORCE, values=drive, hold=hold),)}
     kind, values = TrialKind.FORCED if forced else TrialKind.DRIVEN, values[:, None]
-    push = Trial.plain("push", kind, ("x",), time, values=values, begins=Start.STILL, **given)
-    channel = Channel("x", Quantity.DISPLACEMENT, "cart", NoiseRecord(5e-4))
-    return Campaign("Cart", {"x": channel}, (push,), None, {}, "")
+    push = asked(kind, time, channels=("x",), values=values, begins=Start.STILL, **given)
+    return campaign(push, x=Channel("x", Quantity.DISPLACEMENT, "cart", NoiseRecord(5e-4)))
 
 
 def pushed(scale=1.0):

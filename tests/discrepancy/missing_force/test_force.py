@@ -26,12 +26,11 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence
 from discrepancy.search.strategy import Search, search
-from discrepancy.sources.examples import example_campaign, plan_for, plan_of
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.discrepancy.core.kit import fitted, problem_of
-from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass
+from tests.discrepancy.rigs import FEW, chosen, fmu_rig, one_mass, simulated
 from tests.refusals import Inputs
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
@@ -77,16 +76,6 @@ def read(folder):
 
 def available(problem):
     return [item for item in library() if item.unavailable(problem.setting) is None]
-
-
-def show(problem, gain=1.0):
-    """Give a campaign the model's own response, times a gain, and noise alone as its readings."""
-    random = np.random.default_rng(8)
-    start = problem.start(Candidate())
-    for number, data in enumerate(problem.trials):
-        bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
-        response = gain * problem.prediction(number, start, bare)
-        data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
 
 
 def blind(folder, number, seed=1, samples=64):
@@ -138,7 +127,7 @@ def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
 
 def test_one_effect_at_two_places_has_a_prior():
     """Where it is the only one that is looked for."""
-    setting = chain("ringdown", "coulomb_friction", "joint", friction_ratio=0.004).setting
+    setting = chain("ringdown", 0.004).setting
     both = Candidate(tuple(Term(FRICTION, place) for place in FRICTION.places(setting)[:2]))
     assert log_prior(both, 1, setting) == log_prior(both, 2, setting) > -20.0
 
@@ -181,8 +170,12 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
 @pytest.mark.parametrize("gain", [1.0, 1.05])
 def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
     """The same campaign with the model's own response and noise alone as its readings; a gain is no law."""
-    problem = blind(tmp_path, CART)
-    show(problem, gain)
+    problem, random = blind(tmp_path, CART), np.random.default_rng(8)
+    start = problem.start(Candidate())
+    for number, data in enumerate(problem.trials):
+        bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
+        response = gain * problem.prediction(number, start, bare)
+        data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
     search = ForceSearch(problem)
     assert gain != 1.0 or missing_force(search, search.whole) is None
     found = investigate(problem.campaign, problem.model, FEW)
@@ -195,15 +188,9 @@ STIFF = PowerStiffness("slide", 2.0, 3.0, 0, 0.02)
 DAMPED = PowerDamping("slide", 0.5, 2.0, 0.0, 0.6, 1.0)
 
 
-def released(hidden):
-    """Return ring-downs of the single-mass rig, which hides something."""
-    rig = LumpedModel.load("single_mass_rig")
-    plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
-    return example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
-
-
 def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tmp_path):
-    campaign, lumped = released(ModelPatch((STIFF,))), LumpedModel.load("single_mass_rig")
+    lumped = LumpedModel.load("single_mass_rig")
+    campaign = simulated(lumped, "ringdown", 3, ModelPatch((STIFF,)))
     with closing(FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2")))) as fmu:
         scales = lumped.scales(campaign)
         first, second = (
@@ -232,10 +219,11 @@ def drawn_through(search, effect, place):
 def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(high):
     """Beside no law a damper takes up what the drag does: the drag is the same wherever its range ends."""
     rig, (drag,) = LumpedModel.load("single_mass_rig"), chosen("quadratic_damping")
+    campaign = simulated(rig, "ringdown", 3, ModelPatch((DAMPED,)))
     first, damper = rig.description.parameter
     rows = [first, damper.model_copy(update={"high": high})]
     rig = LumpedModel(rig.description.model_copy(update={"parameter": rows}))
-    problem = problem_of(released(ModelPatch((DAMPED,))), rig)
+    problem = problem_of(campaign, rig)
     found = drawn_through(ForceSearch(problem), drag, "slide")
     (law,) = found.candidate.patch(problem.setting, found.effect)
     at_one = law.coefficient / law.reference_velocity**2
@@ -283,17 +271,16 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
     assert np.abs(best.shared).max() < 1.5
 
 
-def chain(kind, effect, place, **values):
-    """Return an example of the three-mass chain that hides an effect."""
+def chain(kind, ratio):
+    """Return the problem of an example of the three-mass chain that hides friction of its joint."""
     model = LumpedModel.load("three_mass_chain")
-    plan = replace(plan_of(model), duration=0.5 * plan_of(model).duration)
-    patch = hiding(example_campaign(model, kind, 3, plan), model, effect, values, place)
-    return problem_of(example_campaign(model, kind, 3, plan, patch), model)
+    hidden = "coulomb_friction", {"friction_ratio": ratio}, "joint"
+    return problem_of(simulated(model, kind, 3, hidden), model)
 
 
 def test_friction_that_holds_is_the_law_of_the_missing_force():
     """The joint sticks half of the time; what is told of it is of the trials in motion."""
-    search = ForceSearch(chain("laboratory", "coulomb_friction", "joint", friction_ratio=0.004))
+    search = ForceSearch(chain("laboratory", 0.004))
     missing = missing_force(search, drawn_through(search, FRICTION, "joint"))
     assert (missing.told.port, missing.law) == ("joint", "Coulomb friction")
     assert share_of(missing) > 0.95

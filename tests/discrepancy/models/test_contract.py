@@ -21,16 +21,8 @@ from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.models.system_model import State, SystemModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import (
-    PRIMITIVES,
-    FreePlay,
-    LoadGain,
-    LoadPlace,
-    PointMass,
-    PowerDamping,
-    PowerStiffness,
-)
-from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, seen
+from fe.runtime.patch import PRIMITIVES, FreePlay, LoadPlace, PointMass, PowerDamping, PowerStiffness
+from tests.discrepancy.rigs import INPUTS, asked, campaign, fmu_rig, seen
 from tests.refusals import refused
 
 TABLE = INPUTS.table("kinds.toml")
@@ -50,10 +42,6 @@ class Kind:
     quantities: dict[str, str]
     carried: list[str]
 
-    @property
-    def means(self) -> FloatArray:
-        return np.array([parameter.mean for parameter in self.model.parameters])
-
     def trial(self, kind: TrialKind, **said: Any) -> Trial:
         time = 0.005 * np.arange(len(next(iter(said.values()))) if said else 60)
         release = {"release": Release(0.02)} if kind is TrialKind.RINGDOWN else {}
@@ -61,7 +49,7 @@ class Kind:
 
     def seen(self, what: Trial, *items: Any, **given: Any) -> Any:
         outputs = given.pop("outputs", {self.output: self.model.output_quantity(self.output)})
-        return seen(self.model, what, outputs, *items, **{"parameters": self.means} | given)
+        return seen(self.model, what, outputs, *items, **{"parameters": self.model.prior_mean()} | given)
 
 
 @pytest.fixture(scope="module", params=TABLE["kind"])
@@ -96,7 +84,7 @@ def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> 
     model = kind.model
     stiffness, mass, row, rows = np.full((1, 1), 1974.0), np.full((1, 1), 2.0), np.ones(1), [np.ones(1)]
     if isinstance(model, SystemModel):
-        state = State(tuple(kind.means), (0.0,) * len(model.regions))
+        state = State(tuple(model.prior_mean()), (0.0,) * len(model.regions))
         stiffness, mass = (getattr(model.system(state), name) for name in ("stiffness", "mass"))
         row, rows = model.force_row(kind.place, state), [model.port_rows[name] for name in kind.ports]
     loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -6.0]))
@@ -121,7 +109,7 @@ def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> 
 def test_what_changes_nothing_changes_no_bit(kind: Kind, how: TrialKind) -> None:
     what = kind.trial(how, **({"force": np.linspace(0.0, 5.0, 9)} if how is TrialKind.STATIC else {}))
     once = kind.seen(what)
-    for items in ((), (patch.SensorGain("*", 0.5),), (LoadGain(0.0, 0.0),)):
+    for items in ((), (patch.SensorGain("*", 0.5),), (patch.LoadGain(0.0, 0.0),)):
         assert np.array_equal(kind.seen(what, *items), once)
     if isinstance(kind.model, LumpedModel | WingModel):
         assert np.array_equal(kind.seen(what, PointMass(0.0, 0.3)), once)
@@ -177,7 +165,7 @@ def test_rates_are_derivatives(kind: Kind, change: str) -> None:
             if name == change and kind.model.supports(type(item))
         )
     )
-    conditions = Conditions(kind.means, clock=(0.0, -0.15 / kind.pace))
+    conditions = Conditions(kind.model.prior_mean(), clock=(0.0, -0.15 / kind.pace))
     found = kind.model.respond(what, tuple(outputs), items, conditions)
     assert not found.values[:48, 1:3].any()
     assert not found.rates[:48].any()

@@ -95,6 +95,15 @@ def test_a_record_that_begins_under_load_begins_at_rest() -> None:
         np.testing.assert_allclose(shown(CHAIN, what, *items), still, rtol=1e-3 if items else 1e-11)
 
 
+def test_hysteresis_remembers_its_path_also_while_it_warms() -> None:
+    """A temperature that does nothing does not change the path, though every level is solved by itself."""
+    path, slip = [2.0, 4.0, 10.0, 6.0, 0.0], MicroSlip("joint", 2.5, 800.0, -0.3)
+    values = shown(CHAIN, static(path), slip)
+    assert values[-1, 2] > 1e-5  # unloaded, it does not come back
+    warm = shown(CHAIN, static(path, temperature=np.arange(5.0)), slip, patches.ModulusTemperature(1e-12))
+    assert warm == pytest.approx(values, rel=1e-6, abs=1e-10)
+
+
 def test_initial_states_are_shares_of_the_release() -> None:
     start = shown(CHAIN, ringdown(), initial=np.array([[0.1, 0.0], [0.05, 0.0]]))[0]
     wanted = 0.02 * (1.1 * END / END[2] + 0.05 * SHAPES[:, 1] / SHAPES[2, 1])

@@ -10,16 +10,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import (
-    Campaign,
-    Channel,
-    Hold,
-    Quantity,
-    RecordedInput,
-    Start,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
@@ -27,16 +18,7 @@ from discrepancy.models.sensing import observe
 from discrepancy.models.system_model import FORCES
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import (
-    LoggerClock,
-    ModulusTemperature,
-    Overflow,
-    PortLoad,
-    PowerDamping,
-    PowerStiffness,
-    Primitive,
-    Window,
-)
+from fe.runtime.patch import PowerDamping, PowerStiffness, Primitive, Window
 from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, integrated, model_of, one_mass, seen
 from tests.fe.runtime.stepping import exact
 
@@ -130,7 +112,7 @@ def test_what_leaves_one_store_enters_the_next_and_flows_over_when_full() -> Non
     what = trial(time, RecordedInput("pump", Quantity.FLOW, flow, Hold.ZERO_ORDER), begins=Start.UNKNOWN)
     laws = (
         PowerDamping("first", 0.1, 0.5, 0.0, 1.0, 1.0), PowerDamping("second", 0.12, 0.5, 0.0, 1.0, 1.0),
-        Overflow("first", 0.3, 1.5, 2.0, 1.0),
+        patch.Overflow("first", 0.3, 1.5, 2.0, 1.0),
     )  # fmt: skip
 
     def rate(t: float, level: FloatArray, k: int) -> list[float]:
@@ -271,7 +253,7 @@ def test_a_rig_at_rest_has_the_temperature_of_each_level_and_what_holds_it() -> 
     what = trial(np.arange(3.0), kind=TrialKind.STATIC, begins=Start.SETTLED, **warm)
     held = INPUTS.text("wheel.toml").removesuffix("]\n") + INPUTS.text("held.toml")
     outputs = {"turn": Quantity.ANGLE, "given": Quantity.TORQUE}
-    found = seen(model_of(held), what, outputs, ModulusTemperature(0.01))
+    found = seen(model_of(held), what, outputs, patch.ModulusTemperature(0.01))
     turn = 3.0 / (np.array([100.0, 60.0, 100.0]) + 50.0)
     np.testing.assert_allclose(found, np.stack((turn, -50.0 * turn), axis=1), rtol=1e-12)
 
@@ -350,7 +332,7 @@ def moved(law: Callable[[float, float, float], float], edges: Any, kind: TrialKi
         (TrialKind.FORCED, patch.PowerStiffness("slide", 30.0, 3.0, 0, 0.05), lambda t, x, v: 2.4e5 * x**3),
         (
             TrialKind.FORCED,
-            PortLoad("slide", "3 * max(0, time - 2.5)"),
+            patch.PortLoad("slide", "3 * max(0, time - 2.5)"),
             lambda t, *_: -3.0 * max(0.0, t - 2.5),
         ),
     ],
@@ -394,9 +376,9 @@ def test_sensors_are_wrong_within_their_windows_only() -> None:
     [
         (lambda: patch.PointMass(0.1, 0.2, windows=(Window("run", 1.0),)), "'point_mass' cannot act in"),
         (lambda: replace(DRAG, windows=(Window("a trial", 2.0, 1.0),)), "must begin before it ends"),
-        (lambda: PortLoad("slide", "3 * tme"), "unknown name 'tme'"),
-        (lambda: response(of_mass(TrialKind.FORCED), PortLoad("door", "time")), "the port 'door', which"),
-        (lambda: response(of_mass(TrialKind.RINGDOWN), PortLoad("slide", "time")),
+        (lambda: patch.PortLoad("slide", "3 * tme"), "unknown name 'tme'"),
+        (lambda: response(of_mass(TrialKind.FORCED), patch.PortLoad("door", "time")), "port 'door', which"),
+        (lambda: response(of_mass(TrialKind.RINGDOWN), patch.PortLoad("slide", "time")),
          "ring-down, which no force with a course in time"),
     ],
 )  # fmt: skip
@@ -416,17 +398,15 @@ LOGGED = replace(campaign(SWEPT, **SEEN), loggers={"rack": ("shaker", "laser"), 
 RATE = 4e-3
 
 
-def shown(
-    *changes: Primitive, given: Campaign = LOGGED, at: Any = (1.0, 1.0), what: Trial = SWEPT
-) -> FloatArray:
+def shown(*changes: Primitive, given: Any = LOGGED, at: Any = (1.0, 1.0), what: Trial = SWEPT) -> FloatArray:
     return observe(SHAKEN, given, what, patch.ModelPatch(changes), Conditions(np.array(at))).values
 
 
 def test_each_logger_has_its_own_clock_and_one_alone_is_a_stiffer_rig_under_a_larger_load() -> None:
-    one, square = shown(LoggerClock("*", RATE), given=replace(LOGGED, loggers={})), (1.0 + RATE) ** 2
+    one, square = shown(patch.LoggerClock("*", RATE), given=replace(LOGGED, loggers={})), (1.0 + RATE) ** 2
     alias = shown(patch.LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
     np.testing.assert_allclose(one, alias, atol=1e-9 * np.abs(alias).max())
-    clocks = LoggerClock("film", RATE), LoggerClock("rack", RATE), patch.Clock(RATE, 0.0)
+    clocks = patch.LoggerClock("film", RATE), patch.LoggerClock("rack", RATE), patch.Clock(RATE, 0.0)
     film, rack, motion = map(shown, clocks)
     later = replace(SWEPT, time=1e5 + STAMPS)  # of the day
     for change in (*clocks, patch.StiffnessDrift(0.05)):
@@ -440,4 +420,4 @@ def test_each_logger_has_its_own_clock_and_one_alone_is_a_stiffer_rig_under_a_la
     true = shown(patch.Clock(1.0 / (1.0 + RATE) - 1.0, 0.0), what=stretched)
     np.testing.assert_allclose(rack[:, 1], true[:, 1], atol=1e-12)
     with pytest.raises(CatalogueError, match="no logger 'tape'; it has 'rack', 'film'"):
-        shown(LoggerClock("tape", RATE))
+        shown(patch.LoggerClock("tape", RATE))

@@ -324,20 +324,15 @@ def test_a_port_turns_as_what_is_measured_or_prescribed_of_it():
 # ---------------------------------------------------------------- the folder
 
 
-def old_verdict(place):
-    """Make a folder that looks like one of a verdict, with something of the user's in it."""
-    place.mkdir(parents=True)
-    (place / "verdict.json").write_text("first", encoding="utf-8")
-    (place / "notes.txt").write_text("mine", encoding="utf-8")
-    return place
-
-
 def test_an_old_verdict_is_not_lost(drag, tmp_path):
     """Where writing fails, another process replaces it, or a killed one had moved it aside.
 
     How a kill between the moves leaves it is in test_workflow of twin_master.
     """
-    folder = old_verdict(tmp_path / "v")
+    folder = tmp_path / "v"
+    folder.mkdir()
+    (folder / "verdict.json").write_text("first", encoding="utf-8")
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
 
     def refuse(patch, target):
         raise OSError(28, "No space left on device")

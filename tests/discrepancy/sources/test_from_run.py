@@ -76,6 +76,12 @@ def test_every_turn_is_in_one_trial_and_the_model_has_the_strains_of_the_fmu(run
     for one, other in zip(campaign.trials, run_campaign(tmp_path / "bare").trials, strict=True):
         np.testing.assert_array_equal(one.values, other.values)
         np.testing.assert_array_equal(one.health, other.health)
+    # turns of several steps, behind a start
+    binding, header = tmp_path / "bare/asset/binding.toml", "step_size = 1.0"
+    several = binding.read_text().replace(header, "step_size = 0.5\ndecimation = 4\nstart_time = 30.0")
+    binding.write_text(several)
+    (trial,) = run_campaign(tmp_path / "bare", held_out_share=0.0).trials
+    np.testing.assert_array_equal(trial.time, 32.0 + 2.0 * np.arange(TURNS))
     # the model gives what the FMU had
     trial, model = run_campaign(run, held_out_share=0.0).trials[0], run_model(run)[0]
     outputs, conditions = flown(model, tree)

@@ -22,13 +22,7 @@ from evidence.identification.errors import IdentificationError
 from evidence.identification.identifiability import analyse, profile
 from evidence.identification.least_squares import DesignFit, identify
 from evidence.identification.local_model import LocalModel, build_local_model
-from evidence.identification.parameters import (
-    deviations,
-    scaled,
-    values_of,
-    wing_parameters,
-    with_values,
-)
+from evidence.identification.parameters import deviations, scaled, values_of, wing_parameters, with_values
 from evidence.identification.targets import (
     LEVELS,
     MASS_TOTAL,

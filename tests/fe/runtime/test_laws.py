@@ -399,9 +399,6 @@ def test_rayleigh_coefficients_are_the_inverse_of_the_ratios(alpha, beta, freque
     low, high = rayleigh_damping_ratio(alpha, beta, frequency)
     found = rayleigh_coefficients(frequency, (float(low), float(high)))
     np.testing.assert_allclose(found, (alpha, beta), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("frequency", [(1.0, 1.0), (0.0, 1.0), (-1.0, 2.0)])
-def test_two_different_positive_frequencies_are_needed(frequency):
-    with pytest.raises(ValueError, match="Two different positive frequencies"):
-        rayleigh_coefficients(frequency, (0.1, 0.1))
+    for wrong in ((1.0, 1.0), (0.0, 1.0), (-1.0, 2.0)):
+        with pytest.raises(ValueError, match="Two different positive frequencies"):
+            rayleigh_coefficients(wrong, (0.1, 0.1))

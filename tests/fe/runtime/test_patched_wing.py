@@ -16,6 +16,7 @@ from fe.runtime.patched_wing import PatchedState, PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
+from fe.runtime.wing_rows import PatchArrays
 from fe.wing.operators import (
     AffineOperators,
     assemble,
@@ -28,7 +29,7 @@ from fe.wing.operators import (
 from fe.wing.parts import DISTRIBUTIONS
 from tests.fe.runtime.stepping import second_order
 from tests.refusals import Inputs, refused
-from tests.wings import wing_integrator
+from tests.wings import rigid, wing_integrator
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -48,6 +49,9 @@ class Compared:
         self.mesh, self.design = operators.wing_mesh, operators.wing_mesh.design
         self.place, self.row = wing.arrays.load_place, wing.force_row("tip_load")
         self.factors = Factorisation(operators.stiffness(FACTOR, STATE[1]))
+        masses = self.design.masses
+        mass, self.upwards = operators.mass(point_masses(masses.servo, masses.pitot)), rigid(operators)
+        self.weight = STANDARD_GRAVITY * (mass @ self.upwards)  # along the free unknowns [N]
 
     def structure(
         self, *items: Any, state: Any = STATE, masses: Any = MASSES, temperature: float = 0.0
@@ -75,23 +79,10 @@ class Compared:
                 whole = whole - loss * factor * operators.body.stiffness(cells)
         return whole.tocsr()
 
-    @property
-    def upwards(self) -> FloatArray:
-        """Free unknowns of which the vertical ones are one."""
-        heave = self.operators.expansion.T @ upward(np.ones(len(self.mesh.points)))
-        return np.append(heave[:-3], (1.0, 0.0, 0.0))
-
-    @property
-    def weight(self) -> FloatArray:
-        """Weight along the free unknowns [N]."""
-        masses = self.design.masses
-        mass = self.operators.mass(point_masses(masses.servo, masses.pitot))
-        return STANDARD_GRAVITY * (mass @ self.upwards)
-
 
 @pytest.fixture(scope="module")
-def both(coarse_patched_wing: PatchedWing, coarse_operators: AffineOperators) -> Compared:
-    return Compared(coarse_patched_wing, coarse_operators)
+def both(coarse_patch_arrays: PatchArrays, coarse_operators: AffineOperators) -> Compared:
+    return Compared(PatchedWing(coarse_patch_arrays), coarse_operators)
 
 
 # ---------------------------------------------------------------- structure
@@ -344,13 +335,13 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
 
-def test_a_released_wing_for_patches_moves_as_all_its_unknowns(coarse_patched_wing):
+def test_a_released_wing_for_patches_moves_as_all_its_unknowns(both):
     """What its modes leave out fades as the damping has it, for a law as well."""
     vector = np.array((1.0, 0.0, 0.0, 0.169, 0.134, 1.0, 0.0))
     weak = patch.PowerStiffness("tip", 1e-6, 1.0, 0, 1.0)  # which only tells where the tip is
-    motion = ModalIntegrator(coarse_patched_wing, vector, ALPHA, BETA, ModelPatch((weak,)))
+    motion = ModalIntegrator(both.wing, vector, ALPHA, BETA, ModelPatch((weak,)))
     structure, load = motion.structure, motion.structure.acting(vector)
-    answers, tip = structure.answers, coarse_patched_wing.port_rows["tip"]
+    answers, tip = structure.answers, both.wing.port_rows["tip"]
     held = 0.03 / (structure.outputs[-1] @ answers[:, HOLDING]) * answers[:, HOLDING]
     rest, n = answers[:, :4] @ load, len(held)
     state = motion.advance(motion.released(0.03, load, HOLDING), 5e-4, load)

@@ -138,25 +138,17 @@ def test_drift_by_kind_of_trial_and_exponent():
     assert np.all(np.isfinite(rates))
 
 
-@given(st.floats(-1.5, 1.5), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+@given(st.floats(-1.5, 1.5), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 @settings(max_examples=60)
-def test_rotation_is_that_of_the_strain_tensor(angle, along, across, gamma):
-    tensor = np.array([[along, gamma / 2.0], [gamma / 2.0, across]])
+def test_rotation_is_that_of_the_strain_tensor(angle, across, gamma):
+    """Two rotations of one gauge add up, and a gain acts on what the turned gauge shows."""
+    tensor = np.array([[1.0, gamma / 2.0], [gamma / 2.0, across]])
     direction = np.array([np.cos(angle), np.sin(angle)])
-    record = SensorRecord((("g", "strain"),), "static", np.zeros(1), 0.0, np.zeros(1))
-    # Two rotations of one gauge add up, and a gain acts on what the turned gauge shows.
-    items = SensorGain("g", 1.0), SensorRotation("g", angle / 3), SensorRotation("g", angle * 2 / 3)
-    one, two, three = (np.array([[value]]) for value in (along, across, gamma))
-    values, _ = applied(ModelPatch(items), record, one, None, two, three)
-    assert values[0, 0] == pytest.approx(2.0 * direction @ tensor @ direction, abs=1e-12)
-
-
-def test_rotation_needs_components_and_has_rates():
-    turn = SensorRotation("g0", 0.2)
-    values, rates = shown(turn, transverse=-0.3 * VALUES, shear=0.1 * VALUES)
-    factor = np.cos(0.2) ** 2 - 0.3 * np.sin(0.2) ** 2 + 0.1 * np.sin(0.2) * np.cos(0.2)
-    assert values[:, 1] == pytest.approx(factor * VALUES[:, 1])
-    assert rates[1:-1, 1] == pytest.approx(factor * RATES[1:-1, 1], abs=1e-6)
+    items = SensorGain("g0", 1.0), SensorRotation("g0", angle / 3), SensorRotation("g0", angle * 2 / 3)
+    values, rates = shown(*items, transverse=across * VALUES, shear=gamma * VALUES)
+    factor = 2.0 * direction @ tensor @ direction
+    assert values[:, 1] == pytest.approx(factor * VALUES[:, 1], abs=1e-15)
+    assert rates[1:-1, 1] == pytest.approx(factor * RATES[1:-1, 1], abs=8e-6)
 
 
 def test_lines_run_with_the_trial():

@@ -1,5 +1,6 @@
-"""A wing: its design and lift, its mesh and operators, and its responses against what is published."""
+"""A wing: design, lift, mesh, operators, balances; its responses against what is published, and CalculiX."""
 
+import math
 import tomllib
 from functools import reduce
 from operator import getitem
@@ -11,18 +12,33 @@ from hypothesis import strategies as st
 
 from fe.elements.cells import jacobians
 from fe.elements.kinds import gauss_points
-from fe.runtime.errors import InvalidDesignError, MeshError
-from fe.runtime.state import STANDARD_GRAVITY
+from fe.runtime.errors import CalculixError, InvalidDesignError, MeshError
+from fe.runtime.state import STANDARD_GRAVITY, DigitalState
+from fe.verification import calculix_comparison as comparison
+from fe.verification import wing_checks
 from fe.wing import operators as modelled
 from fe.wing.design import SHIPPED_DESIGN, parse_design
 from fe.wing.mesh import build_mesh
 from fe.wing.operators import assemble, eigenmodes, lift_load
 from fe.wing.parts import DISTRIBUTIONS, Planform, lifting_line
+from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs, refused
-from tests.wings import tip_stiffness
+from tests.wings import rigid, tip_stiffness
+
+INPUTS = Inputs(__file__)
 
 
-@pytest.mark.parametrize(("path", "value", "sentence"), Inputs(__file__).refused("wing"))
+def test_the_wing_with_a_third_region_is_the_shipped_one_with_a_third_region():
+    shipped, three = (
+        tomllib.loads(SHIPPED_DESIGN.with_name(name).read_text(encoding="utf-8"))
+        for name in ("uav_wing.toml", "uav_wing_three_regions.toml")
+    )
+    assert set(three["defects"].pop()) == {"span_start", "span_end", "chord_start", "chord_end"}
+    assert (three.pop("name"), shipped.pop("name")) == ("UAV wing, three regions", "UAV wing")
+    assert three == shipped
+
+
+@pytest.mark.parametrize(("path", "value", "sentence"), INPUTS.refused("wing"))
 def test_a_wrong_design_is_refused_with_one_sentence_that_names_the_place(path, value, sentence):
     content = tomllib.loads(SHIPPED_DESIGN.read_text(encoding="utf-8"))
     if path == ["defects", 1, "span_start"]:
@@ -73,22 +89,14 @@ def test_the_lifting_line_has_the_induced_drag_of_glauerts_table():
 # ---------------------------------------------------------------- mesh
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
-LOCAL, WEIGHT = gauss_points(3)
-
-
-def determinants(mesh):
-    return np.linalg.det(jacobians(mesh.kind, mesh.nodes, LOCAL))
-
-
-def cells_of(mesh, name):
-    return np.flatnonzero(mesh.region == mesh.region_names.index(name))
 
 
 def test_parts_have_the_edges_and_volumes_of_the_design(coarse_design):
     coarse_mesh = build_mesh(coarse_design)
-    plan, volume = coarse_design.planform, determinants(coarse_mesh) @ WEIGHT
+    plan, (local, weight) = coarse_design.planform, gauss_points(3)
+    volume = np.linalg.det(jacobians(coarse_mesh.kind, coarse_mesh.nodes, local)) @ weight
     for name, defect in zip(coarse_design.regions, coarse_design.defects, strict=True):
-        inside = cells_of(coarse_mesh, name)
+        inside = np.flatnonzero(coarse_mesh.region == coarse_mesh.region_names.index(name))
         x, y, _ = coarse_mesh.corners[inside].reshape(-1, 3).T
         fraction = x / plan.chord(y / plan.semi_span) + plan.straight_chord_line
         assert (y.min(), y.max()) == pytest.approx((defect.span_start, defect.span_end))
@@ -132,16 +140,6 @@ def test_mesh_lines_that_nearly_coincide_are_named(coarse_design):
 
 
 # ---------------------------------------------------------------- operators
-
-
-def rigid(operators, lever=None):
-    """Free unknowns of a heave, or of a flap where the lever is that of the nodes."""
-    full = np.zeros(operators.expansion.shape[0])
-    full[2::3] = 1.0 if lever is None else lever
-    free = operators.expansion.T @ full
-    if lever is None:
-        free[-modelled.ROOT_UNKNOWNS :] = 1.0, 0.0, 0.0
-    return free
 
 
 def test_a_rigid_heave_meets_the_loads_of_the_design_and_moves_every_output_by_one(coarse_operators):
@@ -207,3 +205,96 @@ def test_the_wing_has_the_published_stiffness_and_frequencies(shipped_operators)
     # No weight is published: this is what the parts of the design weigh on its mesh.
     heave = rigid(shipped_operators)
     assert heave @ (shipped_operators.mass_terms[0] @ heave) == pytest.approx(0.947, rel=0.002)
+
+
+# ---------------------------------------------------------------- balances and convergence
+
+
+def test_sums_agree_and_every_gauge_converges_by_name(coarse_design, coarse_operators):
+    checks = list(wing_checks.balance_checks(coarse_operators))
+    assert [check.name for check in checks[1:]] == ["mass", "reaction", "root moment", "energy and work"]
+    assert all(check.limit is not None and check.passed and check.value < 1e-6 for check in checks)
+    # Three coarse meshes: the names and the kind of figures, not their size.
+    checks = list(wing_checks.convergence_checks(coarse_design, (0.25, 0.3, 0.36), limited=False))
+    names = [check.name for check in checks]
+    assert names[:3] == ["tip stiffness", "first bending", "second bending"]
+    assert [name for name in names if name.startswith("gauge ")] == [f"gauge {n}" for n in range(1, 25)]
+    assert all("order" in check.note or "monotone" in check.note for check in checks[:3])
+
+
+@pytest.mark.long
+def test_the_mesh_converges(shipped_design):
+    found = wing_checks.mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
+    assert (np.diff(found["unknowns"]) > 0).all()
+    for name in ("tip stiffness", "first bending", "second bending"):
+        coarse, half, one = found[name]
+        assert one == pytest.approx(half, rel=0.025)
+        assert half == pytest.approx(coarse, rel=0.025)
+    assert np.sqrt(np.mean((found["strain"][2] / found["strain"][1] - 1.0) ** 2)) < 0.05
+
+
+@pytest.mark.parametrize("order", [0.5, 1.0, 2.0, 3.7])
+@pytest.mark.parametrize("refinements", [(0.5, 1.0, 2.0), (1.0, 1.5, 2.25), (0.25, 0.5, 1.5, 4.5)])
+def test_the_order_of_a_power_law_is_found(refinements, order):
+    values = [7.0 - 0.3 * refinement**-order for refinement in refinements]
+    found = wing_checks.observed_order(refinements[-1] / refinements[-2], values)
+    assert found == pytest.approx(order, abs=1e-6)
+
+
+@pytest.mark.parametrize("values", [(1.0, 2.0, 1.5), (1.0, 2.0, 4.0), (1.0, 1.0, 1.0)])
+def test_no_order_where_values_do_not_settle(values):  # to and fro, running away, standing still
+    assert math.isnan(wing_checks.observed_order(2.0, values))
+
+
+# ---------------------------------------------------------------- the wing against CalculiX
+
+
+ROD = {"web": 1, "reach": 0.25, "diameter": 0.012, "young_modulus": 120e9, "density": 1600.0}
+DAMAGED = {"young_modulus_factor": 1.0073, "stiffness_loss": (0.4, 0.6), "servo_mass": 0.0, "pitot_mass": 0.3}
+FEW_CELLS = {"edge_size": None, "span_size": 0.2, "chord_size": 0.2}
+PLACES = {"nodal displacements": 1e-5, "displacement outputs": 1e-5, "strains at integration points": 2e-5}
+
+
+@needs_calculix
+@pytest.mark.parametrize(
+    ("state", "changes"),
+    [
+        (DAMAGED, {}),
+        ({}, {"rods": [ROD], "skin": {"closed_leading_edge": False}}),
+    ],
+    ids=["damaged, with other masses", "with a rod and no wall at its nose"],
+)
+def test_statics_and_frequencies_agree(state, changes, coarse_design, tmp_path):
+    wing = assemble(coarse_design.changed(mesh=FEW_CELLS, **changes))
+    found = comparison.agreement(comparison.wing_deck(wing, DigitalState(**state)), tmp_path, 6)
+    assert list(found.loads) == ["tip force", "lift"]
+    for differences in found.loads.values():
+        assert all(differences[name] < most for name, most in PLACES.items())
+        assert changes or differences["gauge strains"] < 1e-5
+    assert len(found.ours) == 6
+    assert found.modal < 1e-5
+
+
+@needs_calculix
+def test_an_input_that_calculix_refuses_is_one_sentence(tmp_path):
+    with pytest.raises(CalculixError, match=r"did not finish .*bad\.inp.*bad\.log"):
+        comparison.run_calculix("*NONSENSE\n*STEP\n*STATIC\n*END STEP\n", tmp_path, "bad")
+
+
+def test_calculix_that_is_not_there_is_one_sentence(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(CalculixError, match="apt-get install calculix-ccx"):
+        comparison.run_calculix("", tmp_path, "job")
+
+
+TABLES, EIGENVALUES = (INPUTS.text(f"{name}.dat") for name in ("tables", "eigenvalues"))
+
+
+def test_printed_tables_are_read_or_refused():
+    tables = {name: [rows.tolist() for rows in own] for name, own in comparison.read_tables(TABLES).items()}
+    assert tables == {"NALL": [[[1, 0.1, -2, 0], [2, 0.3, 4, 5]]], "E0": [[[1, 1, 2.5]]]}
+    assert comparison.read_frequencies(EIGENVALUES).tolist() == [5.632151, 15.09876]
+    with pytest.raises(CalculixError, match="not a row of numbers"):
+        comparison.read_tables(TABLES.replace("-2.000000E+00", "*************"))
+    with pytest.raises(CalculixError, match="no eigenvalues"):
+        comparison.read_frequencies(TABLES)

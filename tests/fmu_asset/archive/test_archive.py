@@ -16,8 +16,7 @@ from fmu_asset.check import FmuCheck, check_file, check_fmu
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.session import FmiAsset
 from tests.fmu_asset.door.kinds import HOSTILE, WING_BINDING
-from tests.fmu_asset.foreign.workshop import MODELS
-from tests.fmu_asset.making import DESCRIPTION, archive_of, bound, edited, members, tables
+from tests.fmu_asset.making import DESCRIPTION, MODELS, archive_of, bound, edited, members, tables
 
 REFUSED = tables(__file__)["refused"]
 
@@ -36,34 +35,36 @@ def test_what_is_wrong_with_a_file_is_one_sentence(fmu, tmp_path, row) -> None:
         read_fmu(archive_of(path, in_utf_16(contents) if "utf_16" in row else contents))
 
 
-def test_an_archive_that_would_fill_the_disk_is_refused(fmu, tmp_path) -> None:
-    for name, size, words in (
-        ("resources/zeros", 300 * 1024**2, r"would extract to 30\d MiB, which looks like an archive"),
-        (f"{3000 * 'd/'}x", 1, r"an entry 3001 folders deep; no tool exports that .*refused"),
-    ):
-        with pytest.raises(errors.FmuFileError, match=words):
-            read_fmu(archive_of(tmp_path / "changed.fmu", members(fmu) | {name: bytes(size)}))
+def test_a_display_unit_that_is_one_over_the_value_is_none(ours, tmp_path) -> None:
+    inverse = ('<DisplayUnit name="microstrain"', '<DisplayUnit inverse="true" name="microstrain"')
+    changed = edited(ours("fmi3"), tmp_path / "changed.fmu", inverse)
+    shown = [{u.name: u.displays for u in read_fmu(path).units}["1"] for path in (ours("fmi3"), changed)]
+    assert [("microstrain", 1e6, 0.0) in displays for displays in shown] == [True, False]
 
 
-def test_what_is_no_fmu_is_one_sentence(fmu, tmp_path) -> None:
-    (tmp_path / "a.fmu").write_text("hello", encoding="utf-8")
+def test_what_is_no_fmu_or_dangerous_is_one_sentence(fmu, tmp_path) -> None:
+    """Among them archives that would fill the disk."""
+    link, contents, text = tmp_path / "link.fmu", members(fmu), tmp_path / "a.fmu"
+    text.write_text("hello", encoding="utf-8")
+    link.write_bytes(fmu.read_bytes())
+    with zipfile.ZipFile(link, "a") as archive:
+        entry = zipfile.ZipInfo("resources/link")
+        entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(entry, "/etc/passwd")
+    large = archive_of(tmp_path / "large.fmu", contents | {"resources/zeros": bytes(300 * 1024**2)})
+    deep = archive_of(tmp_path / "deep.fmu", contents | {f"{3000 * 'd/'}x": b"x"})
     for path, words in (
         (tmp_path, "is a folder"),
-        (tmp_path / "a.fmu", r"not a sound FMU archive .* fetch or build it again"),
+        (text, r"not a sound FMU archive .* fetch or build it again"),
+        (link, "outside its folder; it was refused"),
+        (large, r"would extract to 30\d MiB, which looks like an archive"),
+        (deep, r"an entry 3001 folders deep; no tool exports that .*refused"),
     ):
         with pytest.raises(errors.FmuFileError, match=words):
             read_fmu(path)
     words = r"offers co-simulation only, but .* asks for model-exchange"
     with pytest.raises(errors.FmuUnsupportedError, match=words):
         read_fmu(fmu, "model-exchange")
-    path = tmp_path / "link.fmu"
-    path.write_bytes(fmu.read_bytes())
-    with zipfile.ZipFile(path, "a") as archive:
-        link = zipfile.ZipInfo("resources/link")
-        link.external_attr = (stat.S_IFLNK | 0o777) << 16
-        archive.writestr(link, "/etc/passwd")
-    with pytest.raises(errors.FmuFileError, match="outside its folder; it was refused"):
-        read_fmu(path)
 
 
 def test_what_is_seen_when_it_is_loaded_is_one_sentence(foreign_fmu, fmu, tmp_path, scratch) -> None:

@@ -22,9 +22,6 @@ from tests.fmu_asset.making import bound, changed, system, tables, watch
 from tests.fmu_asset.ours import OurFmus
 from tests.refusals import refused as in_one_sentence
 
-NAN, DIE = 1.0, 3.0
-
-
 JACOBI = {"algorithm": "jacobi"}
 
 
@@ -111,20 +108,6 @@ def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
     other = CoupledAsset(replace(structure, connections=delayed), BINDINGS["three"], isolated=False)
     with other, pytest.raises(errors.FmuStateError, match="another FMU than the system test"):
         other.restore_state(state)
-
-
-def test_what_an_fmu_does_wrong_names_its_component(spring_mass, foreign_fmu) -> None:
-    law = linear("law", foreign_fmu("linear2"), d=np.eye(2))
-    joined = system([Component("spring", spring_mass), law], [("spring.position", "law.u1")])
-    binding = bound(0.1, {"y": ("law.y1", "1")}, load={"misbehaviour": ("spring.misbehaviour", "1")})
-    for behaviour, kind, words in (
-        (NAN, errors.FmuOutputError, "component spring: .*not finite.*position"),
-        (DIE, errors.FmuWorkerError, "component spring: .*ended by signal"),
-    ):
-        with CoupledAsset(joined, binding) as asset:
-            asset.step()
-            with pytest.raises(kind, match=words):
-                asset.step(load={"misbehaviour": behaviour})
 
 
 # ---------------------------------------------------------------------- inputs in straight lines

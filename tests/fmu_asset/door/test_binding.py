@@ -23,8 +23,7 @@ from fmu_asset.worker.client import WorkerLimits
 from reporting import units
 from reporting.units import Meaning, exact_meaning, meaning_of
 from tests.fmu_asset.door.kinds import WING_BINDING
-from tests.fmu_asset.foreign.workshop import MODELS
-from tests.fmu_asset.making import changed, tables
+from tests.fmu_asset.making import MODELS, changed, tables
 from tests.refusals import refused
 
 HERE = Path(__file__).parent

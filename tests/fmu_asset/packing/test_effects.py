@@ -1,7 +1,4 @@
-"""Missing effects in the FMU: of sensors, against whole records; of the wing, against the naming side.
-
-Both sides hold the wing in the same few vectors; what can differ is the physics.
-"""
+"""Missing effects in the FMU: of sensors, against whole records; of the wing, against the naming side."""
 
 import json
 import math

@@ -83,10 +83,6 @@ class Slave:
         """Return real variables by name."""
         return self.read([self.reference[name] for name in names])
 
-    def of(self, name: str) -> float:
-        """Return a real variable."""
-        return self.get(name)[0]
-
     def everything(self) -> list[float]:
         """Return all real variables."""
         return self.get(*self.names)

@@ -1,10 +1,8 @@
 """Missions of assets by FMUs, coupled ones and SSP files, and of structures from a mesh."""
 
-import json
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,12 +15,14 @@ import xarray as xr
 from benchmarks.seeds import fly_seeds
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError, InvalidDesignError
+from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuError, SspError
+from fmu_asset.ssp.reader import read_ssp
+from fmu_asset.structures import structure_binding_text
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import (
     changed_scenario,
-    check_resumed,
     check_same,
     cut_off_after,
     edited,
@@ -35,7 +35,6 @@ from tests.twin_master.runs import (
     written,
 )
 from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
-from twin_master.assets.structure_source import StructureBelief
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
 from twin_master.fleet.plan import ensemble
@@ -68,36 +67,38 @@ def folder(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return place
 
 
-@pytest.fixture(scope="module")
-def direct(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The mission with the one FMU, and with the system of one component."""
-    place = tmp_path_factory.mktemp("direct")
-    return {
-        name: new_run(load_scenario(folder / f"{name}.toml"), place / name).folder
-        for name in ("fouling", "coupled_fouling")
-    }
-
-
 def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
-@pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
-def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
+def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, tmp_path):
     """Also of a system of that FMU. It cannot save its state: its inputs are replayed.
 
     What is flown lies in the run folder.
     """
-    loaded = load_scenario(folder / f"{name}.toml")
-    inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
-    assert rows(inside) == rows(direct[name]) == rows(direct["fouling"])
-    check_resumed(direct[name], loaded, tmp_path / "part", 11)
-    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False)
-    flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
-    assert rows(flown) == rows(direct[name])
-    assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
-    ssp.unlink()
-    assert rows(resume(flown).folder) == rows(direct[name])
+    alone = rows(new_run(load_scenario(folder / "fouling.toml"), tmp_path / "alone").folder)
+    for name in ("fouling", "coupled_fouling"):
+        loaded, place = load_scenario(folder / f"{name}.toml"), tmp_path / name
+        whole = new_run(loaded, place / "whole").folder
+        inside = new_run(loaded, place / "inside", Overrides(in_process=True)).folder
+        assert rows(inside) == rows(whole) == alone
+        with cut_off_after(11):
+            new_run(loaded, place / "part")
+        resume(place / "part")
+        check_same(place / "part", whole, "run.nc", "config.json", "summary.json", "journal.jsonl")
+        ssp = export_scenario(loaded, place / "x.ssp", replace_file=False)
+        flown = new_run(loaded, place / "flown", Overrides(ssp=ssp)).folder
+        assert rows(flown) == alone
+        assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
+        ssp.unlink()
+        assert rows(resume(flown).folder) == alone
+    several = ("step_size = 60.0", "step_size = 15.0\ndecimation = 4\nstart_time = 1000.0")
+    own = written(tmp_path, (folder / "binding.toml").read_text(encoding="utf-8"), several)
+    loaded = load_scenario(folder / "fouling.toml")
+    asset = loaded.scenario.asset.model_copy(update={"binding": str(own)})
+    later = replace(loaded, scenario=loaded.scenario.model_copy(update={"asset": asset}))
+    ssp = export_scenario(later, tmp_path / "later.ssp", replace_file=False)
+    assert read_ssp(ssp, tmp_path).span == (1000.0, 1000.0 + 60.0 * later.scenario.mission.steps)
 
 
 @pytest.mark.parametrize(
@@ -112,28 +113,16 @@ def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, nam
     assert not [*tmp_path.iterdir()]
 
 
-def test_damage_that_the_asset_lives_by_itself_needs_a_model_for_the_twin(folder, tmp_path):
-    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
-    own = '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
-    path = written(folder, text[: text.index("[truth]")] + own, name="own.toml")
-    with pytest.raises(MissionInputError, match="name a model for the twin in the table `belief`"):
-        new_run(load_scenario(path), tmp_path / "run")
-    assert not [*tmp_path.iterdir()]
-
-
 # ---------------------------------------------------------------------- with the shipped wing
 
 
-def shipped(name: str, tmp_path: Path, *changes: tuple[str, str]) -> LoadedScenario:
-    """Return a shipped scenario with changes, and with a calibration that costs nothing."""
+def plant_of(name: str, folder: Path, *changes: tuple[str, str]) -> Plant:
+    """Return what flies in a shipped scenario with changes, and with a calibration that costs nothing."""
     text = text_of(name)
     calibration = text[text.index("[calibration]") : text.index("[truth]")]
     fixed = '[calibration]\nparameter = "young_modulus_factor"\nsource = "fixed"\nmean = 1.0073\n\n'
-    return load_scenario(written(tmp_path, text, (calibration, fixed), *changes, name=f"{name}.toml"))
-
-
-def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
-    scenario, source = loaded.scenario, prepared(loaded, folder, {"in_process": True})
+    loaded = load_scenario(written(folder, text, (calibration, fixed), *changes, name=f"{name}.toml"))
+    scenario, source = loaded.scenario, prepared(loaded, folder / name, {"in_process": True})
     truth = Truth(scenario, build_graphical_model(scenario), scenario.mission.seed)
     return Plant(scenario, truth, source.open())
 
@@ -143,8 +132,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
     quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
     lived = INPUTS.table("lived_by_fmus.toml")["changes"]
-    split = plant_of(shipped("three_fmus", tmp_path, *lived), tmp_path / "split")
-    single = plant_of(shipped("failing_gauges", tmp_path, quiet), tmp_path / "single")
+    split, single = plant_of("three_fmus", tmp_path, *lived), plant_of("failing_gauges", tmp_path, quiet)
     controls = np.random.default_rng(3).integers(2, size=50).tolist()
     for step, control in enumerate(controls):
         previous = controls[step - 1] if step else None
@@ -311,7 +299,7 @@ def mission(file: Path, **changes: Any) -> LoadedScenario:
 
 
 @pytest.fixture(scope="module")
-def file(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(write_beam: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_beam(tmp_path_factory.mktemp("beam"), TWO)
 
 
@@ -336,6 +324,12 @@ def test_the_twin_finds_the_loss_from_records_of_accelerations(file, tmp_path):
     # mode 5, at 8 kHz and strongly damped, is in the record and told by none of the bands: a small bias
     assert np.abs((seen - true) / np.hypot(errors, 5e-3 * np.abs(true))).max() < 5.0
     assert np.all(errors[:, 0] < 1e-3 * true[:, 0])
+    # a record has its own rate, however many steps of the binding make a turn
+    several = ("step_size = 1.0", "step_size = 1.0\ndecimation = 4")
+    binding = written(tmp_path, structure_binding_text(load_structure(file)), several)
+    once = {"mission": {"steps": 1}, "truth": {"gains": []}, "asset": {"binding": str(binding)}}
+    rate = fly(mission(file, **once), tmp_path / "rate")
+    np.testing.assert_array_equal(rate["observed"]["modes"].values, seen[:1])
     noise = np.hypot(errors, loaded.scenario.observation.standard_deviation)
     np.testing.assert_allclose(tree["filtered"]["noise_standard_deviation"], noise, rtol=1e-9)
     np.testing.assert_allclose(tree["filtered"]["mean"].values, tree["truth"]["state"].values, atol=0.02)
@@ -374,7 +368,7 @@ def test_a_watch_takes_features_with_their_covariance(file):
     reader, count = MessageReader(scenario), scenario.observation.count
     covariance = np.diag([1e-2, 1e-8, 1e-6, 1.0, 1e-6, 1e-6])
     told = {"frequency_1_Hz": 461.7, "mid_1": None, "modes_4": 4590.0, "covariance": covariance.tolist()}
-    message = reader.message(json.dumps(told).encode())
+    message = reader.message(told)
     np.testing.assert_array_equal(message.observed[:count], [461.7, np.nan, np.nan, 4590.0, np.nan, np.nan])
     np.testing.assert_array_equal(message.observed, packed_row(message.observed[:count], covariance))
     for wrong, sentence in (([1.0], "6 rows of 6"), ((-covariance).tolist(), "eigenvalues of zero or more")):
@@ -404,7 +398,6 @@ def test_gauges_that_cannot_stand_beside_those_of_the_file(tmp_path):
     gauges = text[text.index("[[gauge]]") : text.index("[[displacement]]")]
     rows = 'gauge = [{ name = "end_1", point = [40, 50, -20], direction = [1, 0, 0] }]\n'
     inline = written(tmp_path, rows + edited(text, (gauges, "")), name="panel.toml")
-    assert isinstance(panel.belief, StructureBelief)
     believed = panel.belief.model_copy(update={"structure": str(inline)})
     with pytest.raises(MissionInputError, match=r"as tables \[\[gauge\]\], not in a list"):
         with_candidates(panel.model_copy(update={"belief": believed}), "3", tmp_path / "3")

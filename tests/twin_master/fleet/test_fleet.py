@@ -33,10 +33,8 @@ from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.turns import DamageGrowth
-from twin_master.network.transition import TransitionModel
-from twin_master.store.writing import open_run
-from uav_twin import GraphicalModel, fly_fleet, load_scenario, open_fleet, prepare_twin
 from uav_twin import fly as new_run
+from uav_twin import fly_fleet, load_scenario, open_fleet, open_run, prepare_twin
 
 
 def growing(library_file: Path, count: int = 10, shard: int = 4) -> Fleet:
@@ -106,9 +104,7 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
     assert fly_fleet(fleet, cut).shards_flown == 0
 
 
-def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
-    library_file, tmp_path, monkeypatch
-):
+def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_in_vain(library_file, tmp_path, monkeypatch):
     fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
     monkeypatch.setattr("twin_master.fleet.shard.CONNECTING", 0.2)
     with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
@@ -234,9 +230,8 @@ def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():
     delay, early = _fallbacks(knowledge, flights)
     np.testing.assert_array_equal(delay, [np.inf, np.inf, np.nan, 1.0, np.nan])
     assert (early == 0).all()
-    both = replace(
-        knowledge, policy=np.eye(2)[(knowledge.model.states.coordinates.sum(axis=1) < 0.5).astype(int)]
-    )
+    lost = knowledge.model.states.coordinates.sum(axis=1)
+    both = replace(knowledge, policy=np.eye(2)[(lost < 0.5).astype(int)])
     delay, early = _fallbacks(both, flights)  # by which no state alone calls for a fallback
     assert (np.isnan(delay) & (early == -1)).all()
 
@@ -279,16 +274,20 @@ def same(first: Flights, second: Flights) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("name", "decide_on"),
+    ("name", "decide_on", "product"),
     [
-        ("level_turns", "filtered"),
-        ("growing_damage", "predicted"),
-        ("failing_gauges", "filtered"),
-        ("inspected_wing", "predicted"),
+        ("level_turns", "filtered", False),
+        ("growing_damage", "predicted", False),
+        ("growing_damage", "filtered", True),  # of tables, one for each region
+        ("failing_gauges", "filtered", False),
+        ("inspected_wing", "predicted", False),
     ],
 )
-def test_each_twin_flies_what_it_flies_alone(name, decide_on, library_file):
+def test_each_twin_flies_what_it_flies_alone(name, decide_on, product, library_file, monkeypatch):
+    if product:
+        monkeypatch.setattr("twin_master.network.transition.JOINT_NON_ZEROS", 0)
     knowledge, asset = known(name, library_file, decide_on)
+    assert knowledge.model.transition.is_product is product
     truths = [knowledge.truth(seed) for seed in range(5)]
     together = fly_side_by_side(knowledge, truths, [asset] * 5)
     assert same(together, fly_one_by_one(knowledge, truths, lambda *_: asset))
@@ -337,9 +336,7 @@ def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
         (Remembering, FmuEndedError("It is over.", time=1.0)),
     ],
 )
-def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_the_others(
-    driven, error, library_file
-):
+def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown(driven, error, library_file):
     knowledge, asset = known("growing_damage", library_file)
     truths, soft = [knowledge.truth(seed) for seed in range(6)], until_soft(asset, error)
     whole = fly_side_by_side(knowledge, truths, [asset] * 6)
@@ -349,11 +346,9 @@ def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_
     softened = whole.state[:, :, 0] >= 0.4 - 1e-9
     flown = np.where(softened.any(axis=1), softened.argmax(axis=1), 35)
     assert 0 < np.sum(flown < 35) < 6
-    ends, over = (
-        isinstance(error, FmuEndedError),
-        "The asset ended the mission after {} of 35 turns: It is over.",
-    )
-    assert found.ended == [over.format(n) if ends and n < 35 else "" for n in flown]
+    ends, over = isinstance(error, FmuEndedError), "The asset ended the mission after"
+    said = [f"{over} {n} of 35 turns: It is over." if ends and n < 35 else "" for n in flown]
+    assert found.ended == said
     assert [text != "" for text in found.failure] == [not ends and n < 35 for n in flown]
     for twin, end in enumerate(flown):
         assert np.array_equal(found.filtered[twin, :end], whole.filtered[twin, :end])
@@ -380,17 +375,8 @@ def test_an_impossible_observation_ends_one_flight_only(library_file):
     assert "step 4" in found.failure[1]
 
 
-def test_a_product_of_tables_flies_the_same_and_damage_grows_as_the_model_says(library_file):
-    knowledge, asset = known("growing_damage", library_file)
-    model = knowledge.model
-    tables = model.transition.blocks[0].reshape(2, 5, 5, 5, 5)
-    moves = TransitionModel((tables[:, :, 0].sum(axis=-1), tables[:, 0].sum(axis=2)))
-    graph = GraphicalModel(model.states, model.controls, model.prior, moves)
-    product = replace(knowledge, model=graph)
-    assert product.model.transition.is_product
-    truths = [product.truth(seed) for seed in range(2)]
-    together = fly_side_by_side(product, truths, [asset] * 2)
-    assert same(together, fly_one_by_one(product, truths, lambda *_: asset))
+def test_damage_grows_as_the_model_says(library_file):
+    model = known("growing_damage", library_file)[0].model
     growth, uniform = DamageGrowth(model), (np.arange(2000) + 0.5) / 2000
     for control in (0, 1):
         row = model.transition.row(control, 6)

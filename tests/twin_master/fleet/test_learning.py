@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,21 +27,12 @@ from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from uav_twin import (
-    GaussianSensorModel,
-    filter_sequence,
-    fly_fleet,
-    learn_from_fleet,
-    load_scenario,
-    open_fleet,
-)
+from uav_twin import GaussianSensorModel, fly_fleet, learn_from_fleet, load_scenario, open_fleet
 
 EACH = {"2g": 0.07, "3g": 0.2}
 
 
-def tiny(
-    probability: object, levels: int = 3, name: str = "growing_damage", success: float = 1.0
-) -> Scenario:
+def tiny(probability: Any, levels: int = 3, name: str = "growing_damage", success: float = 1.0) -> Scenario:
     """Return a shipped scenario with few levels, whose repairs may fail."""
     table = load_scenario(name).scenario.to_dict()
     for action in table["action"]:
@@ -96,8 +88,8 @@ def test_evidence_of_a_node_is_that_of_the_filter():
     for node, twin in product(range(3), range(2)):
         alone = GaussianSensorModel(values[node : node + 1], 1e-4, interval=interval)
         rows = alone.log_likelihood_sequence(observed[twin], control[twin])
-        expected = filter_sequence(model, control[twin], rows).log_evidence.sum()
-        assert nodes[twin, node] == pytest.approx(expected, rel=1e-12)
+        *_, expected = precise_forward_backward(model, control[twin], rows)
+        assert nodes[twin, node] == pytest.approx(expected.sum(), rel=1e-12)
 
 
 def grid_of(*counts: tuple[int, int]) -> Grid:

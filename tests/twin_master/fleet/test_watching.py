@@ -1,7 +1,6 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
 import json
-import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 
 from tests.command_line import command, said
 from tests.twin_master.runs import journal, text_of, written
-from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, served, wait_until, write_csv
+from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until, write_csv
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving
@@ -100,13 +99,11 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     assert [state[f"north/wing-{number}"]["last"]["turn"] for number in range(3)] == [TURNS - 1] * 3
     (again / "watched.json").unlink()  # as if a kill had come: nobody knows whether the last ones were told
     told = list[tuple[str, bool]]()
-    fleet = FleetWatch(
-        load_fleet(fleet_file),
-        again,
-        lambda one, decision: told.append((one.name, decision["told_again"])),
-        print,
-    )
-    fleet.run()
+
+    def tell(one: WatchedAsset, decision: Decision) -> None:
+        told.append((one.name, decision["told_again"]))
+
+    FleetWatch(load_fleet(fleet_file), again, tell, print).run()
     assert sorted(told) == [(f"north/wing-{number}", True) for number in range(3)]
     with pytest.raises(RunFolderError, match="another fleet"):
         FleetWatch(load_fleet(fleet_file, seed=8), again, print, print)
@@ -119,15 +116,11 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
 
 
 @pytest.fixture
-def broker(fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+def broker(fleet_file: Path, tmp_path: Path) -> Iterator[Mosquitto]:
     """A broker that has a topic for each asset of the fleet."""
-    if shutil.which("mosquitto") is None:
-        pytest.skip("no mosquitto")
-    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
-    broker = Mosquitto(tmp_path)
-    fleet_of(tmp_path, f'observations = "mqtt://wing@127.0.0.1:{broker.port}/wings/+"')
-    yield broker
-    broker.stop()
+    with mosquitto(tmp_path) as broker:
+        fleet_of(tmp_path, f'observations = "mqtt://wing@127.0.0.1:{broker.port}/wings/+"')
+        yield broker
 
 
 def publish(client: Any, name: str, turn: int, control: str = "2g", strain: Any = (1e-3,) * 24) -> None:
@@ -323,9 +316,8 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     config = json.loads((outcome.folder / "config.json").read_text())
     soon = leaving(outcome.folder, config["fleet"]["groups"][0], group)
     for _ in range(2):  # the second time nothing is left to read
-        records = [
-            asset.record() for _, asset in sorted(watched(fleet_file, tmp_path / "out").assets.items())
-        ]
+        assets = watched(fleet_file, tmp_path / "out").assets
+        records = [asset.record() for _, asset in sorted(assets.items())]
         assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
         assert sum(record["alarms"] > 0 for record in records) == alarmed
 

@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,16 +16,16 @@ from scenarios import scenario_files
 from tests.command_line import said
 from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
+from twin_master.command import _shown
 from twin_master.errors import TwinMasterError
 from twin_master.report.model import learnt_figure, sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
-from twin_master.store.mission_result import MissionResult
-from twin_master.store.writing import open_run
+from twin_master.store.mission_result import MissionResult, printed_learnt
 from twin_master.viewer.flight import Flight
-from uav_twin import load_scenario, prepare_twin
+from uav_twin import fly, load_scenario, open_run, prepare_twin
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -52,13 +53,8 @@ def folder(scenario: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(folder: Path) -> xr.DataTree:
-    return open_run(folder)
-
-
-@pytest.fixture(scope="module")
-def learnt(run: xr.DataTree) -> xr.Dataset:
-    return run["learnt"].to_dataset()
+def learnt(folder: Path) -> xr.Dataset:
+    return open_run(folder)["learnt"].to_dataset()
 
 
 def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
@@ -78,7 +74,8 @@ def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
         assert variable.attrs["long_name"]
 
 
-def test_prior_and_truth_are_those_of_the_scenario(learnt, run):
+def test_prior_and_truth_are_those_of_the_scenario(learnt, folder):
+    run = open_run(folder)
     draws = run["calibration"]["draw_value"].values
     mean, wide = (learnt[f"young_modulus_factor_prior_{name}"].item() for name in MOMENTS[:2])
     assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())  # between the draws as well
@@ -102,12 +99,7 @@ def test_prior_and_truth_are_those_of_the_scenario(learnt, run):
 @pytest.mark.parametrize(("faster", "truth"), [({"2g": 0.1, "3g": 0.2}, 2.0), ({"2g": 0.1, "3g": 0.1}, None)])
 def test_the_true_factor_is_that_of_the_true_probabilities(faster, truth):
     learning = {"parameter": False, "noise": False, "transition_factors": [1.0, 2.0]}
-    changes = {
-        "learning": learning,
-        "truth": {"probability": faster},
-        "mission": {"steps": 2},
-        "notice": False,
-    }
+    changes = {"learning": learning, "truth": {"probability": faster}, "mission": {"steps": 2}}
     known, source = of_wing(changed_scenario("growing_damage", changes | {"notice": False}).scenario)
     (factor,) = MissionResult(known.scenario, known, flight_of(known, source), known.truth(3)).learnt
     assert (factor.name, factor.truth) == ("transition_factor", truth)
@@ -152,28 +144,22 @@ def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
     assert "posterior mean of the Young" not in text
 
 
-def test_the_view_shows_what_was_learnt(folder, run):
+def test_the_view_shows_what_was_learnt(folder):
     """From the posterior of each quantity alone, which the journal tells."""
-    flight, filtered = Flight(folder), run["filtered"].to_dataset()
+    flight, run = Flight(folder), open_run(folder)
+    filtered = run["filtered"].to_dataset()
     flight.update()
-    shown, noise = (
-        flight.believed(flight.seen(0, TURNS)).expected,
-        filtered["noise_standard_deviation"].values,
-    )
+    shown = flight.believed(flight.seen(0, TURNS)).expected
+    noise = filtered["noise_standard_deviation"].values
     wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
     np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
-    ahead = (
-        flight.predicted(flight.seen(TURNS - 1, TURNS)[0]).expected.mean
-        - run["predicted"]["quantity_mean"].values[-1]
-    )
-    assert np.abs(ahead / noise[-1]).max() < 0.06
+    ahead = flight.predicted(flight.seen(TURNS - 1, TURNS)[0]).expected.mean
+    assert np.abs((ahead - run["predicted"]["quantity_mean"].values[-1]) / noise[-1]).max() < 0.06
 
     def off() -> float:
-        error = (
-            flight.believed(flight.seen(0, TURNS)).expected.mean - filtered["quantity_mean"].values
-        ) / noise
-        return float(np.abs(error).max())
+        error = flight.believed(flight.seen(0, TURNS)).expected.mean - filtered["quantity_mean"].values
+        return float(np.abs(error / noise).max())
 
     residual = (run["observed"]["strain"].values - filtered["quantity_mean"].values) / noise
     np.testing.assert_allclose(residual, filtered["residual"].values)
@@ -200,6 +186,23 @@ def test_more_transitions_than_there_can_be_are_refused(tmp_path):
     knowledge = prepare_twin(load_scenario(file))
     with pytest.raises(TwinMasterError, match=r"smaller `learning.transition_factors`"):
         knowledge.twin()
+
+
+def test_offsets_of_sensors_of_several_units_have_their_own(tmp_path):
+    """And no mean: that of litres a minute, newton metres, degrees and bars says nothing."""
+    given: dict[str, Any] = {"mission": {"steps": 2}, "calibration": {"draws": 4}}
+    given |= {"learning": {"gauge_offset": [0.5, 0.4, 1.0, 0.1]}}
+    plain = changed_scenario("pump_wear", given | {"observation": {"unit": "1"}})  # which is no strain
+    assert printed_learnt("gauge_offset", "1", plain.scenario) == (1.0, "")
+    fly(changed_scenario("pump_wear", given), tmp_path, report=False)
+    summary, units = json.loads((tmp_path / "summary.json").read_text()), ["L/min", "N.m", "degC", "bar"]
+    told = {figure["key"]: figure for figure in summary["figures"]}
+    most = told["gauge_offset_most"]
+    assert most["unit"] == units[int(re.search(r"sensor (\d)", most["title"])[1]) - 1]
+    assert told["gauge_offset_mean"]["value"] is None
+    assert summary["learnt"]["gauge_offset"]["unit"] == units
+    learnt = journal(tmp_path)[-1]["learnt"]
+    assert [learnt[f"gauge_offset[{number}]"]["unit"] for number in range(1, 5)] == units
 
 
 def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
@@ -237,6 +240,7 @@ def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_re
     faults = ("# What the figures", Inputs(__file__).text("faults.toml") + "# What the figures")
     spoilt, noticed = written(tmp_path, TEXT, *SHORT, faults), tmp_path / "run"
     console = said("run", spoilt, "--out", noticed, "--no-report")
+    assert _shown(123_456, "") == "123456"  # a turn has all of its digits
     alarm = next(line for line in console.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
     assert "gauge 5 shows too much, since about turn 2 (" in alarm
     search = f"; to find the cause: uav-twin discrepancy run --from-run {noticed} --from-turn 2"

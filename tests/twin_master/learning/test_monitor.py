@@ -1,7 +1,6 @@
 """What is noticed, against sums over every course of events, an exact mean, and faults that are put in."""
 
 from dataclasses import replace
-from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -11,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from tests.twin_master.runs import changed_scenario
+from tests.twin_master.network.decision_oracles import trajectories
+from tests.twin_master.runs import changed_scenario, estimates_of
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
@@ -23,16 +23,7 @@ from twin_master.network.estimator import Words
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.twin import TwinTurn
 from twin_master.scenario.tables import Learning, Noticing
-from uav_twin import (
-    Carried,
-    Estimate,
-    ExactFilter,
-    GaussianSensorModel,
-    GraphicalModel,
-    Twin,
-    WatchfulEstimator,
-    prepare_twin,
-)
+from uav_twin import ExactFilter, GaussianSensorModel, GraphicalModel, Twin, WatchfulEstimator, prepare_twin
 
 Float = NDArray[np.float64]
 
@@ -50,15 +41,6 @@ def small(gauges: int = 3) -> tuple[GraphicalModel, GaussianSensorModel]:
 def watchful(gauges: int = 3, given: Noticing = SETTINGS) -> WatchfulEstimator:
     model, sensors = small(gauges)
     return WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, given)
-
-
-def run(estimator: WatchfulEstimator, seen: Float) -> list[Estimate]:
-    estimates: list[Estimate] = []
-    before: Carried | None = None
-    for turn, row in enumerate(seen):
-        estimates.append(estimator.turn(before, row, 0, turn))
-        before = estimates[-1].carried
-    return estimates
 
 
 def drawn(random: np.random.Generator, turns: int, gauges: int = 3) -> Float:
@@ -79,15 +61,10 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     seen = drawn(np.random.default_rng(3), 12)
     seen[6:, 1] *= 1.4
     words = Words(names=("root", "spar", "tip"), command="")  # of an asset where none looks for causes
-    watched = run(WatchfulEstimator(inner, sensors, DRAWS, words=words), seen)
-    before: Carried | None = None
-    for turn, row in enumerate(seen):
-        plain, found = inner.turn(before, row, 0, turn), watched[turn]
-        before = plain.carried
+    watched = estimates_of(WatchfulEstimator(inner, sensors, DRAWS, words=words), seen)
+    for turn, (plain, found) in enumerate(zip(estimates_of(inner, seen), watched, strict=True)):
         # The filter goes on as if it were alone, and the evidence is the model's.
-        np.testing.assert_array_equal(
-            found.carried.arrays["log_filtered"], plain.carried.arrays["log_filtered"]
-        )
+        np.testing.assert_array_equal(*(one.carried.arrays["log_filtered"] for one in (found, plain)))
         assert found.log_evidence == plain.log_evidence
         probability = {one.name: one.probability for one in found.hypotheses}
         told = 1.0 - sum(probability.values())  # those that are left out are improbable
@@ -144,36 +121,28 @@ def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch
     turns, seen = 4, drawn(np.random.default_rng(8), 4)
     seen[2, 1] = seen[1] = np.nan  # a gauge, and a whole turn
     known = Noticing(noise_degrees=1e9, onset_turns=3.0)
-    found = run(watchful(given=known), seen)[-1].suspicion
+    found = estimates_of(watchful(given=known), seen)[-1].suspicion
     model, sensors = small()
     to_begin = 0.5 / (1.0 + np.arange(turns) / 3.0)
     first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of these turns, and of none of them
 
     def evidence(gauge: int, gain: float, begin: int) -> float:
-        total = 0.0
-        for draw, path in product(range(2), product(range(3), repeat=turns)):
-            probability = 0.5 * float(path[0] == 0)
-            for before, after in pairwise(path):
-                probability *= model.transition.matrix[0, before, after]
-            shown = sensors.value_per_draw[draw, list(path), 0].copy()
-            shown[begin:, gauge] *= 1.0 + gain
-            density = norm.pdf(seen, shown)
-            total += probability * np.prod(density[~np.isnan(seen)])
-        return total
+        shown = sensors.value_per_draw[:, :, 0].repeat(turns, axis=1).reshape(2, 3, turns, 3)
+        shown[:, :, begin:, gauge] *= 1.0 + gain
+        density = np.nansum(norm.logpdf(seen, shown), axis=-1).swapaxes(1, 2)  # (E, T, S)
+        paths = ([*trajectories(model, [0] * turns, row)][-1][1] for row in density)
+        return 0.5 * float(sum(joint.sum() for joint in paths))
 
     for gauge in range(3):
-        rival = sum(
-            weight * np.mean([evidence(gauge, gain, begin) for gain in GAINS])
-            for begin, weight in enumerate(first)
-        )
-        expected = np.log(rival / evidence(gauge, 0.0, 0))
+        each = [np.mean([evidence(gauge, gain, begin) for gain in GAINS]) for begin in range(turns + 1)]
+        expected = np.log(first @ each / evidence(gauge, 0.0, 0))
         assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-5)
 
 
 def test_the_first_evidence_is_a_ratio_of_two_sums():
     sensors = small()[1]
     row = sensors.value_per_draw[0, 0, 0] * [1.0, 1.3, 1.0]
-    found = run(watchful(), row[None])[0].suspicion
+    found = estimates_of(watchful(), row[None])[0].suspicion
     sums = np.zeros(2)
     for value in sensors.value_per_draw[:, 0, 0]:  # the first state is certain
         spread = np.sqrt(1.0 + (SETTINGS.all_gain * value) ** 2)
@@ -198,7 +167,7 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
     estimator = watchful(1)
     seen = drawn(np.random.default_rng(turns), turns, 1)
     seen[-1] += 4.0  # a past that looks like a fault
-    today = run(estimator, seen)[-1]
+    today = estimates_of(estimator, seen)[-1]
     model, sensors = small(1)
     kept = today.carried.arrays
     belief = kept["notice/model"] @ model.transition.matrix[0]
@@ -220,10 +189,8 @@ def twins() -> dict[str, Twin]:
     """Return twins of two gauges that do not learn, learn, and give notice beside either."""
     model, sensors = small(2)
     priors = Learning(noise_degrees=10.0, gauge_gain=0.1, gauge_offset=1.0)
-    inner = {
-        "exact": ExactFilter(model, sensors),
-        "learning": LearningFilter(model, sensors, priors, ("e", DRAWS)),
-    }
+    learning = LearningFilter(model, sensors, priors, ("e", DRAWS))
+    inner = {"exact": ExactFilter(model, sensors), "learning": learning}
     own = inner | {f"watchful {name}": WatchfulEstimator(e, sensors, DRAWS) for name, e in inner.items()}
     return {name: Twin(name, model, sensors, np.ones((3, 1)), estimator=e) for name, e in own.items()}
 
@@ -285,11 +252,6 @@ def at_levels(name: str, between: bool) -> Knowledge:
     return prepare_twin(changed_scenario(name, FEW | {"observation": {"between_levels": between}}))
 
 
-@pytest.fixture(scope="module")
-def wing() -> Knowledge:
-    return prepare_twin(changed_scenario("paper_level_turns", FEW))
-
-
 @pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 6)])
 def test_damage_between_two_levels_raises_no_alarm(between, alarmed):
     """Six flights of the panel with a stiffener that grows soft between two levels, and nothing else."""
@@ -297,16 +259,12 @@ def test_damage_between_two_levels_raises_no_alarm(between, alarmed):
     sensors, shape = panel.sensor_model, panel.model.states.shape
     table = sensors.mean[:, 1].reshape(*shape, -1)[:, 0, 0]  # (levels, sensors), at full pressure
     estimator = WatchfulEstimator(panel.twin().estimator, sensors, panel.draws.values)
-    alarms = 0
+    loss, alarms = np.minimum(0.25 + 0.01 * np.arange(30), 0.4) / 0.25, 0
+    shown = np.stack([np.interp(loss, np.arange(shape[0]), column) for column in table.T], axis=1)
     for flight in range(6):
-        random, before, raised = np.random.default_rng(flight), None, False
-        for turn in range(30):
-            loss = min(0.25 + 0.01 * turn, 0.4) / 0.25
-            shown = [np.interp(loss, np.arange(shape[0]), column) for column in table.T]
-            seen = shown + sensors.standard_deviation * random.normal(size=len(shown))
-            estimate = estimator.turn(before, seen, 1, turn)
-            before, raised = estimate.carried, raised or any(n.kind == "alarm" for n in estimate.notices)
-        alarms += raised
+        noise = sensors.standard_deviation * np.random.default_rng(flight).normal(size=shown.shape)
+        estimates = estimates_of(estimator, shown + noise, [1] * 30)
+        alarms += any(notice.kind == "alarm" for one in estimates for notice in one.notices)
     assert alarms == alarmed
 
 
@@ -328,9 +286,8 @@ def test_belief_and_decision_follow_what_holds_now(between):
             control = course[watched][-1].next_control if turn else 1
             row = known.sensor_model.mean[state, control] * np.where(wrong, 0.67, 1.0) + noise
             course[watched].append(twin.turn(row, control))
-    mean = {
-        watched: np.array([found.filtered @ states[:, 0] for found in course[watched]]) for watched in course
-    }
+    first = states[:, 0]
+    mean = {watched: np.array([found.filtered @ first for found in course[watched]]) for watched in course}
     assert np.abs(mean[True] - truth)[np.r_[14:20, 25:30, 35:90]].max() < 0.12
     assert mean[False][40:46].max() < 0.25  # the filter alone believes the gauge, flies on and wears the wing
     assert {found.next_control for found in course[False][32:46]} == {1}
@@ -358,7 +315,8 @@ def test_belief_and_decision_follow_what_holds_now(between):
     assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
 
 
-def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named(wing):
+def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():
+    wing = prepare_twin(changed_scenario("paper_level_turns", FEW))
     assert wing.scenario.control_names[wing.safest] == "2g"
     planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
     named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))

@@ -27,15 +27,7 @@ from scenarios import asset_scripts
 from scenarios.assets.gear_pump import steady_temperature
 from tests.kept import ROOT
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import (
-    check_same,
-    cut_off_after,
-    figures_of,
-    loaded_from,
-    merged,
-    table_of,
-    written,
-)
+from tests.twin_master.runs import check_same, cut_off_after, loaded_from, merged, table_of, written
 from twin_master.assets.library_source import load_observation_library
 from twin_master.assets.resolution import Overrides, asset_source
 from twin_master.errors import MissionInputError
@@ -57,12 +49,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def grid(files: tuple[Path, Path], mode: float = FINE, **changes: object) -> SamplingGrid:
-    texts = [
-        f"wear={','.join(map(str, WEAR))}",
-        f"gain={','.join(map(str, GAIN))}",
-        f"push={','.join(map(str, PUSH))}",
-        f"mode={mode}",
-    ]
+    texts = ["wear=0,0.25,0.5", "gain=0.9,1.0,1.1", "push=2,4", f"mode={mode}"]
     return replace(grid_of_fmu(*files, texts), **changes)  # type: ignore[arg-type]
 
 
@@ -144,9 +131,8 @@ def test_what_is_damaged_is_sampled_again(files, tmp_path, monkeypatch):
         else:
             kept.write_bytes(kept.read_bytes()[:-8])
         outcome = sample_library(some, out, workers=1, resume=True)
-        assert outcome.block_count - outcome.kept_blocks == (
-            1 if out.stem == "block" else outcome.block_count
-        )
+        again = outcome.block_count - outcome.kept_blocks
+        assert again == (1 if out.stem == "block" else outcome.block_count)
         assert out.read_bytes() == whole.path.read_bytes()
 
 
@@ -154,10 +140,9 @@ def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(files, 
     for mode in (LAG, COUNT):
         with pytest.raises(MissionInputError, match=r"remembers earlier steps: at wear = .*--settle"):
             sample_library(grid(files, mode), tmp_path / "lever.nc", workers=1, replace_existing=True)
+    early = grid(files, LAG, settling_steps=3)
     with pytest.raises(MissionInputError, match="has not settled after 3 steps"):
-        sample_library(
-            grid(files, LAG, settling_steps=3), tmp_path / "lever.nc", workers=1, replace_existing=True
-        )
+        sample_library(early, tmp_path / "lever.nc", workers=1, replace_existing=True)
     lagging = grid(files, LAG, settling_steps=40)
     settled = sample_library(lagging, tmp_path / "lever.nc", workers=1, replace_existing=True)
     exact = sample_library(grid(files), tmp_path / "exact.nc", workers=1)
@@ -253,7 +238,8 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
     outcome = fly(SMALL, tmp_path / "run", Overrides(library=made, fmu=fmu))
     assert outcome.origin.differ
     assert outcome.origin.model == "observation library of another FMU"
-    assert figures_of(outcome.folder)["model_misfit_largest"] > 1.0  # percent: it is hotter with less cooling
+    (misfit,) = (figure.value for figure in outcome.figures if figure.key == "model_misfit_largest")
+    assert misfit > 1.0  # percent: it is hotter with less cooling
     assert json.loads((outcome.folder / "summary.json").read_text())["asset_and_model_differ"] is True
 
 
@@ -375,10 +361,8 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         asked = grid_of_scenario(loaded, tmp_path / "made", grid, overrides=given)
         given = replace(given, library=sample_library(asked, tmp_path / "l.nc", workers=1).path)
     elif way == "learnt":
-        learnt = (
-            'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100.0\nstandard_deviation = 30.0\n'
-        )
-        given = replace(given, learnt=written(tmp_path, learnt))
+        text = 'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100\nstandard_deviation = 30\n'
+        given = replace(given, learnt=written(tmp_path, text))
     known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
     assert ("the observation library is interpolated" in known.draws.source) is (way == "swept")
     assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
@@ -390,9 +374,8 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         source.prepare(tmp_path / f"{true:g}", SilentProgress())
         assert source.origin.model == f"observation library of it {of}".strip()
         assert source.origin.differ == bool(of)
-    draw, fouling, flow = np.meshgrid(
-        known.draws.values, [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2], indexing="ij"
-    )
+    axes = known.draws.values, [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2]
+    draw, fouling, flow = np.meshgrid(*axes, indexing="ij")
     passed = draw / (1.0 + fouling * draw) / ((slope * draw + offset) * flow)
     shown = 20.0 + 60.0 * (1.0 - np.exp(-np.stack([0.5 * passed, passed], axis=-1)))
     np.testing.assert_allclose(known.predicted, shown, rtol=1e-4 if way == "swept" else 1e-12)

@@ -22,15 +22,11 @@ class Wayward(Fmi2Slave):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self.push = self.wear = self.shown = self.double = 0.0
-        self.mode, self.gain, self.count = float(FINE), 1.0, 0
-        for name in ("push", "wear", "mode"):
-            self.register_variable(Real(name, causality=Fmi2Causality.input))
-        self.register_variable(
-            Real("gain", causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed)
-        )
-        for name in ("shown", "double"):
-            self.register_variable(Real(name, causality=Fmi2Causality.output))
+        self.count = 0
+        for name, (causality, _, _, _, start, _) in self.variable_table.items():
+            setattr(self, name, start or 0.0)
+            kind = Fmi2Variability.fixed if causality == "parameter" else Fmi2Variability.continuous
+            self.register_variable(Real(name, causality=Fmi2Causality[causality], variability=kind))
 
     def do_step(self, current_time, step_size):
         target = self.gain * self.push / (1.0 + self.wear)

@@ -23,7 +23,6 @@ from tests.twin_master.runs import (
     flight_of,
     journal,
     of_library,
-    table_of,
     text_of,
     written,
 )
@@ -40,11 +39,10 @@ from twin_master.mission.loop import fly, kept_in, taken_up
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Plant, SensorStatus, Truth, Turn
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import PURPOSES, generator
-from twin_master.store.writing import open_run
-from uav_twin import ScenarioEnvironment, fly_fleet, open_fleet, resume
+from uav_twin import ScenarioEnvironment, fly_fleet, open_fleet, open_run, resume
 from uav_twin import fly as new_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
@@ -179,9 +177,8 @@ def test_faults():
     ):  # fmt: skip
         assert np.all(truth.status[part] == status)
     np.testing.assert_allclose(truth.drift[:10, 11], [0] * 8 + [6e-6, 12e-6])
-    table = table_of("failing_gauges")
-    table["truth"]["noise"] = {"standard_deviation_microstrain": 0}
-    truth, value = truth_of(parse_scenario(table, "quiet")), np.full(24, 1e-3)
+    quiet = changed_scenario("failing_gauges", {"truth": {"noise": {"standard_deviation_microstrain": 0}}})
+    truth, value = truth_of(quiet.scenario), np.full(24, 1e-3)
     sensed = truth.sense(13, value)
     assert np.isnan(sensed[16:20]).all()
     assert sensed[11] == pytest.approx(1e-3 + 36e-6)
@@ -264,9 +261,8 @@ BINDING = INPUTS.text("hostile_binding.toml")
 
 def hostile(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = BINDING) -> Any:
     written(folder, binding, name="binding.toml")
-    return load_scenario(
-        written(folder, INPUTS.text("hostile.toml"), ("FMU", str(fmu)), *changes, name="scenario.toml")
-    )
+    text = INPUTS.text("hostile.toml")
+    return load_scenario(written(folder, text, ("FMU", str(fmu)), *changes, name="scenario.toml"))
 
 
 def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch):
@@ -285,9 +281,7 @@ def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypa
     check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "csv/observed.csv")
 
 
-def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
-    foreign_fmu, tmp_path, monkeypatch
-):
+def test_an_fmu_that_ends_ends_the_mission_with_what_was_flown(foreign_fmu, tmp_path, monkeypatch):
     """In a run, a fleet and an environment."""
     fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
@@ -362,9 +356,7 @@ def test_our_policy_flies_the_mission_of_the_loop(environment):
             action = twin.turn(info["observed"], info["control"]).next_control
             observation, reward, terminated, truncated, info = environment.step(action)
             assert not terminated
-            np.testing.assert_array_equal(
-                observation, np.where(np.isnan(info["observed"]), 0, info["observed"])
-            )
+            np.testing.assert_array_equal(observation, np.nan_to_num(info["observed"]))
             observed.append(info["observed"])
             controls.append(info["control"])
             rewards.append(reward)

@@ -20,23 +20,15 @@ from scipy.stats import norm
 import uav_twin
 from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
-from scenarios import structure_files
 from tests.command_line import refused, said
-from tests.twin_master.runs import edited, of_wing, text_of, written
+from tests.twin_master.runs import edited, estimates_of, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission import sensor_design
 from twin_master.mission.loop import fly
-from twin_master.mission.planning import (
-    ComparedPolicy,
-    compared,
-    expected_plan,
-    policy_file,
-    promised,
-    risk_of,
-)
+from twin_master.mission.planning import compared, expected_plan, policy_file, promised, risk_of
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
@@ -48,8 +40,8 @@ from twin_master.run_folder import kept_scenario
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Learning, Noticing
-from twin_master.store.writing import open_run
-from uav_twin import Carried, ExactFilter, WatchfulEstimator, reduced_model
+from twin_master.watch.feeds import file_feed
+from uav_twin import ExactFilter, WatchfulEstimator, open_run, reduced_model, structure_files
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3
@@ -121,18 +113,14 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
         others.append(WatchfulEstimator(exact, sensors, known.draws.values, wary))
     rng, states = np.random.default_rng(1), np.array([0, 1, 6, 7, 12, 13])
     controls = [1, INSPECT, 0, INSPECT, INSPECT, 1]
-    before: list[Carried | None] = [None] * (1 + len(others))
-    for turn, control in enumerate(controls):
-        row = sensors.sampled(states[[turn]], control, rng)[0]
-        row[:24] = row[:24] if gauges else np.nan
-        found = [
-            one.turn(last, row, control, turn) for one, last in zip([exact, *others], before, strict=True)
-        ]
-        for estimate in found[1:]:
-            assert estimate.filtered == pytest.approx(found[0].filtered, abs=1e-5)
-            assert estimate.forecast == pytest.approx(found[0].forecast, abs=1e-5)
-        before = [estimate.carried for estimate in found]
-    assert found[0].filtered.max() > 0.3  # something was told
+    rows = [sensors.sampled(states[[turn]], control, rng)[0] for turn, control in enumerate(controls)]
+    seen = np.where(gauges | (np.arange(26) >= 24), rows, np.nan)
+    expected = estimates_of(exact, seen, controls)
+    for estimator in others:
+        for found, right in zip(estimates_of(estimator, seen, controls), expected, strict=True):
+            assert found.filtered == pytest.approx(right.filtered, abs=1e-5)
+            assert found.forecast == pytest.approx(right.forecast, abs=1e-5)
+    assert expected[-1].filtered.max() > 0.3  # something was told
 
 
 def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_run_keeps_readings(tmp_path):
@@ -151,8 +139,12 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
     run = open_run(folder)
     observed, truth = run["observed"], run["truth"]
     inspected = observed["control_index"].values == INSPECT
-    for name in ("z1", "z2"):
+    fed = file_feed(folder / "run.nc", kept_scenario(folder)).messages(None)
+    rows = np.array([message.observed for message, _ in fed])
+    np.testing.assert_array_equal(rows[:, :24], observed["strain"])
+    for place, name in enumerate(("z1", "z2"), start=24):
         read = observed[f"inspect_{name}"].values
+        np.testing.assert_array_equal(rows[:, place], read)
         assert np.array_equal(np.isfinite(read), inspected)
         assert inspected.sum() == 11
         assert read[inspected] == pytest.approx(truth["state"].sel(region=name).values[inspected], abs=0.4)
@@ -180,21 +172,21 @@ def planned() -> tuple[Any, Any]:
     return problem, expected_plan(known.scenario, problem, known.rewards)[0]
 
 
-def flown_and(known: Knowledge, said: ComparedPolicy) -> tuple[float, float]:
+def flown_and(known: Knowledge, mean: float, half_width: float) -> tuple[float, float]:
     """Return what 300 flown missions bring, and half its 99 % interval: what was said lies inside."""
     flown = side_by_side(known, 300)
     place = np.rint(flown.state / 0.4).astype(int) @ (2, 1)
     reward = known.planning_reward[place, flown.control_index]
     total = reward @ known.scenario.planner.gamma ** np.arange(reward.shape[1])
     half = 2.58 * total.std() / np.sqrt(len(total))
-    assert abs(total.mean() - said.mean) <= np.hypot(half, 2.58 / 1.96 * said.half_width)
+    assert abs(total.mean() - mean) <= np.hypot(half, 2.58 / 1.96 * half_width)
     return total.mean(), half
 
 
 def test_flown_missions_bring_the_return_that_was_promised():
     known, (problem, plan) = knowledge(*FOUR_STATES), planned()
     said = promised(known.scenario, problem, plan.policy)
-    mean, half = flown_and(following(known, plan.policy), said)
+    mean, half = flown_and(following(known, plan.policy), said.mean, said.half_width)
     assert plan.lower - half <= mean <= plan.upper + half
 
 
@@ -203,7 +195,8 @@ def test_simpler_rules_bring_what_is_said_of_them(decide_on, monkeypatch):
     monkeypatch.setattr("twin_master.mission.planning.PERIODS", ())
     for policy in ("mode", "qmdp"):
         known = of_wing(scenario(*FOUR_STATES, policy=policy, decide_on=decide_on))[0]
-        flown_and(known, compared(known.scenario, planned()[0])[policy == "qmdp"])
+        rule = compared(known.scenario, planned()[0])[policy == "qmdp"]
+        flown_and(known, rule.mean, rule.half_width)
 
 
 def test_a_limit_is_kept_by_the_plan():

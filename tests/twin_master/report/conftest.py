@@ -1,6 +1,5 @@
 """Runs of the wing of a strain library as their report reads them, with changes; what a figure shows."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -62,28 +61,22 @@ def line(axes: Axes, label: str) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def folder(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The paper's mission, with what the FMU of a wing would have monitored."""
-    run = flown(library_file, tmp_path_factory.mktemp("flown") / "run")
+    place = tmp_path_factory.mktemp("flown") / "run"
+    steps = flown(library_file, place).steps
     monitored = {
-        name: ("step", [value] * run.steps, {"units": unit})
+        name: ("step", [value] * steps, {"units": unit})
         for name, value, unit in (("strain_error_bound", 1.2e-6, "1"), ("tip_displacement", 0.18, "m"))
     }
-    run.tree["truth"] = xr.DataTree(run.tree["truth"].to_dataset().assign(monitored))
-    return run
+    xr.Dataset(monitored).to_netcdf(place / "run.nc", mode="a", group="truth", engine="h5netcdf")
+    return place
 
 
 @pytest.fixture(scope="session")
-def folder(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a report reads of that run."""
-    place = tmp_path_factory.mktemp("run")
-    groups = {name: run.tree[name].to_dataset().drop_encoding() for name in run.tree.children}
-    attributes = {name: run.tree.attrs[name] for name in ("seed", "scenario")}
-    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
-    tree.to_netcdf(place / "run.nc", engine="h5netcdf")
-    for name, content in (("config", run.config), ("summary", run.summary)):
-        (place / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
-    return place
+def run(folder: Path) -> Run:
+    """What a report reads of it."""
+    return read_run(folder)
 
 
 @pytest.fixture

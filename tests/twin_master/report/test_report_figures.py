@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.transforms import Bbox
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
@@ -101,10 +102,8 @@ def test_states_and_sensors_have_units_and_names_of_their_own(run, hold, tmp_pat
 
 
 def test_numbers_beside_an_axis_are_short():
-    numbers = (0.0, 0.5, -20.0, 1500.0, 1e-4, 25000.0, -0.000125)
-    assert [short_number(n) for n in numbers] == [
-        "0", "0.5", "-20", "1500", "1e-4", "2.5e4", "-1.25e-4",
-    ]  # fmt: skip
+    for number in ("0", "0.5", "-20", "1500", "1e-4", "2.5e4", "-1.25e-4"):
+        assert short_number(float(number)) == number
 
 
 def test_maps_show_the_joint_belief_the_policy_and_its_margin(run):
@@ -215,10 +214,6 @@ def test_nothing_is_drawn_outside_the_figure(run, hold, tmp_path):
     names = []
     for drawn in report.report_figures(tmp_path, 18):
         names.append(drawn.name)
-        tight = drawn.figure.get_tightbbox()
-        width, height = drawn.figure.get_size_inches()
-        assert tight.x0 >= -0.01, drawn.name
-        assert tight.y0 >= -0.01, drawn.name
-        assert tight.x1 <= width + 0.01, drawn.name
-        assert tight.y1 <= height + 0.01, drawn.name
+        tight, whole = drawn.figure.get_tightbbox(), drawn.figure.bbox_inches.padded(0.01)
+        assert np.array_equal(Bbox.union([tight, whole]).bounds, whole.bounds), drawn.name
     assert names[-1] == "structure"

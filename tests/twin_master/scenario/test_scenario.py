@@ -4,7 +4,6 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -17,11 +16,10 @@ from calibration.errors import CalibrationRecordError
 from calibration.result.file import description, plain_record, result_bytes, run_record, save_calibration
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
-from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
+from fe.runtime.patch import LocalStiffnessLoss
 from fe.wing.design import SHIPPED_DESIGN
-from fmu_asset.packing.patch_file import SCHEMA
 from tests.refusals import Inputs, refused
-from tests.twin_master.runs import merged, table_of, text_of, written
+from tests.twin_master.runs import merged, patch_record, table_of, text_of, written
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import draw_parameter
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
@@ -34,7 +32,7 @@ from twin_master.scenario.section import AssetSection
 from uav_twin import fly, load_calibration, prepare_twin
 
 INPUTS = Inputs(__file__)
-EDITED = ("level_turns", "level_turns_learning", "inspected_wing", "model_mismatch")
+EDITED = ("level_turns", "failing_gauges", "level_turns_learning", "inspected_wing", "model_mismatch")
 
 
 @pytest.mark.parametrize(
@@ -47,10 +45,8 @@ def test_whatever_is_wrong_is_named_in_one_sentence(name, old, new, sentence, tm
 
 
 def test_files_that_are_none_or_name_what_is_not_there(tmp_path):
-    faults = text_of("failing_gauges", ("sensors = [12]", "sensors = [25]"))
-    for text, sentence in ((faults, "from 1 to 24, and 25 came"), ("format = = 1", "is not valid TOML")):
-        with refused(ScenarioError, sentence):
-            load_scenario(written(tmp_path, text))
+    with refused(ScenarioError, "is not valid TOML"):
+        load_scenario(written(tmp_path, "format = = 1"))
     with refused(ScenarioError, "level_turns"):
         load_scenario("level_turn")
 
@@ -177,19 +173,13 @@ def test_a_kind_of_one_s_own_is_one_class(tmp_path):
         parse_scenario(table | {"asset": {"kind": "bellows", "stifness": 1.0}}, "mine.toml")
 
 
-MakeCalibration = Callable[..., Calibrated]
-
-
 @pytest.fixture(scope="module")
-def folder(
-    library_file: Path, make_calibration: MakeCalibration, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def folder(library_file: Path, make_calibration: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What scenarios and options name: a library, another wing, hidden effects, a calibration, half of it."""
     place = tmp_path_factory.mktemp("given")
     shutil.copy(library_file, place / "UAVconfig.json")
     written(place, SHIPPED_DESIGN.read_text(), ("refinement = 1.0", "refinement = 0.25"), name="other.toml")
-    effects = [{"id": "hidden", "primitives": ModelPatch((LocalStiffnessLoss(0.3, 0.9, 0.3),)).to_list()}]
-    written(place, json.dumps({"schema": SCHEMA, "effects": effects, "channels": {}}), name="p.json")
+    written(place, json.dumps(patch_record(LocalStiffnessLoss(0.3, 0.9, 0.3))), name="p.json")
     wing = save_calibration(make_calibration(), place / "wing 7.nc")
     (place / "half.nc").write_bytes(wing.read_bytes()[:9000])
     return place

@@ -27,9 +27,8 @@ from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
-from twin_master.store.writing import open_run
 from twin_master.viewer.flight import LATEST, Belief, Flight, Request, Teller
-from uav_twin import fly, load_scenario
+from uav_twin import fly, load_scenario, open_run
 
 TURNS = 50
 
@@ -93,9 +92,7 @@ def test_every_number_is_that_of_the_run(run):
     np.testing.assert_array_equal(flight.truth(flight.seen(0, TURNS)), stored["truth"]["state"].values)
 
 
-def test_turns_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_they_are_taken_back(
-    begun, lines
-):
+def test_turns_are_seen_once_their_lines_are_whole_and_forgotten_where_taken_back(begun, lines):
     """A line that was changed ends the view with its number."""
     flight = Flight(begun)
     assert not flight.update()

@@ -9,8 +9,8 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
@@ -20,8 +20,6 @@ import numpy as np
 import pytest
 from paho.mqtt import client as paho
 
-from fe.runtime.patch import ModelPatch, SensorGain
-from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from tests.twin_master.runs import flight_of, text_of
 from twin_master.mission.journal import JOURNAL_NAME
@@ -30,7 +28,7 @@ from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.viewer.flight import Flight
-from twin_master.watch.feeds import CsvFeed
+from twin_master.watch.feeds import PASSWORD_VARIABLE, CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts, Feed
 from twin_master.watch.opening import begun_watch
@@ -63,29 +61,11 @@ def watchful(base: Watch, folder: Path) -> Watch:
     return watch
 
 
-def decided(watch: Watch, feed: Feed, between: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
-    """Run a watch to the end of its feed; return what was decided."""
-    decisions = list[dict[str, Any]]()
-    watch.run(feed, lambda decision: decisions.append(dict(decision)), between)
-    return decisions
-
-
 def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
     """Run a watch up to each number of turns (None: to the end); return the last counts."""
     for turns in stops or (None,):
         counts = watch.run(feed, lambda _decision: time.sleep(pause), turns=turns)
     return counts
-
-
-def beliefs_of(watch: Watch, observed: np.ndarray, controls: np.ndarray, first: int) -> list[list[float]]:
-    """Return what a twin believes that has the second model of a watch from a turn on."""
-    twin, beliefs = watch.models[0].knowledge.twin(), []
-    for turn, (row, control) in enumerate(zip(observed, controls.tolist(), strict=True)):
-        if turn == first:
-            state, twin = twin.save_state(), watch.models[1].knowledge.twin()
-            twin.restore_state(state)
-        beliefs.append(twin.turn(row, control).filtered.tolist())
-    return beliefs
 
 
 def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
@@ -115,18 +95,6 @@ def viewed(folder: Path) -> Flight:
     return flight
 
 
-def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
-    """Return a patch in which a gauge shows too much by a share."""
-    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
-    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
-
-
-def of_gauge(path: Path, gain: float, channel: str = "g5") -> Path:
-    """Write such a patch."""
-    path.write_text(json.dumps(patch_of(gain, channel)))
-    return path
-
-
 def wait_until(found: Callable[[], object]) -> None:
     limit = time.monotonic() + 60.0
     while not found():
@@ -143,6 +111,18 @@ def served(port: int, path: str = "/", host: str = "localhost") -> tuple[int, st
 
 
 PASSWORD = "a password"
+
+
+@contextmanager
+def mosquitto(folder: Path, *, tls: bool = False) -> Iterator["Mosquitto"]:
+    """Run a broker whose password the twin knows."""
+    if shutil.which("mosquitto") is None:
+        pytest.skip("no mosquitto")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(PASSWORD_VARIABLE, PASSWORD)
+        broker = Mosquitto(folder, tls=tls)
+        yield broker
+        broker.stop()
 
 
 class Mosquitto:
@@ -248,14 +228,6 @@ def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> 
 def watch(base: Watch, tmp_path: Path) -> Watch:
     """One like it in a folder of its own."""
     return begun(base, tmp_path / "watch")
-
-
-@pytest.fixture
-def hasty(watch: Watch) -> Watch:
-    """A watch that notices a silence at once."""
-    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
-    watch.scenario = watch.scenario.model_copy(update={"watch": section})
-    return watch
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import json
 import random
-import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -15,7 +14,7 @@ import pytest
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, ran, wait_until
+from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, mosquitto, ran, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of
@@ -29,15 +28,9 @@ Told = dict[str, Any]
 
 
 @pytest.fixture
-def broker(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Mosquitto]:
-    if shutil.which("mosquitto") is None:
-        pytest.skip("no mosquitto")
-    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    broker = Mosquitto(tmp_path, tls=getattr(request, "param", False))
-    yield broker
-    broker.stop()
+def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Mosquitto]:
+    with mosquitto(tmp_path, tls=getattr(request, "param", False)) as broker:
+        yield broker
 
 
 def address(broker: Mosquitto) -> str:
@@ -179,9 +172,7 @@ def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watc
     assert [decision["turn"] for decision in sent] == [0, 1, 2, 1, 2]
 
 
-def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
-    scenario, base, watch, broker, tmp_path, monkeypatch
-):
+def test_an_orderly_end_and_a_watch_in_place_of_another(scenario, base, watch, broker, tmp_path, monkeypatch):
     publisher, notes = broker.client("publisher"), list[str]()
 
     def watched(watch: Watch, turns: int, *sent: int) -> Counts:

@@ -11,18 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fe.runtime.patch import SensorGain
 from reporting.figures import new_figure, to_svg
-from tests.twin_master.runs import check_same, figures_of, journal
-from tests.twin_master.watch.conftest import (
-    beliefs_of,
-    decided,
-    of_gauge,
-    patch_of,
-    ran,
-    viewed,
-    wait_until,
-    watchful,
-)
+from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
+from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import replay
@@ -55,11 +47,16 @@ place.rename(out)
 """
 
 
+def of_gauge(folder: Path, name: str, gain: float, channel: str = "g5") -> Path:
+    """Write a patch in which a gauge shows too much by a share."""
+    return written(folder, json.dumps(patch_record(SensorGain(channel, gain), channel=channel)), name=name)
+
+
 def tutor(
     watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-", wait: bool = True
 ) -> Tutor:
     answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
-    answer.write_text(json.dumps([kind, patch_of(gain)]))
+    answer.write_text(json.dumps([kind, patch_record(SensorGain("g5", gain))]))
     script.write_text(ANSWER)
     return Tutor(watch, wait=wait, command=(sys.executable, str(script), str(answer), gate))
 
@@ -67,7 +64,8 @@ def tutor(
 def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, loose, tmp_path):
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
-    decisions = decided(watch, CsvFeed(loose, watch.scenario), tutor(watch, tmp_path, "named", -0.3).act)
+    decisions = list[dict[str, Any]]()
+    watch.run(CsvFeed(loose, watch.scenario), decisions.append, tutor(watch, tmp_path, "named", -0.3).act)
     records = journal(watch.folder)
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]
@@ -111,7 +109,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     (folder / "figures").mkdir(parents=True)
     (folder / "figures" / "missing_force.svg").write_bytes(to_svg(new_figure(2.0)))
     (folder / "verdict.json").write_text(json.dumps({"verdict": {"sentence": "It is so."}}))
-    of_gauge(folder / "patch.json", -0.3)
+    of_gauge(folder, "patch.json", -0.3)
     ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
     flight = viewed(noticing.folder)
     before, number = flight.believed(flight.seen(0, 5)).expected.mean, flight.number
@@ -181,9 +179,7 @@ def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence_and_is_no_deci
     assert kinds == [["verdict", "heard"], []]
 
 
-def test_live_turns_wait_neither_for_the_search_nor_for_the_patched_model(
-    noticing, mission, loose, tmp_path, monkeypatch
-):
+def test_live_turns_wait_for_neither_search_nor_model(noticing, mission, loose, tmp_path, monkeypatch):
     """It is built beside them, and believed behind the turn that the journal says, to the bit."""
     monkeypatch.setattr("twin_master.watch.tutor.COURTESY", 0)
     gate = tmp_path / "gate"
@@ -205,8 +201,13 @@ def test_live_turns_wait_neither_for_the_search_nor_for_the_patched_model(
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
-    beliefs = beliefs_of(noticing, observed, mission.control_index, model["model"]["from_turn"])
-    assert journal(noticing.folder)[-1]["filtered"] == beliefs[-1]
+    twin, patched = (one.knowledge.twin() for one in noticing.models)
+    for turn, (row, control) in enumerate(zip(observed, mission.control_index.tolist(), strict=True)):
+        if turn == model["model"]["from_turn"]:
+            patched.restore_state(twin.save_state())
+            twin = patched
+        believed = twin.turn(row, control).filtered.tolist()
+    assert journal(noticing.folder)[-1]["filtered"] == believed
     again = watchful(noticing, tmp_path / "again")
     twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)]
     assert twins[0].save_state() == twins[1].save_state()
@@ -229,7 +230,7 @@ def test_a_policy_that_changes_is_told(base):
 
 def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_path):
     """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
-    file = of_gauge(tmp_path / "patch.json", -0.12, "g17")
+    file = of_gauge(tmp_path, "patch.json", -0.12, "g17")
     known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
     keep_knowledge(tmp_path, taught)
     for read in (taught, kept_knowledge(tmp_path, taught.scenario)):
@@ -274,7 +275,7 @@ def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():
 
 
 def test_a_second_patch_stands_beside_the_first(tmp_path):
-    first, second = (of_gauge(tmp_path / channel, -0.1, channel) for channel in ("g5", "g7"))
+    first, second = (of_gauge(tmp_path, channel, -0.1, channel) for channel in ("g5", "g7"))
     both = json.loads(both_patches(first, second))
     assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
     assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}

@@ -17,20 +17,10 @@ import numpy as np
 import pytest
 
 import uav_twin
-from reporting.netcdf import Group, Variable, write_groups
 from reporting.progress import SilentProgress
 from tests.command_line import command, said
 from tests.twin_master.runs import check_same, edited, figures_of, journal
-from tests.twin_master.watch.conftest import (
-    begun,
-    decided,
-    killed_at,
-    ran,
-    viewed,
-    wait_until,
-    watchful,
-    write_csv,
-)  # fmt: skip
+from tests.twin_master.watch.conftest import begun, killed_at, ran, viewed, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, whole_record
 from twin_master.mission.loop import BelievedModel, journalled_decision
@@ -159,18 +149,6 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
         assert last["filtered"] == found.filtered.tolist()
 
 
-def test_what_inspections_read_is_read_back_from_a_run(tmp_path):
-    scenario = load_scenario("inspected_wing").scenario
-    names, strain = [name for *_, name, _ in scenario.readings], 1e-4 * np.ones((2, 24))
-    read = np.array([[np.nan] * len(names), 0.1 + 0.2 * np.arange(len(names))])
-    found = {name: Variable(("step",), own, {}) for name, own in zip(names, read.T, strict=True)}
-    found |= {"strain": Variable(("step", "sensor"), strain, {})}
-    steps = {"step": Variable(("step",), np.array([3, 4]), {})}
-    write_groups(tmp_path / "run.nc", {"observed": Group(found, steps)}, {})
-    messages = [message for message, _ in file_feed(tmp_path / "run.nc", scenario).messages(None)]
-    np.testing.assert_array_equal([message.observed for message in messages], np.hstack((strain, read)))
-
-
 def test_what_came_behind_the_last_turn_of_a_live_watch_stays_counted(watch, mission):
     told = {"turn": 0, "control": watch.scenario.control_names[mission.control_index[0]]}
     line = json.dumps(told | {"strain": mission.observed[0].tolist()}).encode() + b"\n"
@@ -203,9 +181,8 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     controls[[20, 30]] = 1 - controls[[20, 30]]
     header, *rows = write_csv(tmp_path / "m.csv", mission.observed, controls).read_text().split()
     part = f"30,,{rows[30].split(',')[2]}{',' * 23}"  # one gauge, and no control
-    (tmp_path / "late.csv").write_text(
-        "\n".join([header, *rows[:20], *rows[21:25], rows[20], *rows[25:30], part, *rows[30:], ""])
-    )
+    late = [*rows[:20], *rows[21:25], rows[20], *rows[25:30], part, *rows[30:]]
+    (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
     first, second = begun(base, tmp_path / "first"), begun(base, tmp_path / "second")
     for watch, source, stops in (
         (first, tmp_path / "late.csv", (None,)),
@@ -217,7 +194,8 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     late = [*rows[:20], *rows[21:25], rows[20], rows[25].replace(",", ",,", 1), *rows[26:30], rows[25]]
     (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
     watch = watchful(base, tmp_path / "watch")
-    told = decided(watch, CsvFeed(tmp_path / "late.csv", watch.scenario))
+    told = list[dict[str, Any]]()
+    watch.run(CsvFeed(tmp_path / "late.csv", watch.scenario), told.append)
     assert journalled(watch) == told
     assert watch.last_decision() == told[-1] | {"told_again": True}
     assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
@@ -266,8 +244,10 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
 
 
 @pytest.mark.parametrize("source", ["standard input", "a file that grows"])
-def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
-    watch, told = hasty, list[dict[str, Any]]()
+def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
+    told = list[dict[str, Any]]()
+    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
+    watch.scenario = watch.scenario.model_copy(update={"watch": section})
     if source == "standard input":
         read, write = os.pipe()
         stream = os.fdopen(read, "rb")
@@ -312,9 +292,8 @@ def test_silence_is_told_and_journalled(hasty, plain, tmp_path, source):
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_path, monkeypatch):
-    lines = [
-        json.dumps({"turn": t, "strain": row}) + "\n" for t, row in enumerate(mission.observed[:4].tolist())
-    ]
+    rows = mission.observed[:4].tolist()
+    lines = [json.dumps({"turn": turn, "strain": row}) + "\n" for turn, row in enumerate(rows)]
     line = [sys.executable, "-m", "uav_twin", "watch", str(scenario.path), "--no-report"]
     out, pipe = ["--out", str(tmp_path / "watch")], subprocess.PIPE
     with subprocess.Popen([*line, *out], stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -363,9 +342,7 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     assert "60 messages." in again.stderr
 
 
-def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
-    scenario, base, mission, recorded, whole, tmp_path
-):
+def test_a_watch_is_opened_and_taken_up_from_python(scenario, base, mission, recorded, whole, tmp_path):
     folder, decisions, opened = tmp_path / "watch", list[dict[str, object]](), []
 
     def decide(decision: Mapping[str, object]) -> None:

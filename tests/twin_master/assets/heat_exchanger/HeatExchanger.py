@@ -10,22 +10,15 @@ class HeatExchanger(Fmi2Slave):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self.mass_flow = 1.0
-        self.fouling = 0.0
-        self.wall_temperature = 80.0
-        self.conductance = 6000.0
-        self.specific_heat = 4186.0
-        self.outlet = 20.0
-        self.middle = 20.0
-        self.heat = 0.0
-        for name in ("mass_flow", "fouling", "wall_temperature"):
-            self.register_variable(Real(name, causality=Fmi2Causality.input))
-        for name in ("conductance", "specific_heat"):
-            self.register_variable(
-                Real(name, causality=Fmi2Causality.parameter, variability=Fmi2Variability.tunable)
-            )
-        for name in ("outlet", "middle", "heat"):
-            self.register_variable(Real(name, causality=Fmi2Causality.output))
+        for causality, starts in (
+            ("input", {"mass_flow": 1.0, "fouling": 0.0, "wall_temperature": 80.0}),
+            ("parameter", {"conductance": 6000.0, "specific_heat": 4186.0}),
+            ("output", {"outlet": 20.0, "middle": 20.0, "heat": 0.0}),
+        ):
+            kind = Fmi2Variability.tunable if causality == "parameter" else Fmi2Variability.continuous
+            for name, start in starts.items():
+                setattr(self, name, start)
+                self.register_variable(Real(name, causality=Fmi2Causality[causality], variability=kind))
 
     def do_step(self, current_time, step_size):
         """Set the outputs for the inputs of the step."""
