@@ -223,7 +223,7 @@ def test_noise_without_a_record_is_what_the_fit_leaves():
             np.testing.assert_allclose(item.noise_deviation, data.deviation, rtol=0.25)
         told += any(cell.significant for cell in locate(found).cells)
     assert told <= 2
-    left = Remainder(*(size * np.ones(3) for size in (5.0, 5.0, 1.0, 0.0)), np.zeros(3, dtype=bool))
+    left = Remainder(*(size * np.ones(3) for size in (500.0, 5.0, 1.0, 0.0)), np.zeros(3, dtype=bool))
     for item in residual_set(unknown, replace(kit.fitted(unknown), remainder=left)).trials:
         assert np.all(item.predictive_deviation < 1.5 * item.noise_deviation)
 
