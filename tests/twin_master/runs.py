@@ -3,7 +3,7 @@
 import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -135,8 +135,8 @@ def journal(folder: Path) -> list[dict[str, Any]]:
 
 
 @contextmanager
-def cut_off_after(turns: int, *, ends: bool = True) -> Iterator[None]:
-    """Let the run within die once so many turns are kept; it must, unless a command line tells it."""
+def cut_off_after(turns: int) -> Iterator[None]:
+    """Let the run within die once so many turns are kept."""
     append = JournalFile.append
 
     def dying(self: JournalFile, record: Mapping[str, Any]) -> None:
@@ -146,7 +146,7 @@ def cut_off_after(turns: int, *, ends: bool = True) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(JournalFile, "append", dying)
-        with pytest.raises(KeyboardInterrupt) if ends else nullcontext():
+        with pytest.raises(KeyboardInterrupt):
             yield
 
 
