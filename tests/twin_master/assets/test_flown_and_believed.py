@@ -24,7 +24,6 @@ from fe.runtime.patch import (
     Washout,
 )
 from scenarios import binding_files
-from tests import command_line
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import figures_of, loaded_from, patch_record, prepared, table_of, text_of, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
@@ -210,23 +209,14 @@ def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str
     + [(SensorDrift("strain[1]", 1e-5, 1.0), "on time"), (BoucWen("tip", 1.0, 1e-3, 1.0), "loads before")]
     + [(SensorDrift("strain[1]", 1e-5, 1.0, 0.0), "")],
 )
-def test_places_beside_the_wing_and_what_changes_in_a_mission_are_refused(primitive, words, tmp_path):
+def test_places_beside_the_wing_are_refused_and_what_changes_in_a_mission_is_no_model(
+    primitive, words, tmp_path
+):
     write_patch(tmp_path, primitive)
     for lines, belief in (("", FILE), *[(FILE, "")] * ("m" in words.split())):
         loaded = load_scenario(scenario_of(tmp_path, lines, belief=belief))
         with refused(MissionInputError, words) if words else nullcontext():
             check_scenario(loaded)
-
-
-def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):
-    write_patch(tmp_path, *DRIFT)
-    for lines, parameters, belief, words in (
-        (FILE, '"effect.hiden.active" = 0', "", "effect.hiden.active"),
-        ('patch = "q.json"\n', "", "", "q.json cannot be read"),
-    ):
-        scenario = scenario_of(tmp_path, lines, parameters, belief)
-        assert words in command_line.refused("run", scenario, "--out", tmp_path / "run")
-        assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture

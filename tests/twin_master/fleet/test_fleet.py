@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from calibration.errors import PosteriorError
 from fmu_asset.errors import FmuEndedError
@@ -65,9 +66,7 @@ def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
     cut = fly_fleet(growing(library_file, shard=3), tmp_path / "cut", Engine(2))
     assert cut.shards_flown == 4
     first, second = (open_fleet(folder)["growing_damage"] for folder in (whole, cut.folder))
-    assert set(first.data_vars) == set(second.data_vars)
-    for name in first.data_vars:
-        np.testing.assert_array_equal(first[name].values, second[name].values)
+    xr.testing.assert_equal(first, second)
     assert (first["status"].values == 1).all()
     assert len(np.unique(first["state"].values[:, -1], axis=0)) > 1
 
@@ -100,7 +99,9 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
     assert fly_fleet(fleet, cut).shards_flown == 0
 
 
-def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_in_vain(library_file, tmp_path, monkeypatch):
+def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
+    library_file, tmp_path, monkeypatch
+):
     fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
     monkeypatch.setattr("twin_master.fleet.shard.CONNECTING", 0.2)
     with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
@@ -332,7 +333,9 @@ def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
         (Remembering, FmuEndedError("It is over.", time=1.0)),
     ],
 )
-def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown(driven, error, library_file):
+def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_the_others(
+    driven, error, library_file
+):
     knowledge, asset = known("growing_damage", library_file)
     truths, soft = [knowledge.truth(seed) for seed in range(6)], until_soft(asset, error)
     whole = fly_side_by_side(knowledge, truths, [asset] * 6)
