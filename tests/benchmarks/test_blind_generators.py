@@ -1,6 +1,5 @@
 """Hidden effects beside the package's own models and patches, with which the generators share no code."""
 
-import ast
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +29,7 @@ from discrepancy.models.sensing import observe
 from discrepancy.models.structures import WingModel
 from fe.runtime.patch import ModelPatch
 from tests.discrepancy.rigs import chosen, model_of, setting_of
+from tests.test_architecture import named_imports
 
 pytestmark = pytest.mark.long  # loops are compiled in half a minute, the full wing is projected in one
 
@@ -130,7 +130,5 @@ def test_generators_share_no_code_with_what_names():
         "fe.runtime.reduced",
     )
     for file in Path(benchmarks.blind.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            assert not [name for name in names if name.startswith(forbidden)], file
+        names = named_imports(f"benchmarks.blind.{file.stem}", file)
+        assert not [name for name in names if name.startswith(forbidden)], file
