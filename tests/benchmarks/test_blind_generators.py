@@ -20,7 +20,6 @@ from benchmarks.blind.changes import Changes
 from benchmarks.blind.effects import DRAWS, LUMPED, Hidden, spread_cubic_stiffness
 from benchmarks.blind.instruments import Chance, draw_chance, true_signals
 from benchmarks.blind.lumped_rig import model_text
-from benchmarks.blind.traps import TRAPS
 from benchmarks.blind.writing import write_case
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
@@ -87,17 +86,6 @@ def test_a_hidden_effect_shows_as_its_patch_in_the_model(rig, draw):
         assert np.abs((found - expected) / noise).max() < NEAR[work.rig.name], trial.name
         seen = max(seen, np.abs((expected - bare[trial.name]) / noise).max())
     assert seen > 0.6
-
-
-@pytest.mark.parametrize("trap", [name for name, trap in TRAPS.items() if "lumped" in trap.rigs])
-def test_traps_are_set(trap):
-    case = make_case(Order("case-1", "trap", "lumped", (), 8, trap))
-    assert case.truth["trap"] == trap
-    assert case.truth["accepted"]
-    if TRAPS[trap].largest is not None:
-        assert max(case.truth["d2"].values()) <= TRAPS[trap].largest
-    if trap == "wrong noise label":
-        assert not case.measured.noise
 
 
 def test_written_case_is_detectable_and_repeats_and_tells_nothing_and_seals_everything(tmp_path):
