@@ -3,11 +3,10 @@
 import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from fe.runtime.patch import ModelPatch, Primitive
@@ -109,9 +108,7 @@ def flight_of(
     return fly(knowledge.scenario, knowledge.twin(), plant, *sinks)
 
 
-def estimates_of(
-    estimator: Estimator, seen: np.ndarray, controls: Sequence[int] | None = None
-) -> list[Estimate]:
+def estimates_of(estimator: Estimator, seen: Any, controls: Sequence[int] | None = None) -> list[Estimate]:
     """Return what an estimator makes of turns, under their controls or always the first one."""
     estimates: list[Estimate] = []
     for turn, (row, control) in enumerate(zip(seen, controls or [0] * len(seen), strict=True)):
@@ -138,8 +135,8 @@ def journal(folder: Path) -> list[dict[str, Any]]:
 
 
 @contextmanager
-def cut_off_after(turns: int, *, ends: bool = True) -> Iterator[None]:
-    """Let the run within die once so many turns are kept; it must, unless a command line tells it."""
+def cut_off_after(turns: int) -> Iterator[None]:
+    """Let the run within die once so many turns are kept."""
     append = JournalFile.append
 
     def dying(self: JournalFile, record: Mapping[str, Any]) -> None:
@@ -149,7 +146,7 @@ def cut_off_after(turns: int, *, ends: bool = True) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(JournalFile, "append", dying)
-        with pytest.raises(KeyboardInterrupt) if ends else nullcontext():
+        with pytest.raises(KeyboardInterrupt):
             yield
 
 

@@ -113,15 +113,6 @@ def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path, nam
     assert not [*tmp_path.iterdir()]
 
 
-def test_damage_that_the_asset_lives_by_itself_needs_a_model_for_the_twin(folder, tmp_path):
-    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
-    own = '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
-    path = written(folder, text[: text.index("[truth]")] + own, name="own.toml")
-    with pytest.raises(MissionInputError, match="name a model for the twin in the table `belief`"):
-        new_run(load_scenario(path), tmp_path / "run")
-    assert not [*tmp_path.iterdir()]
-
-
 # ---------------------------------------------------------------------- with the shipped wing
 
 

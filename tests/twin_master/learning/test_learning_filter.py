@@ -240,9 +240,8 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     assert (noise.lower, noise.upper) == pytest.approx(np.sqrt(squared.ppf([0.05, 0.95])))
     row = design[-1]
     rewards = RewardModel(sensor, 9.0, (0.0, 0.0), 0.8)
-    found = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]])).filtered(
-        carried, [turn.filtered for turn in estimates], seen[:, None]
-    )
+    expectation = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]]))
+    found = expectation.filtered(carried, [turn.filtered for turn in estimates], seen[:, None])
     spread = 0.5 * np.sqrt(scale2 * row @ covariance @ row)
     assert found.mean[-1, 0] == pytest.approx(shown[-1] + 0.5 * row @ mean)
     assert found.standard_deviation[-1, 0] == pytest.approx(spread)
@@ -271,9 +270,8 @@ def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
     joint = np.zeros((1, 3, 2))
     joint[0, 1, 1] = 1.0
     told = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}  # half way between draws on both sides
-    found = LearntExpectation(learner, rewards, np.full((3, 2), 0.5)).of_marginals(
-        told, joint, slice(None), None
-    )
+    expectation = LearntExpectation(learner, rewards, np.full((3, 2), 0.5))
+    found = expectation.of_marginals(told, joint, slice(None), None)
     value, weight = sensor.value_per_draw[:, 1, 1], np.array([0.25, 0.25, 0.5])
     np.testing.assert_allclose(found.mean[0], weight @ value, rtol=1e-12)
     spread = np.sqrt(weight @ (value - weight @ value) ** 2)

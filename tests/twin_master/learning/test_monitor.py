@@ -286,9 +286,8 @@ def test_belief_and_decision_follow_what_holds_now(between):
             control = course[watched][-1].next_control if turn else 1
             row = known.sensor_model.mean[state, control] * np.where(wrong, 0.67, 1.0) + noise
             course[watched].append(twin.turn(row, control))
-    mean = {
-        watched: np.array([found.filtered @ states[:, 0] for found in course[watched]]) for watched in course
-    }
+    first = states[:, 0]
+    mean = {watched: np.array([found.filtered @ first for found in course[watched]]) for watched in course}
     assert np.abs(mean[True] - truth)[np.r_[14:20, 25:30, 35:90]].max() < 0.12
     assert mean[False][40:46].max() < 0.25  # the filter alone believes the gauge, flies on and wears the wing
     assert {found.next_control for found in course[False][32:46]} == {1}

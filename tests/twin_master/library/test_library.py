@@ -361,10 +361,8 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         asked = grid_of_scenario(loaded, tmp_path / "made", grid, overrides=given)
         given = replace(given, library=sample_library(asked, tmp_path / "l.nc", workers=1).path)
     elif way == "learnt":
-        learnt = (
-            'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100.0\nstandard_deviation = 30.0\n'
-        )
-        given = replace(given, learnt=written(tmp_path, learnt))
+        text = 'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100\nstandard_deviation = 30\n'
+        given = replace(given, learnt=written(tmp_path, text))
     known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
     assert ("the observation library is interpolated" in known.draws.source) is (way == "swept")
     assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
@@ -376,9 +374,8 @@ def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchang
         source.prepare(tmp_path / f"{true:g}", SilentProgress())
         assert source.origin.model == f"observation library of it {of}".strip()
         assert source.origin.differ == bool(of)
-    draw, fouling, flow = np.meshgrid(
-        known.draws.values, [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2], indexing="ij"
-    )
+    axes = known.draws.values, [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2]
+    draw, fouling, flow = np.meshgrid(*axes, indexing="ij")
     passed = draw / (1.0 + fouling * draw) / ((slope * draw + offset) * flow)
     shown = 20.0 + 60.0 * (1.0 - np.exp(-np.stack([0.5 * passed, passed], axis=-1)))
     np.testing.assert_allclose(known.predicted, shown, rtol=1e-4 if way == "swept" else 1e-12)

@@ -261,9 +261,8 @@ BINDING = INPUTS.text("hostile_binding.toml")
 
 def hostile(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = BINDING) -> Any:
     written(folder, binding, name="binding.toml")
-    return load_scenario(
-        written(folder, INPUTS.text("hostile.toml"), ("FMU", str(fmu)), *changes, name="scenario.toml")
-    )
+    text = INPUTS.text("hostile.toml")
+    return load_scenario(written(folder, text, ("FMU", str(fmu)), *changes, name="scenario.toml"))
 
 
 def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch):
@@ -282,9 +281,7 @@ def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypa
     check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "csv/observed.csv")
 
 
-def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
-    foreign_fmu, tmp_path, monkeypatch
-):
+def test_an_fmu_that_ends_ends_the_mission_with_what_was_flown(foreign_fmu, tmp_path, monkeypatch):
     """In a run, a fleet and an environment."""
     fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))

@@ -346,9 +346,8 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first, worth):
 def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypatch):
     monkeypatch.setattr(belief_planning, "LIVES", 4000)
     problem, rng = drawn(8, 4, moves_first=False), np.random.default_rng(1)
-    policy = BeliefPolicy(
-        0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]]), np.array([1, 0, 2])
-    )
+    vectors = 0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]])
+    policy = BeliefPolicy(vectors, np.array([1, 0, 2]))
 
     def leaves(belief: np.ndarray, turns: int) -> float:
         if policy.decide(belief) != 1:

@@ -2,8 +2,9 @@
 
 import pickle
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def test_the_transitions_of_a_scenario():
     assert matrix[0, at((0.8, 0.0)), at((0.0, 0.2))] == pytest.approx(0.125)
 
 
-def decided(knowledge: Knowledge, rule: Literal["filtered", "predicted"], turns: int) -> TwinTurn:
+def decided(knowledge: Knowledge, rule: str, turns: int) -> TwinTurn:
     """Return the last of some turns that follow the dynamics alone at 3g, decided by a rule."""
     planner = knowledge.scenario.planner.model_copy(update={"decide_on": rule})
     scenario = knowledge.scenario.model_copy(update={"planner": planner})
@@ -53,18 +54,11 @@ def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_turn(
     After 26 transitions p(z1 >= 60 %) = 0.489, after 27 it is 0.515.
     """
     np.testing.assert_array_equal(knowledge.plan.control_index.reshape(5, 5)[:, 0], [1, 1, 1, 0, 0])
-    gentle = [float(binom.sf(2, count, 0.1)) for count in (25, 26, 27)]
-    assert gentle[1] < 0.5 < gentle[2]
-    for turns, rule, probability, control in (
-        (26, "filtered", gentle[0], 1),
-        (26, "predicted", gentle[1], 1),
-        (27, "filtered", gentle[1], 1),
-        (27, "predicted", gentle[2], 0),
-        (28, "filtered", gentle[2], 0),
-    ):
-        turn = decided(knowledge, rule, turns)
-        np.testing.assert_allclose(turn.decision_probability, [probability, 1.0 - probability], atol=1e-12)
-        assert turn.next_control == control, (turns, rule)
+    for rule, turns in product(("filtered", "predicted"), (26, 27, 28)):
+        turn, moves = decided(knowledge, rule, turns), turns - (rule == "filtered")
+        gentle = binom.sf(2, moves, 0.1)
+        np.testing.assert_allclose(turn.decision_probability, [gentle, 1.0 - gentle], atol=1e-12)
+        assert turn.next_control == int(moves <= 26), (turns, rule)
         # What is predicted does not depend on the rule.
         ahead = turn.prediction.control_probability[0, 0]
         assert ahead == pytest.approx(binom.sf(2, turns, 0.1), abs=1e-12)
@@ -157,9 +151,7 @@ def test_own_policy_planner_sensor_model_and_estimator(knowledge, seen):
     class Counting(ExactFilter):
         """An estimator that learns: it carries a figure from turn to turn beside the belief."""
 
-        def turn(
-            self, before: Carried | None, observation: np.ndarray, control_index: int, turn: int
-        ) -> Estimate:
+        def turn(self, before: Any, observation: np.ndarray, control_index: int, turn: int) -> Estimate:
             estimate = super().turn(before, observation, control_index, turn)
             count = 1.0 if before is None else float(before.arrays["count"]) + 1.0
             carried = Carried(control_index, {**estimate.carried.arrays, "count": np.array(count)})

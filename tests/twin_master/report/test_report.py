@@ -200,9 +200,8 @@ def test_a_calibration_file_shows_its_wing(run, make_calibration):
     flown = rescripted(plain, asset={"design": "calibration", "parameters": {}})
     mean, wide = wing.mean("young_modulus_factor"), wing.standard_deviation("young_modulus_factor")
     assert true_value(flown) == mean  # the FMU starts at the mean
-    page = report.render_page(
-        flown, {"calibration": DRAWING}, {"calibration": ReportFigure("calibration", None, "", "")}
-    )
+    figures = {"calibration": ReportFigure("calibration", None, "", "")}
+    page = report.render_page(flown, {"calibration": DRAWING}, figures)
     assert "The calibrated wing: Wing 7 (é)" in page
     page = re.sub(' data-of="[^"]*"', "", page)  # headings for narrow screens
     servo = wing.mean("servo_mass"), wing.standard_deviation("servo_mass")

@@ -1,6 +1,5 @@
 """Scenario files: what is read, what is refused, kinds, format 1; what options and files change."""
 
-import itertools
 import json
 import re
 import shutil
@@ -73,7 +72,6 @@ def tables(*changed: list[float]) -> dict[str, Any]:
         )],
         *INPUTS.refused("tables"),
     ],
-    ids=itertools.count(),
 )  # fmt: skip
 def test_keys_that_do_not_fit_and_numbers_that_no_file_or_float_holds_are_refused(name, changes, words):
     with refused(ScenarioError, words):

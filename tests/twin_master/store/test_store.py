@@ -72,17 +72,16 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
 
 
 def test_tables_are_in_the_units_of_their_headers(result):
-    tables = tables_of(groups_of(result), "strain")
-    health = list(csv.DictReader(tables["health"].splitlines()))
+    texts = tables_of(groups_of(result), "strain")
+    tables = {name: [*csv.DictReader(text.splitlines())] for name, text in texts.items()}
+    health, observed = tables["health"], tables["observed"]
     assert [float(row["z1_true_percent"]) for row in health[8:13]] == [0, 0, 2, 4, 6]
-    observed = list(csv.DictReader(tables["observed"].splitlines()))
     shown = float(observed[3]["strain_5_microstrain"])
     assert shown == pytest.approx(1e6 * result.flight.observed[3, 4], rel=1e-5)
     assert observed[36]["strain_5_microstrain"] == ""
-    policy = list(csv.DictReader(tables["policy"].splitlines()))
+    policy, decisions = tables["policy"], tables["decisions"]
     assert (policy[0]["z1_percent"], policy[0]["control"]) == ("0", "3g")
     assert (policy[-1]["z1_percent"], policy[-1]["control"]) == ("80", "2g")
-    decisions = list(csv.DictReader(tables["decisions"].splitlines()))
     assert decisions[0]["control"] == "3g"
     assert decisions[36]["error_reward"] == ""
 

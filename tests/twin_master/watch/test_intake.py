@@ -74,9 +74,7 @@ def same(first: Twin, second: Twin) -> bool:
     return first.save_state() == second.save_state()
 
 
-def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
-    knowledge, strains, clean, expected, tmp_path
-):
+def test_late_doubled_and_garbled_messages_end_as_clean_ones(knowledge, strains, clean, expected, tmp_path):
     chance = random.Random(5)
     order = sorted(range(TURNS), key=lambda turn: turn + (chance.random() < 0.2) * chance.randint(1, 15))
     lines: list[bytes] = []
@@ -156,9 +154,7 @@ def test_anything_is_an_observation_or_refused(content):
     assert isinstance(found, Refused) or not np.isinf(found.observed).any()
 
 
-def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
-    knowledge, clean, expected, tmp_path, monkeypatch
-):
+def test_a_flood_and_messages_of_ten_megabytes_are_counted(knowledge, clean, expected, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.watch.intake.REJECTED_KEPT", 50)
     big = b'{"strain_1": "' + b"x" * 10_000_000 + b'"}\n'
     deep = b'{"strain": ' + b"[" * (LARGEST_MESSAGE // 4) + b"\n"
@@ -181,9 +177,7 @@ JITTERED = [time + 0.1 * (turn % 3 - 1) for turn, time in enumerate(RIGHT)]
 @pytest.mark.parametrize(
     "times", [[0.0, *RIGHT[1:]], [1.7e308, *RIGHT[1:]], [1.7e9, 4e9, *RIGHT[2:]], JITTERED]
 )  # the first three of a clock that was not yet set
-def test_times_stand_for_turns_and_a_clock_that_is_set_after_the_first_spoils_none(
-    knowledge, strains, clean, times
-):
+def test_times_stand_for_turns_and_a_clock_that_is_set_late_spoils_none(knowledge, strains, clean, times):
     section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
     timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
 
@@ -199,12 +193,9 @@ def test_times_stand_for_turns_and_a_clock_that_is_set_after_the_first_spoils_no
     gap, counted = watched(timed, [*lines[:4], *lines[5:]])
     assert (gap.turns, counted.counts.missing) == (8, 1)
     np.testing.assert_array_equal(gap.observed(7), strains[7])
-    # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up.
-    for later in (
-        b"1700000500",
-        b"1.6e9",
-        b"1.7e308",
-    ):  # the first near enough that a missing limit ends, too
+    # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up;
+    # the first is near enough that a missing limit ends, too.
+    for later in (b"1700000500", b"1.6e9", b"1.7e308"):
         again = taken_up(intake.state(), b'{"time": %s, "strain_1": 1e-4}\n' % later)
         assert again.read(twin) is None
         assert again.counts.rejected == 1

@@ -51,16 +51,12 @@ def belief_of(watch: Watch) -> object:
 
 def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tmp_path):
     run = uav_twin.open_run(whole)
-    for group, name, found in (
-        ("observed", "strain", mission.observed),
-        ("observed", "control_index", mission.control_index),
-        ("filtered", "probability", mission.filtered),
-        ("filtered", "log_evidence", mission.log_evidence),
-        ("filtered", "decision_probability", mission.decision_probability),
-        ("smoothed", "probability", mission.smoothed),
-        ("predicted", "probability", mission.predicted),
-    ):
-        np.testing.assert_array_equal(run[group][name].values, found, err_msg=f"{group}/{name}")
+    np.testing.assert_array_equal(run["observed"]["strain"].values, mission.observed)
+    np.testing.assert_array_equal(run["observed"]["control_index"].values, mission.control_index)
+    for group in ("filtered", "smoothed", "predicted"):
+        np.testing.assert_array_equal(run[group]["probability"].values, getattr(mission, group))
+    for name in ("log_evidence", "decision_probability"):
+        np.testing.assert_array_equal(run["filtered"][name].values, getattr(mission, name))
     assert "truth" not in run.children
     told = journalled(base, whole)
     assert [decision["turn"] for decision in told] == list(range(50))
@@ -181,9 +177,8 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     controls[[20, 30]] = 1 - controls[[20, 30]]
     header, *rows = write_csv(tmp_path / "m.csv", mission.observed, controls).read_text().split()
     part = f"30,,{rows[30].split(',')[2]}{',' * 23}"  # one gauge, and no control
-    (tmp_path / "late.csv").write_text(
-        "\n".join([header, *rows[:20], *rows[21:25], rows[20], *rows[25:30], part, *rows[30:], ""])
-    )
+    late = [*rows[:20], *rows[21:25], rows[20], *rows[25:30], part, *rows[30:]]
+    (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
     first, second = begun(base, tmp_path / "first"), begun(base, tmp_path / "second")
     for watch, source, stops in (
         (first, tmp_path / "late.csv", (None,)),
@@ -293,9 +288,8 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_path, monkeypatch):
-    lines = [
-        json.dumps({"turn": t, "strain": row}) + "\n" for t, row in enumerate(mission.observed[:4].tolist())
-    ]
+    rows = mission.observed[:4].tolist()
+    lines = [json.dumps({"turn": turn, "strain": row}) + "\n" for turn, row in enumerate(rows)]
     line = [sys.executable, "-m", "uav_twin", "watch", str(scenario.path), "--no-report"]
     out, pipe = ["--out", str(tmp_path / "watch")], subprocess.PIPE
     with subprocess.Popen([*line, *out], stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -344,9 +338,7 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     assert "60 messages." in again.stderr
 
 
-def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
-    scenario, base, mission, recorded, whole, tmp_path
-):
+def test_a_watch_is_opened_and_taken_up_from_python(scenario, base, mission, recorded, whole, tmp_path):
     folder, decisions, opened = tmp_path / "watch", list[dict[str, object]](), []
 
     def decide(decision: Mapping[str, object]) -> None:
