@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from json import loads
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -346,10 +347,11 @@ def _values(text: str, identifier: str, given: list[str], names: list[str]) -> d
         if equals and name not in names:
             raise CatalogueError(f"{identifier} has no parameter {name!r}; it has {', '.join(names)}.")
         try:
-            values[name or names[position]] = float(number)
+            value = values[name or names[position]] = float(number)
         except ValueError:
-            example = {"identifier": identifier, "name": names[0]}
-            raise CatalogueError(said("effects.numbers", text=text, **example)) from None
+            value = nan
+        if not isfinite(value):
+            raise CatalogueError(said("effects.numbers", text=text, identifier=identifier, name=names[0]))
     return values
 
 

@@ -5,8 +5,11 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from discrepancy.campaign.reading import TABLE_ERRORS, assemble
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
+from discrepancy.campaign.sampling import as_meant
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion, conversion_of, quantities_of
@@ -67,12 +70,14 @@ class Column:
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
         cells = self.sheet.numbers(self.head, decimal)
+        if self.to_si == 1.0:
+            return cells
+        values = np.array([float(cell or "nan") for cell in cells])
+        if self.role == "time" and len(cells) > 1 and np.all(np.diff(values) > 0.0):
+            values = as_meant(values, cells)  # minutes of few digits may be even
         # two digits less than a float may need, so that no rounding shows: 4.387 mm is 0.004387 m
-        return (
-            cells
-            if self.to_si == 1.0
-            else tuple(cell and f"{float(cell) * self.to_si:.15g}" for cell in cells)
-        )
+        shown = (f"{value * self.to_si:.15g}" for value in values.tolist())
+        return tuple(cell and text for cell, text in zip(cells, shown, strict=True))
 
 
 class Understanding:

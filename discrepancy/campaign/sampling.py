@@ -23,7 +23,8 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     """Return the times of a record: on the even grid where they are even as printed, else as they came.
 
     Times may be printed with few decimals: half a unit of the last one is allowed in addition, and the times
-    are then put on the even grid through first and last. Times that are even to 1e-9 stay as they are.
+    are then put on the even grid that is nearest to all of them, through zero where they begin there. Times
+    that are even to 1e-9 stay as they are.
 
     Parameters
     ----------
@@ -50,11 +51,19 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     if steps[back] <= 0.0:
         told = {"at": back + 1, "time": cells[back], "then": cells[back + 1]}
         raise CampaignDataError(said("campaign.time_goes_back", file=file, user=user, **told))
+    return as_meant(time, cells)
+
+
+def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
+    """Return the times (N,) of printed cells, in any unit: on an even grid where they are even as printed."""
     # Trailing zeros may be dropped in print, so the finest cell says how many decimals there are.
     rounding = min(_last_digit(cell) for cell in cells)  # twice half of it
-    even, off = even_grid(time)
-    interval = (time[-1] - time[0]) / (count - 1)
-    return even if _EXACT < off <= EVEN + rounding / interval else time
+    interval, off = (time[-1] - time[0]) / (len(time) - 1), even_grid(time)[1]
+    if not _EXACT < off <= EVEN + rounding / interval:
+        return time
+    place = np.arange(len(time)) - (0.0 if time[0] == 0.0 else 0.5 * (len(time) - 1))
+    about = 0.0 if time[0] == 0.0 else time.mean()
+    return np.asarray(about + place * (place @ (time - about)) / (place @ place))
 
 
 def even_grid(time: FloatArray) -> tuple[FloatArray, float]:

@@ -80,7 +80,8 @@ def _predicted(
             leverage = np.minimum(taken + counted * carried, 1.0)
             variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
         if found.remainder is not None and data.trial.is_dynamic:
-            variance = variance + precision[data.groups] * found.remainder.size[data.groups] ** 2
+            recorded = problem.freedom[data.groups] > 0.0  # in the others it is in the noise already
+            variance = variance + recorded * found.remainder.size[data.groups] ** 2
         sensitive = None
         if sensitivities:
             sensitive = np.zeros((*shape, total))

@@ -246,5 +246,5 @@ class Columns:
         changed = with_it.values - true
         rate, zero = clock_of(sensors)
         if slope is not None:
-            changed += slope * (rate * trial.time + zero)[:, None]
+            changed += slope * (rate * (trial.time - trial.time[0]) + zero)[:, None]
         return trial.over_noise(changed * gains)

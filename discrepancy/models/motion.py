@@ -5,7 +5,7 @@ A model makes a `LinearSystem` of its parameters and the structural part of a pa
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -71,7 +71,7 @@ class Motion:
         system, modal = self.system, self.system.modal
         pull = self.q @ modal.whole.T
         if self.laws.rate != 0.0:
-            pull *= 1.0 + self.laws.rate * self.time[:, None]
+            pull *= 1.0 + self.laws.rate * (self.time[:, None] - self.laws.since)
         found = system.forces(self.acting, self.time) - pull - self.velocity @ modal.damping.T
         if len(self.laws):
             found -= self.port_forces @ self.laws.rows(modal.actions, self.q.shape[1])
@@ -153,7 +153,7 @@ def motion_of(system: LinearSystem, acting: Acting, laws: Laws, refinement: int 
     ModelError
         If it begins at rest where there is none, or the release point cannot be moved.
     """
-    times = acting.sampled
+    times, laws = acting.sampled, replace(laws, since=float(acting.time[0]))
     if acting.release is None:
         first, begin = float(acting.time[0]), _first(system, acting, laws)
         found = _followed(system, acting, laws, first, times, begin, refinement)

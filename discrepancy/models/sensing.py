@@ -48,9 +48,10 @@ def observe(
     rate, zero = clock_of(patch)
     clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
     bare = patch.without(*SENSORS)
-    # inputs at their true times, each channel sampled by its own clock
+    # inputs at their true times, each channel sampled by its own clock; clocks are right at the first stamp
     inputs, by_channel = _logger_rates(campaign, trial, patch)
-    stamped = replace(trial, time=(1.0 + inputs) * trial.time) if inputs else trial
+    first = float(trial.time[0])
+    stamped = replace(trial, time=trial.time + inputs * (trial.time - first)) if inputs else trial
     turned = [column for column, (_, quantity) in enumerate(outputs) if quantity is Quantity.STRAIN]
     turned *= len(patch.of(SensorRotation)) > 0
     outputs += tuple((outputs[column][0] + part, Quantity.STRAIN) for part in ACROSS for column in turned)
@@ -60,7 +61,8 @@ def observe(
     slopes, by_output = np.zeros_like(values), np.append(by_channel, np.tile(by_channel[turned], 2))
     for rate in np.unique(by_channel).tolist():
         beside = (rate - inputs) / (1.0 + inputs) * (1.0 + clock[0]) + clock[0]
-        found = model.respond(stamped, outputs, bare, replace(conditions, clock=(beside, clock[1])))
+        own_clock = beside, clock[1] - beside * first
+        found = model.respond(stamped, outputs, bare, replace(conditions, clock=own_clock))
         own = by_output == rate
         values[:, own] = found.values[:, own]
         if found.rates is not None:

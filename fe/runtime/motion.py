@@ -88,6 +88,8 @@ class Laws:
         Stiffness drift of the whole structure [1/s].
     spans : tuple of tuple of (float, float)
         Begins and ends of when each law acts [s], none for one that always acts; empty where all do.
+    since : float
+        From when on the stiffness drifts [s].
     """
 
     ports: tuple[str, ...]
@@ -95,6 +97,7 @@ class Laws:
     values: FloatArray
     rate: float = 0.0
     spans: tuple[tuple[tuple[float, float], ...], ...] = ()
+    since: float = 0.0
 
     def __len__(self) -> int:
         return len(self.ports)
@@ -410,7 +413,8 @@ def advance(
     none, forces = np.empty((2, size, modes)), np.empty((2, size, count))
     found = ModalMotion(none[0], none[1], forces[0], forces[1], memory)
     flexibility, actions = port_flexibility(system, laws), system.actions or system.ports
-    given, time = tuple(map(np.ascontiguousarray, steps)), steps.time
+    given = tuple(map(np.ascontiguousarray, steps._replace(time=steps.time - laws.since)))
+    time = steps.time
     edges = [moment for moment in laws.edges if time[0] < moment < time[-1]]
     cuts = np.unique(np.concatenate(([0, len(time) - 1], np.searchsorted(time, edges)))).tolist()
     for first, last in pairwise(map(int, cuts)):

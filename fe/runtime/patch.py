@@ -249,7 +249,7 @@ class HighPass(Sensor):
 
 
 class Clock(Sensor):
-    """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
+    """A sample stamped t was taken at (1 + `rate`) t + `zero` [s], t since the record's first stamp."""
 
     rate: Annotated[float, "1"]
     zero: Annotated[float, "s"]
@@ -258,6 +258,7 @@ class Clock(Sensor):
 class LoggerClock(Sensor):
     """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
 
+    t counts from the record's first stamp.
     `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
     """
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom, chi2, kstest
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.candidate import Candidate, Point, Remainder, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, absolute_tests, prior_tests, shape_gate
 from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
@@ -223,6 +223,9 @@ def test_noise_without_a_record_is_what_the_fit_leaves():
             np.testing.assert_allclose(item.noise_deviation, data.deviation, rtol=0.25)
         told += any(cell.significant for cell in locate(found).cells)
     assert told <= 2
+    left = Remainder(*(size * np.ones(3) for size in (500.0, 5.0, 1.0, 0.0)), np.zeros(3, dtype=bool))
+    for item in residual_set(unknown, replace(kit.fitted(unknown), remainder=left)).trials:
+        assert np.all(item.predictive_deviation < 1.5 * item.noise_deviation)
 
 
 def test_held_out_trials_move_nothing_that_is_shared():

@@ -9,6 +9,7 @@ from datetime import datetime, timedelta
 from datetime import time as clock
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -110,11 +111,14 @@ def test_a_table_comes_back_from_any_dialect(tmp_path_factory, table, separator,
 
 
 def test_a_temperature_in_kelvin_is_not_called_celsius(tmp_path):
-    sheet = sheet_of(tmp_path, b"t [s];plate [K]\n" + b"".join(b"%d;29%d\n" % (k, k) for k in range(9)))
+    """And minutes of few digits are even."""
+    rows = (b"%.3f;29%d\n" % (k / 12.0, k) for k in range(9))
+    sheet = sheet_of(tmp_path, b"t [min];plate [K]\n" + b"".join(rows))
     understood = Understanding([sheet], {"kind": {"": "driven"}, "column": {"t": "time", "plate": "plate"}})
     campaign = understood.campaign("plate")
     assert campaign.channels["plate"].unit == "K"
     assert campaign.trials[0].values[0, 0] == 290.0
+    np.testing.assert_allclose(campaign.trials[0].time, 5.0 * np.arange(9), rtol=1e-4)
 
 
 def refusal(path):

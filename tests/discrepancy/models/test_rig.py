@@ -408,6 +408,9 @@ def test_each_logger_has_its_own_clock_and_one_alone_is_a_stiffer_rig_under_a_la
     np.testing.assert_allclose(one, alias, atol=1e-9 * np.abs(alias).max())
     clocks = patch.LoggerClock("film", RATE), patch.LoggerClock("rack", RATE), patch.Clock(RATE, 0.0)
     film, rack, motion = map(shown, clocks)
+    later = replace(SWEPT, time=1e5 + STAMPS)  # of the day
+    for change in (*clocks, patch.StiffnessDrift(0.05)):
+        np.testing.assert_allclose(shown(change, what=later), shown(change), atol=1e-5 * np.abs(alias).max())
     assert np.abs(one - motion).max() > 0.05 * np.abs(alias).max()
     np.testing.assert_array_equal(film[:, 0], shown()[:, 0])
     np.testing.assert_array_equal(film[:, 1], motion[:, 1])
