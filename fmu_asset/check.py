@@ -21,7 +21,7 @@ from fmu_asset.door.experiment import whole_binding
 from fmu_asset.door.layout import Place, find
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import contradictions
-from fmu_asset.errors import BindingError, FmuCallError, FmuError, visible
+from fmu_asset.errors import BindingError, FmuCallError, FmuError, said, visible
 from fmu_asset.packing.structure_fmu import recorded_content_hash
 from reporting.arrays import Float
 from reporting.progress import Progress, reporter
@@ -274,8 +274,7 @@ class Flights:
     # ------------------------------------------------------------------ flying
 
     def _asset(self, **header: Any) -> FmiAsset:
-        changed = self._binding.binding.model_copy(update=header)
-        return self._open(self._binding.model_copy(update={"binding": changed}))
+        return self._open(self._binding.with_header(**header))
 
     def _base_inputs(self) -> Inputs:
         """Return zeros for arrays whose start values a new size took; all else begins at its own."""
@@ -321,10 +320,7 @@ class Flights:
         if found.tobytes() != expected.tobytes():
             hint = "its outputs are not a function of its inputs"
             if method == "serialised":
-                hint = (
-                    "it declares canGetAndSetFMUstate but keeps part of its state elsewhere; write "
-                    '`state = "replay"` into the table [binding] of its binding'
-                )
+                hint = said("state.partly", does="keeps part of its state elsewhere")
             return "problem", (
                 "A flight that goes on from a saved state in a new process differs from the one that was "
                 f"not interrupted ({_difference(expected, found)}): {hint}."

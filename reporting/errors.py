@@ -29,9 +29,9 @@ class StandsForOthersError(Exception):
 
     @classmethod
     @contextmanager
-    def instead_of(cls, *causes: type[Exception], before: str = "") -> Iterator[None]:
-        """Return a context whose errors of these classes are raised as this one, `before` their sentences."""
+    def instead_of(cls, *causes: type[Exception], before: str = "", after: str = "") -> Iterator[None]:
+        """Return a context whose errors of these classes are raised as this one, with words around theirs."""
         try:
             yield
         except causes as cause:
-            raise cls(f"{before}{cause}") from cause
+            raise cls(f"{before}{cause}{after}") from cause

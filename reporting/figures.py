@@ -11,7 +11,7 @@ equal bytes: ids are salted, dates and program names left out.
 import html
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullLocator
 from numpy.typing import ArrayLike
 
@@ -45,6 +46,9 @@ REFERENCE: Final = "#999999"
 """Limits, reference lines and other things to read against (light grey)."""
 LEVELS: Final = "cividis"
 """Colour map of magnitudes: perceptually even and safe for colour-blind readers."""
+
+RESIDUALS: Final[dict[str, Any]] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
+"""How residuals are drawn, in standard deviations."""
 
 BAND_OPACITY: Final = 0.22
 TRUTH_LINE: Final[dict[str, Any]] = {"color": TRUTH, "linewidth": 1.0, "linestyle": (0, (4, 1.5, 1, 1.5))}
@@ -160,6 +164,18 @@ def plain_powers(axis: Axis, parts: tuple[float, ...]) -> None:
 def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) -> None:
     """Draw the band between two lines (n,)."""
     axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
+
+
+def interval(axes: Axes, place: float, mean: float, low: float, high: float, **look: Any) -> None:
+    """Draw a mean with its interval, which holds it but for rounding."""
+    ends = [[max(mean - low, 0.0)], [max(high - mean, 0.0)]]
+    axes.errorbar([place], [mean], yerr=ends, linestyle="none", **look)
+
+
+def swatches(names: Sequence[str], colors: Sequence[str], **look: Any) -> list[Rectangle]:
+    """Return what a legend shows of named colours."""
+    named = zip(names, colors, strict=True)
+    return [Rectangle((0, 0), 1, 1, facecolor=color, label=name, **look) for name, color in named]
 
 
 def shared_legend(figure: Figure, rows: int = 1, **place: Any) -> None:

@@ -16,7 +16,7 @@ import typer
 
 from reporting import terminal
 from reporting.errors import ReportingError
-from reporting.words import counted
+from reporting.words import counted, number
 from scenarios import scenario_files
 from twin_master import parts
 from twin_master.errors import TwinMasterError, said
@@ -125,11 +125,7 @@ def show_outcome(outcome: "parts.RunOutcome") -> None:
 
 
 def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str:
-    if value is None:
-        return missing
-    if isinstance(value, str):
-        return value
-    return f"{value if isinstance(value, int) else f'{value:.5g}'} {unit}".strip()
+    return missing if value is None else f"{number(value)} {unit}".strip()
 
 
 def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
@@ -202,8 +198,7 @@ def watch(
 
         def opened(watched: parts.Watch) -> None:
             watches.append(watched)
-            if begun is not None:
-                begun(watched.folder)
+            begun(watched.folder)
 
         folder = parts.watch(
             scenario, observations, out, {"seed": seed, "calibration": calibration, "library": library},

@@ -52,8 +52,7 @@ def watch(
     fleet_view = parts.is_fleet, parts.serve_fleet
     try:
         with parts.listening(watched.ask), shown(view, fleet_view) as begun, console.showing:
-            if begun is not None:
-                begun(folder)
+            begun(folder)
             watched.run(lambda: console.refresh(watched.standing))
     except Exception as error:
         error.add_note("What was observed is kept: repeat the command to go on.")
@@ -214,18 +213,18 @@ Server = tuple[Callable[[Path], bool], Callable[[Path, int, Callable[[str], None
 
 
 @contextmanager
-def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path], None] | None]:
+def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path], None]]:
     """Give what shows a mission from its beginning in a process beside it; at the end wait for Ctrl-C.
 
     Parameters
     ----------
     wanted
-        Whether to show it at all; if not, None is given.
+        Whether to show it at all; if not, what is given does nothing.
     server
         Says whether a folder can be shown yet, and shows it; that of one flight if left out.
     """
     if not wanted:
-        yield None
+        yield lambda _folder: None
         return
     process: multiprocessing.process.BaseProcess | None = None
 

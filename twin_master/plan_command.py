@@ -85,15 +85,9 @@ def _without(knowledge: "parts.Knowledge", names: Sequence[str]) -> "parts.Knowl
     blind = np.where([title in names for title in titles], each + _BLIND * shown, each)
     levels = np.abs(knowledge.model.states.coordinates).max()
     unread = {"standard_deviation": _BLIND * (1.0 + levels)}
-    bare = scenario.model_copy(
-        update={
-            "action": tuple(a.model_copy(update=unread if a.name in names else {}) for a in scenario.action),
-            "observation": scenario.observation.model_copy(
-                update={"standard_deviation": tuple(blind.tolist())}
-            ),
-        }
-    )
-    return replace(knowledge, scenario=bare)
+    actions = tuple(a.model_copy(update=unread if a.name in names else {}) for a in scenario.action)
+    bare = scenario.having("observation", standard_deviation=tuple(blind.tolist()))
+    return replace(knowledge, scenario=bare.model_copy(update={"action": actions}))
 
 
 def _titles(scenario: "parts.Scenario") -> tuple[str, ...]:

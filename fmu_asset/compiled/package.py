@@ -213,12 +213,11 @@ def compile_library(sources: Mapping[str, bytes], *, platform: Platform = PLATFO
         units = sorted(name for name in sources if name.endswith(".c"))
         # Names relative to the working folder, so that no path gets into the library.
         command = [*compiler, *FLAGS[platform], "-o", "library.so", *units, "-lm"]
-        try:
+        before = f"The C compiler {compiler[0]} could not be run ("
+        with FmuBuildError.instead_of(OSError, subprocess.TimeoutExpired, before=before, after=")."):
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST_BUILD, check=False
             )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise FmuBuildError(f"The C compiler {compiler[0]} could not be run ({error}).") from error
         library = Path(folder) / "library.so"
         if done.returncode != 0 or not library.is_file():
             lines = (done.stderr or done.stdout).strip().splitlines()[:_SHOWN_ERROR_LINES]

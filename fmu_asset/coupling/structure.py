@@ -222,10 +222,9 @@ def expand_connection(
     CouplingError
         If the patterns are of unequal length, or an end begins with no component.
     """
-    try:
+    before = f"A connection from {source!r} to {target!r} cannot be read: "
+    with CouplingError.instead_of(ValueError, before=before, after="."):
         sources, targets = expand(source), expand(target)
-    except ValueError as error:
-        raise CouplingError(f"A connection from {source!r} to {target!r} cannot be read: {error}.") from error
     if len(sources) != len(targets):
         counts = len(sources), len(targets)
         raise CouplingError(said("coupling.patterns", source=source, target=target, counts=counts))

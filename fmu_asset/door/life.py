@@ -133,10 +133,7 @@ class SavedState(PackedState):
         if self.method == "replay":
             cause = "it does not give equal outputs for equal inputs, so that it cannot be resumed"
         else:
-            cause = (
-                "it declares canGetAndSetFMUstate but does not restore all of its state; write "
-                '`state = "replay"` into the table [binding] of its binding'
-            )
+            cause = said("state.partly", does="does not restore all of its state")
         values = float(now[which]), float(then[which])
         raise FmuStateError(said("state.differs", name=names[which], values=values, cause=cause))
 

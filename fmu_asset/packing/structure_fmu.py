@@ -128,10 +128,9 @@ def build_fmu(
     check_form(kind, fmi, interface, patched=patch is not None, platforms=platforms)
     values = {} if state is None else start_values(model, state)
     values |= {name: float(value) for name, value in (options.get("start") or {}).items()}
-    try:
+    before = f"The FMU of the structure {model.name} cannot be built: "
+    with FmuBuildError.instead_of(ValueError, before=before, after="."):
         table, roles = structure_table(model, values)
-    except ValueError as error:
-        raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
     name, kept = stem_of(model), {}
     if patch is not None:
         effects = patch.for_gauges(len(model.gauges)).plain

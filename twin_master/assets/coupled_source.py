@@ -271,10 +271,9 @@ def _settings(component: ComponentSection) -> dict[str, Setting]:
     settings: dict[str, Setting] = {}
     where = f"the component `{component.name}`"
     for pattern, value in component.parameters.items():
-        try:
+        before = f"the parameters of {where} cannot be read: "
+        with MissionInputError.instead_of(ValueError, before=before, after="."):
             names = expand(pattern)
-        except ValueError as error:
-            raise MissionInputError(f"the parameters of {where} cannot be read: {error}.") from error
         for name in names:
             if name in settings:
                 raise MissionInputError(f"{where} is given `{name}` twice: keep one of the two.")

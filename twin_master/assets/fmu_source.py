@@ -65,16 +65,6 @@ class FmuSection(AssetSection):
 
     kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
-    @property
-    def true_parameters(self) -> Mapping[str, float]:
-        """Parameters of the true asset by the binding's names, SI."""
-        return self.parameters
-
-    @property
-    def constant_load(self) -> Mapping[str, float]:
-        """Load inputs, the same in every step, SI."""
-        return self.load
-
     def faults(self) -> Iterator[Fault]:
         """Yield parameters that are seeds, too."""
         for name in self.seeds:

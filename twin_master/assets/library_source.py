@@ -124,10 +124,9 @@ class ObservationLibrary:
         if set(names) != set(self.states.names):
             raise MissionInputError(said("assets.states", self=self, names=names))
         wanted = coordinates[:, [names.index(name) for name in self.states.names]]
-        try:
+        before, after = "the observation library lacks a state: ", "; sample one for this scenario."
+        with MissionInputError.instead_of(InvalidModelError, before=before, after=after):
             return [self.states.index(state) for state in wanted]
-        except InvalidModelError as error:
-            raise MissionInputError(said("assets.levels", error=error)) from None
 
     def control_of(self, name: str, values: Mapping[str, float]) -> int:
         """Return the index of the control whose inputs have the given values; its name does not matter.

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -100,10 +99,9 @@ def fleet_page(folder: Path, most: int) -> str:
         WORDS.say("subtitle", assets=members, groups=groups, seed=fleet["seed"], watched=watched),
     )
     page.add_section("The fleet")
-    try:
+    before = f"{folder} is damaged or of another version ("
+    with FleetError.instead_of(KeyError, TypeError, AttributeError, before=before, after=")."):
         (_add_watched if watched else _add_flown)(page, folder, fleet["groups"], most)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise FleetError(f"{folder} is damaged or of another version ({error}).") from error
     return page.render()
 
 
@@ -254,13 +252,12 @@ def map_figure(scenario: Scenario, last: Float, failed: int) -> Figure:
     for number, (factor, (axes,)) in enumerate(zip(factors, rows, strict=True)):
         cells = np.full(high * wide, np.nan)
         cells[: len(last)] = factor.scale * last[order, number]
-        axes.imshow(
-            np.where(np.arange(high * wide) < count, 1.0, np.nan).reshape(high, wide), cmap="Greys",
-            vmin=0.0, vmax=2.0, aspect="auto", interpolation="nearest",
-        )  # fmt: skip
+        look: dict[str, Any] = {"aspect": "auto", "interpolation": "nearest"}
+        there = np.where(np.arange(high * wide) < count, 1.0, np.nan).reshape(high, wide)
+        axes.imshow(there, cmap="Greys", vmin=0.0, vmax=2.0, **look)
         image = axes.imshow(
-            np.ma.masked_invalid(cells.reshape(high, wide)), cmap=style.LEVELS, aspect="auto",
-            norm=Normalize(factor.levels[0], factor.levels[-1]), interpolation="nearest",
+            np.ma.masked_invalid(cells.reshape(high, wide)), cmap=style.LEVELS,
+            vmin=factor.levels[0], vmax=factor.levels[-1], **look,
         )  # fmt: skip
         axes.set_xticks([])
         axes.set_yticks([])

@@ -147,8 +147,7 @@ def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scen
     """Return a scenario whose asset has these true parameters, beside those that it has."""
     if not parameters:
         return scenario
-    table = {**scenario.asset.true_parameters, **parameters}
-    return scenario.model_copy(update={"asset": scenario.asset.model_copy(update={"parameters": table})})
+    return scenario.having("asset", parameters={**scenario.asset.true_parameters, **parameters})
 
 
 def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:

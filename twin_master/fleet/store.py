@@ -173,10 +173,9 @@ def open_group(folder: Path, group: str) -> "xr.Dataset":
     check_installed("zarr")
     import xarray as xr
 
-    try:
+    before = f"{folder} holds no group {group} of a fleet ("
+    with FleetError.instead_of(OSError, KeyError, ValueError, before=before, after=")."):
         found: xr.Dataset = xr.open_zarr(folder / STORE_NAME, group=group, chunks=None, consolidated=False)
-    except (OSError, KeyError, ValueError) as error:
-        raise FleetError(f"{folder} holds no group {group} of a fleet ({error}).") from error
     if missing := SCHEMA["fleet"].keys() - found.keys():
         raise FleetError(said("fleet.other_layout", folder=folder, missing=", ".join(sorted(missing))))
     return found

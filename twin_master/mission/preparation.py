@@ -239,8 +239,7 @@ class Knowledge:
         true = self.scenario.truth.probability
         if not true:
             return self.model
-        transition = self.scenario.transition.model_copy(update={"probability": true})
-        return build_graphical_model(self.scenario.model_copy(update={"transition": transition}))
+        return build_graphical_model(self.scenario.having("transition", probability=true))
 
     def truth(self, seed: int) -> Truth:
         """Return what really happens under a seed."""

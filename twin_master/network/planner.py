@@ -38,10 +38,9 @@ class BeliefPolicy:
         PlanningError
             They are none.
         """
-        try:
+        before = "a policy on the belief has `vectors` and `control`: "
+        with PlanningError.instead_of(KeyError, before=before, after=" is missing"):
             vectors, control = arrays[f"{prefix}vectors"], arrays[f"{prefix}control"]
-        except KeyError as error:
-            raise PlanningError(said("network.policy", error=error)) from None
         if vectors.ndim != 2 or control.shape != vectors.shape[:1] or control.dtype.kind not in "iu":
             raise PlanningError(said("network.vectors", vectors=vectors.shape, controls=control.shape))
         return cls(np.asarray(vectors, dtype=np.float64), np.asarray(control, dtype=np.int64))

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -138,11 +137,8 @@ def _draw(axes: Axes, run: Run, now: int, course: Float, truth: Float | None) ->
             axes.plot(at, center, color=color, label=label, **look)  # type: ignore[arg-type]
     mean, least, most = course[:, now].tolist()
     if np.isfinite(mean):
-        axes.errorbar(
-            [steps[now]], [mean], yerr=[[max(mean - least, 0.0)], [max(most - mean, 0.0)]],
-            color=style.PRESENT, marker="D", markersize=4.2, capsize=2.0, elinewidth=1.2, linestyle="none",
-            zorder=4, label="present",
-        )  # fmt: skip
+        look = {"color": style.PRESENT, "marker": "D", "markersize": 4.2, "capsize": 2.0, "elinewidth": 1.2}
+        style.interval(axes, steps[now], mean, least, most, **look, zorder=4, label="present")
     if truth is not None:
         seen = truth[: len(steps)]
         axes.plot(steps[: len(seen)], seen, **style.TRUTH_LINE, label="truth")
@@ -249,9 +245,10 @@ def _reward_panel(axes: Axes, run: Run, reward: int, now: int) -> str:
     return f"{capital(REWARD_NAMES[reward])} reward"
 
 
-_PROBABILITY_COLORS = LinearSegmentedColormap.from_list(
-    "probability", ["#ffffff", "#d3ece4", "#7fcbb2", style.PRESENT, "#003d2d"]
-)
+_SHADES = ["#ffffff", "#d3ece4", "#7fcbb2", style.PRESENT, "#003d2d"]
+_PROBABILITY: dict[str, Any] = {
+    "cmap": LinearSegmentedColormap.from_list("probability", _SHADES), "vmin": 0.0, "vmax": 1.0
+}  # fmt: skip
 _CONTROL_COLORS = ("#e9ddf0", "#b48ac9", "#7b4f96", "#4a2a63")
 _SMALL_PANELS = 8
 _MEAN: dict[str, Any] = {"marker": "D", "markersize": 4.0, "color": "white", "markeredgecolor": style.PRESENT}
@@ -277,12 +274,8 @@ def _joint_figure(run: Run) -> Figure:
     figure, grid = style.panels(
         rows, columns, 0.95 + 1.62 * rows, 0.52, 0.43, left=0.075, right=right, wspace=0.12, hspace=0.30
     )
-    image = None
-    for number, turn in enumerate(turns):
-        axes = grid[number // columns][number % columns]
-        image = _map(
-            axes, run, run["filtered/probability"][turn], cmap=_PROBABILITY_COLORS, vmin=0.0, vmax=1.0
-        )
+    for axes, turn in zip(style.first_of(grid, len(turns)), turns, strict=True):
+        image = _map(axes, run, run["filtered/probability"][turn], **_PROBABILITY)
         axes.set_title(f"{run.step} {run.first_step + turn}", fontweight="normal", pad=3.0)
         x, y = run.scales * run["filtered/mean"][turn]
         axes.plot(x, y, **_MEAN, linestyle="none", markeredgewidth=1.1, label="mean of the belief")
@@ -293,8 +286,6 @@ def _joint_figure(run: Run) -> Figure:
         axes.set_xlabel(run.factors[0].label, labelpad=2.0)
         axes.set_ylabel(run.factors[1].label, labelpad=2.0)
         axes.label_outer()
-    for spare in [axes for row in grid for axes in row][len(turns) :]:
-        spare.remove()
     height = figure.get_figheight()
     place = figure.add_axes((right + 0.015, 0.43 / height, 0.013, 1 - 0.95 / height))
     style.color_bar(figure, image, "probability", cax=place)
@@ -302,16 +293,19 @@ def _joint_figure(run: Run) -> Figure:
     return figure
 
 
+def turn_map(axes: Axes, run: Run, values: Float, first: int, **look: Any) -> Any:
+    """Draw values (T, n) over the turns, those of a turn one above the other from `first` on."""
+    turns, places = np.arange(run.steps + 1) + run.first_step, np.arange(values.shape[1] + 1) + first
+    return axes.pcolormesh(turns - 0.5, places - 0.5, values.T, **look)
+
+
 def _marginal_figure(run: Run) -> Figure:
     count = len(run.factors)
     figure, grid = style.panels(count, 1, 0.6 + 1.3 * count, 0.3, 0.45, left=0.09, right=0.9, hspace=0.5)
     for index, (factor, (axes,)) in enumerate(zip(run.factors, grid, strict=True)):
-        marginal = run.model.states.marginal(run["filtered/probability"], run.model.states.names[index]).T
+        marginal = run.model.states.marginal(run["filtered/probability"], run.model.states.names[index])
         places = np.arange(len(factor.levels))
-        image = axes.pcolormesh(
-            np.arange(run.steps + 1) + run.first_step - 0.5, np.arange(len(places) + 1) - 0.5, marginal,
-            cmap=_PROBABILITY_COLORS, vmin=0.0, vmax=1.0,
-        )  # fmt: skip
+        image = turn_map(axes, run, marginal, 0, **_PROBABILITY)
         if run.truth is not None:
             truth = np.interp(factor.scale * run.truth[:, index], factor.levels, places)
             axes.plot(run.numbers, truth, color=style.TRUTH, linewidth=1.0, label="truth")
@@ -370,10 +364,7 @@ def _policy_map(axes: Axes, run: Run) -> None:
     axes.set_xlabel(run.factors[0].label)
     axes.set_ylabel(run.factors[1].label)
     style.panel_label(axes, "a", "Policy, and the way through it")
-    handles: list[Any] = [
-        Rectangle((0, 0), 1, 1, facecolor=color, edgecolor=style.REFERENCE, linewidth=0.5, label=name)
-        for name, color in zip(run.controls, colors, strict=True)
-    ]
+    handles: list[Any] = style.swatches(run.controls, colors, edgecolor=style.REFERENCE, linewidth=0.5)
     handles += [line for line in axes.get_lines() if line.get_label() in {"estimate", "truth"}]
     axes.legend(
         handles=handles, loc="lower left", bbox_to_anchor=(-0.02, 1.08), ncols=len(handles), handlelength=1.4

@@ -15,6 +15,7 @@ from scipy.stats import binom, truncnorm
 from reporting import figures as style
 from reporting.arrays import Float
 from reporting.words import between, parameter_title, rounded
+from twin_master.report.mission import turn_map
 from twin_master.report.reading import NORMAL_95, Run
 from twin_master.store.mission_result import LearntQuantity
 
@@ -165,8 +166,14 @@ def _course(axes: Axes, run: Run, course: Float, prior: Float, truth: Float | No
     style.band(axes, steps, course[:, 2], course[:, 3], style.PRESENT)
     axes.plot(steps, course[:, 0], color=style.PRESENT, label="learnt, 90 % band")
     if run.first_step == 0:
-        look = {"color": style.PAST, "marker": "s", "markersize": 3.2, "capsize": 2.0, "elinewidth": 1.2}
-        _bar(axes, -1.0, prior, **look, zorder=4, label="prior, 90 %")
+        look: dict[str, Any] = {
+            "color": style.PAST,
+            "marker": "s",
+            "markersize": 3.2,
+            "capsize": 2.0,
+            "elinewidth": 1.2,
+        }
+        style.interval(axes, -1.0, *prior[[0, 2, 3]], **look, zorder=4, label="prior, 90 %")
     if truth is not None and np.isfinite(truth):
         axes.axhline(float(truth), **style.TRUTH_LINE, label="truth")
     axes.set_xlim(steps[0] - 1.8, steps[-1] + 0.8)
@@ -176,21 +183,15 @@ def _course(axes: Axes, run: Run, course: Float, prior: Float, truth: Float | No
     axes.set_xlabel(run.step, labelpad=1.0)
 
 
-def _bar(axes: Axes, place: float, figures: Float, **look: Any) -> None:
-    """Draw a mean with its interval from (mean, deviation, low, high)."""
-    mean, _, low, high = figures.tolist()
-    axes.errorbar([place], [mean], yerr=[[mean - low], [high - mean]], linestyle="none", **look)
-
-
 def _last_panel(axes: Axes, run: Run, learnt: LearntQuantity, chosen: int) -> None:
     place = np.arange(1.0, len(learnt.prior) + 1.0)
     axes.bar(
         place, learnt.prior[:, 3] - learnt.prior[:, 2], bottom=learnt.prior[:, 2], width=1.0,
         color=style.PAST, alpha=0.12, linewidth=0,
     )  # fmt: skip
-    for index, figures in enumerate(learnt.course[-1]):
+    for index, figures in enumerate(learnt.course[-1][:, [0, 2, 3]]):
         color = style.PRESENT if index == chosen else style.OBSERVED
-        _bar(axes, place[index], figures, color=color, marker="o", markersize=2.6, elinewidth=1.0)
+        style.interval(axes, place[index], *figures, color=color, marker="o", markersize=2.6, elinewidth=1.0)
     if learnt.truth is not None:
         axes.hlines(learnt.truth, place - 0.45, place + 0.45, color=style.TRUTH, linewidth=1.0, zorder=3)
     axes.set_xlim(0.2, place[-1] + 0.8)
@@ -276,11 +277,8 @@ def check_figure(run: Run, check: PredictiveCheck) -> Figure:
 def _residual_panel(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck) -> None:
     axes.set_facecolor("#c8c8c8")
     count = len(run.sensors.titles)
-    image = axes.pcolormesh(
-        np.arange(run.steps + 1) + run.first_step - 0.5, np.arange(count + 1) + 0.5,
-        np.ma.masked_invalid(check.residual.T),
-        cmap="PuOr_r", vmin=-4.0, vmax=4.0, rasterized=check.residual.size > _MOST_CELLS,
-    )  # fmt: skip
+    look = {**style.RESIDUALS, "rasterized": check.residual.size > _MOST_CELLS}
+    image = turn_map(axes, run, np.ma.masked_invalid(check.residual), 1, **look)
     ticks = np.arange(1, count + 1, 4 if count > 8 else 1)
     axes.set(xlabel=run.step, ylabel=run.sensors.word, yticks=ticks)
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))

@@ -270,10 +270,8 @@ def read_run(folder: Path) -> Run:
     config, summary, calibration = (
         _read_json(folder / name) for name in (CONFIG_NAME, SUMMARY_NAME, "calibration.json")
     )
-    try:
+    with RunFolderError.instead_of(TwinMasterError, after=" The run cannot be shown: fly it again."):
         scenario = parse_scenario(config.get("scenario", {}), str(folder / CONFIG_NAME))
-    except TwinMasterError as error:
-        raise RunFolderError(f"{error} The run cannot be shown: fly it again.") from error
     run = Run(tree, scenario, config, summary, calibration)
     missing = [path for path in paths_of(scenario.observation.role) if run.get(path) is None]
     if missing:

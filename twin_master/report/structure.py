@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.tri import Triangulation
 
 from fe.elements.cells import CellMesh
@@ -31,7 +30,6 @@ from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
 
 LOSS = "YlOrRd"
 """Colour map of what regions have lost."""
-_RESIDUALS: dict[str, Any] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
 _BAR = {"pad": 0.02, "fraction": 0.02, "aspect": 14}
 _LENGTH = 0.08
 """Length of the largest displacement in the picture, as a part of the structure's."""
@@ -95,7 +93,7 @@ def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
     measured, sensors = run.sensors.scale * run.observed[-1], run.sensors
     shown: tuple[tuple[str, str, Float, str, dict[str, Any]], ...] = (
         ("a", f"Measured {sensors.quantity}", measured, f"{sensors.quantity} ({sensors.unit})", {}),
-        ("b", "Measured less expected", residual, "standard deviations", _RESIDUALS),
+        ("b", "Measured less expected", residual, "standard deviations", style.RESIDUALS),
     )
     with style.publication_style():
         figure, rows = style.panels(2, 1, 4.0, 0.3, 0.1, left=0.1, right=0.92, hspace=0.25)
@@ -167,7 +165,7 @@ def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
         if places is not None and len(places) == len(residual):
             nearest = np.argmin(np.linalg.norm(mesh.points[:, None] - places, axis=2), axis=0)
             places = (places + scale * displacement[nearest]) @ view
-            _draw_gauges(figure, axes, places, residual, "gauges: standard deviations", **_RESIDUALS)
+            _draw_gauges(figure, axes, places, residual, "gauges: standard deviations", **style.RESIDUALS)
         axes.autoscale_view()
         axes.set_aspect("equal")
         axes.axis("off")
@@ -223,10 +221,7 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
         axes.set_aspect("equal")
         axes.set_axis_off()
         style.panel_label(axes, "abc"[place], f"Belief of {name}")
-    handles = [
-        Rectangle((0, 0), 1, 1, facecolor=color, label=name)
-        for name, color in zip(model.controls, colors, strict=True)
-    ]
+    handles = style.swatches(model.controls, colors)
     figure.legend(handles=handles, loc="lower center", ncols=count, handlelength=1.4)
     return figure
 

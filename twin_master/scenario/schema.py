@@ -273,7 +273,11 @@ class Scenario(Section):
 
     def under(self, seed: int) -> Self:
         """Return the scenario under another seed of the run."""
-        return self.model_copy(update={"mission": self.mission.model_copy(update={"seed": seed})})
+        return self.having("mission", seed=seed)
+
+    def having(self, table: str, **changes: Any) -> Self:
+        """Return the scenario with other values in one of its tables, which nobody checks."""
+        return self.model_copy(update={table: getattr(self, table).model_copy(update=changes)})
 
     def _files(self) -> dict[str, FileSection]:
         return {"asset": self.asset, "belief": self.belief, "calibration": self.calibration}

@@ -420,12 +420,12 @@ class AssetSection(KindSection):
     @property
     def true_parameters(self) -> Mapping[str, float]:
         """Parameters of the true asset, SI, as far as they are given."""
-        return {}
+        return dict(getattr(self, "parameters", {}))
 
     @property
     def constant_load(self) -> Mapping[str, float]:
         """Load inputs, the same in every step, SI."""
-        return {}
+        return dict(getattr(self, "load", {}))
 
     @abstractmethod
     def source(self, scenario: Any) -> Any:

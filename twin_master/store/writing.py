@@ -64,10 +64,9 @@ def open_run(folder: Path | str) -> "DataTree":
     path = Path(folder) / RUN_NAME
     if not path.is_file():
         raise RunFolderError(said("run_folder.no_run", folder=folder))
-    try:
+    after = ": it is not a whole run, resume the run or fly it again."
+    with RunFolderError.instead_of(DamagedFileError, after=after):
         return read_groups(path)
-    except DamagedFileError as error:
-        raise RunFolderError(f"{error}: it is not a whole run, resume the run or fly it again.") from error
 
 
 def store_flight(

@@ -369,10 +369,8 @@ def broker_of(address: str, authority: Path | None = None, *, many: bool = False
     if authority is not None:
         if not (tls and authority.is_file()):
             raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
-        try:
+        with MissionInputError.instead_of(OSError, before=f"{authority} holds no certificate: ", after="."):
             create_default_context(cafile=authority)
-        except OSError as error:
-            raise MissionInputError(f"{authority} holds no certificate: {error}.") from None
     return Broker(parts.hostname, port or (8883 if tls else 1883), topic, user, tls, authority)
 
 

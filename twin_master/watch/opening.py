@@ -292,6 +292,5 @@ def _read(
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.moved(loaded.path.parent)
     if allow_unknown:
-        section = scenario.watch.model_copy(update={"allow_unknown": True})
-        scenario = scenario.model_copy(update={"watch": section})
+        scenario = scenario.having("watch", allow_unknown=True)
     return folder, scenario

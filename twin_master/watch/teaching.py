@@ -64,10 +64,9 @@ def patched_model(
     TwinMasterError, FmuError, FiniteElementError
         The twin cannot believe it.
     """
-    belief = scenario.belief
-    if not isinstance(belief, DesignBelief):
+    if not isinstance(scenario.belief, DesignBelief):
         raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
-    scenario = scenario.model_copy(update={"belief": belief.model_copy(update={"patch": str(file)})})
+    scenario = scenario.having("belief", patch=str(file))
     source: AssetSource = scenario.belief.source(scenario, None)
     return BelievedModel(from_turn, prepared_alone(scenario, source, progress), file)
 
