@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from fe.runtime.arrays import FloatArray
 from fe.verification.calculix_comparison import calculix_program, read_frequencies, read_tables, run_calculix
 from tests.refusals import Inputs
 
-FloatArray = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 needs_calculix = pytest.mark.skipif(

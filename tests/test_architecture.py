@@ -70,10 +70,11 @@ def nodes(path: Path) -> tuple[ast.Import | ast.ImportFrom | ast.FunctionDef | a
 @cache
 def imported(name: str, path: Path) -> frozenset[str]:
     """Return the project modules that `name` imports, in functions and for type checking too."""
-    return frozenset(other for other in _candidates(name, path) if other in modules() and other != name)
+    return frozenset(other for other in named_imports(name, path) if other in modules() and other != name)
 
 
-def _candidates(name: str, path: Path) -> Iterator[str]:
+def named_imports(name: str, path: Path) -> Iterator[str]:
+    """Yield what a module imports, each name as a module and with the module it is of."""
     for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -95,7 +96,7 @@ def test_imports_run_downwards_only_and_never_to_what_stands_beside(package):
         f"{name} imports {other}"
         for name, path in modules().items()
         if name.split(".")[0] == package
-        for other in _candidates(name, path)
+        for other in named_imports(name, path)
         if other.split(".")[0] in refused
     ]
     assert not wrong

@@ -7,7 +7,6 @@ says that the reader has by then.
 import ast
 import contextlib
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,8 @@ import numpy as np
 import pytest
 
 from calibration.result.file import save_calibration
-from calibration.result.record import Calibration
 from tests import command_line
-from tests.conftest import REFERENCE
+from tests.conftest import REFERENCE, synthetic_calibration
 from tests.meshes import box
 from tests.refusals import Inputs
 
@@ -86,6 +84,22 @@ def bracket(folder: Path) -> None:
     mesh.write(folder / "bracket.inp")
 
 
+def flown(name: str, steps: int, place: str) -> Callable[[Path], None]:
+    """Return what makes a run folder of the first turns of a mission, without its report."""
+
+    def fly(folder: Path) -> None:
+        scenario = (ROOT / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
+        text = re.sub(r"(?m)^steps = \d+", f"steps = {steps}", scenario)
+        (folder / "short.toml").write_text(text, encoding="utf-8")
+        command(folder, "run", "short.toml", "--no-report", "--out", place)
+
+    return fly
+
+
+def calibrated_wing(folder: Path) -> None:
+    save_calibration(synthetic_calibration(), folder / "calibrations/wing_7/calibration.nc")
+
+
 WING_FMU = "fmu build --out wing.fmu"
 VERDICT = (
     "discrepancy example static campaign --model single_mass_rig --effect load_cell",
@@ -94,12 +108,16 @@ VERDICT = (
 """A verdict on a mass on a spring, its load cell with a tare."""
 
 READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
+    "README.md": (flown("level_turns", 22, "runs/demo"),),
     "docs/another_asset.md": ("library sample pump_wear --out pump.nc",),
+    "docs/calibrate_a_wing.md": (calibrated_wing,),
     "docs/calibration.md": (
         linked("UAV-Experimental-Calibration", REFERENCE / "uav_experimental_calibration"),
     ),
     "docs/campaign.md": ("discrepancy example static my_campaign --seed 1",),
     "docs/cart_in_ten_minutes.md": (lambda folder: (folder / "my_cart").mkdir(),),
+    # Each turn has damage of its own in the search for an effect.
+    "docs/discrepancy_missions.md": (flown("growing_damage", 12, "runs/mission"),),
     "docs/fmu_models.md": (WING_FMU, linked("rig.toml", INPUTS.folder / "rig.toml")),
     "docs/fmu.md": (
         linked("scenarios", ROOT / "scenarios"),
@@ -110,6 +128,9 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
     # The page packs the FMU itself.
     "docs/python.md": ("fmu build --out drafted.fmu", "fmu bind drafted.fmu --out wing.toml", *VERDICT),
     "docs/real_wing.md": (converted_wing,),
+    # With the turn up to which the page reports, and one more.
+    "docs/report.md": (flown("level_turns", 22, "runs/level_turns"),),
+    "docs/run_folder.md": (flown("level_turns", 22, "runs/level_turns"),),
     "docs/structures.md": (bracket,),
     "docs/use_the_wing_in.md": (WING_FMU, "fmu build --kind compiled --fmi 3 --out wing3.fmu"),
     "docs/verdict.md": VERDICT,
@@ -117,37 +138,6 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
 """What is in the reader's folder before the first block: commands that were run, and what makes more."""
 
 TABLES = INPUTS.table("pages.toml")
-
-
-def flown(folder: Path, name: str, steps: int) -> Path:
-    """The run folder of the first turns of a mission, without its report."""
-    scenario = (ROOT / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
-    text = re.sub(r"(?m)^steps = \d+", f"steps = {steps}", scenario)
-    (folder / "short.toml").write_text(text, encoding="utf-8")
-    command(folder, "run", "short.toml", "--no-report", "--out", "run")
-    return folder / "run"
-
-
-@pytest.fixture(scope="module")
-def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With the turn up to which a page reports, and one more."""
-    return flown(tmp_path_factory.mktemp("mission"), "level_turns", 22)
-
-
-@pytest.fixture(scope="module")
-def short_mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Each turn has damage of its own in the search for an effect."""
-    return flown(tmp_path_factory.mktemp("short_mission"), "growing_damage", 12)
-
-
-@pytest.fixture(scope="module")
-def calibrated_wing(
-    make_calibration: Callable[..., Calibration], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """The folder of a calibration."""
-    folder = tmp_path_factory.mktemp("calibration")
-    save_calibration(make_calibration(), folder / "calibration.nc")
-    return folder
 
 
 @pytest.mark.parametrize("name", TABLES["minutes"])
@@ -166,15 +156,12 @@ def test_what_a_page_of_minutes_imports_is_there(name):
         for page in sorted(WITH_PYTHON)
     ],
 )
-def test_the_blocks_of_a_page_run_as_printed(name, tmp_path, monkeypatch, request):
+def test_the_blocks_of_a_page_run_as_printed(name, tmp_path, monkeypatch):
     for step in READER_HAS.get(name, ()):
         if isinstance(step, str):
             command(tmp_path, *step.split())
         else:
             step(tmp_path)
-    if name in TABLES["made"]:
-        fixture, place = TABLES["made"][name]
-        shutil.copytree(request.getfixturevalue(fixture), tmp_path / place)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "__main__"}
     for number, block in enumerate(blocks(WITH_PYTHON[name], "python"), 1):

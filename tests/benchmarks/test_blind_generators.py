@@ -1,6 +1,5 @@
 """Hidden effects beside the package's own models and patches, with which the generators share no code."""
 
-import ast
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ from benchmarks.blind.changes import Changes
 from benchmarks.blind.effects import DRAWS, LUMPED, Hidden, spread_cubic_stiffness
 from benchmarks.blind.instruments import Chance, draw_chance, true_signals
 from benchmarks.blind.lumped_rig import model_text
-from benchmarks.blind.traps import TRAPS
 from benchmarks.blind.writing import write_case
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
@@ -30,6 +28,7 @@ from discrepancy.models.sensing import observe
 from discrepancy.models.structures import WingModel
 from fe.runtime.patch import ModelPatch
 from tests.discrepancy.rigs import chosen, model_of, setting_of
+from tests.test_architecture import named_imports
 
 pytestmark = pytest.mark.long  # loops are compiled in half a minute, the full wing is projected in one
 
@@ -89,17 +88,6 @@ def test_a_hidden_effect_shows_as_its_patch_in_the_model(rig, draw):
     assert seen > 0.6
 
 
-@pytest.mark.parametrize("trap", [name for name, trap in TRAPS.items() if "lumped" in trap.rigs])
-def test_traps_are_set(trap):
-    case = make_case(Order("case-1", "trap", "lumped", (), 8, trap))
-    assert case.truth["trap"] == trap
-    assert case.truth["accepted"]
-    if TRAPS[trap].largest is not None:
-        assert max(case.truth["d2"].values()) <= TRAPS[trap].largest
-    if trap == "wrong noise label":
-        assert not case.measured.noise
-
-
 def test_written_case_is_detectable_and_repeats_and_tells_nothing_and_seals_everything(tmp_path):
     order = Order("case-0007", "catalogue", "lumped", ("coulomb_friction",), 5)
     case, again = make_case(order), make_case(order)
@@ -130,7 +118,5 @@ def test_generators_share_no_code_with_what_names():
         "fe.runtime.reduced",
     )
     for file in Path(benchmarks.blind.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            assert not [name for name in names if name.startswith(forbidden)], file
+        names = named_imports(f"benchmarks.blind.{file.stem}", file)
+        assert not [name for name in names if name.startswith(forbidden)], file

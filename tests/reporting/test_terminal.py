@@ -1,6 +1,5 @@
 """Tables and progress on a terminal, on a pipe, and not at all."""
 
-import io
 from io import StringIO
 
 import pytest
@@ -55,7 +54,7 @@ def test_stages_and_notes_are_shown_and_standard_output_stays_free(terminal, mon
 
 
 def test_an_exception_passes_and_the_terminal_is_given_back():
-    stream = io.StringIO()
+    stream = StringIO()
     progress = RichProgress(Console(file=stream, force_terminal=True, width=120, color_system=None))
 
     def fail() -> None:
@@ -73,7 +72,7 @@ def test_an_exception_passes_and_the_terminal_is_given_back():
 def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
     seconds = iter([0.0, 1.0, 12.0, 15.0, 23.0, 23.5, 30.0])
     monkeypatch.setattr("reporting.progress.time.perf_counter", lambda: next(seconds))
-    stream = io.StringIO()
+    stream = StringIO()
     progress = RichProgress(Console(file=stream, width=40))
     with progress.stage("Checking a wing that has a long name", total=4, unit="checks") as stage:
         assert stream.getvalue() == "Checking a wing that has a long name, 4 checks ...\n"
@@ -84,7 +83,7 @@ def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
         "Checking a wing that has a long name: 4 of 4 checks, check 3, 23 s ...",
         "Checking a wing that has a long name: done, 23.5 s",
     ]
-    told = io.StringIO()
+    told = StringIO()
     with pytest.raises(KeyError), RichProgress(Console(file=told), lines=True).stage("Failing"):
         raise KeyError
     assert told.getvalue() == "Failing ...\n"

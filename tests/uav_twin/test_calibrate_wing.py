@@ -6,7 +6,8 @@ import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from fmpy import read_model_description
 
 from calibration.geometry import published_lengths, read_lengths
 from calibration.joint.wing_table import weighed
-from calibration.result.record import STATE, Calibration
+from calibration.result.record import STATE
 from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import read_measurements
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
@@ -103,18 +104,12 @@ def test_a_wing_that_is_an_fmu_is_measured_as_the_model_is(wing, tmp_path):
         bench.tip_displacement(1.0)
 
 
-class Calibrated(NamedTuple):
-    """The soft wing, calibrated: the words without --out, the folder, what was said, the result."""
-
-    words: tuple[object, ...]
-    out: Path
-    said: str
-    result: Calibration
-
-
 @pytest.fixture(scope="module")
-def soft(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
-    """Its laboratory has the published planform, and is measured with errors."""
+def soft(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """The soft wing, calibrated: the words without --out, the folder, what was said, the result.
+
+    Its laboratory has the published planform, and is measured with errors.
+    """
     lab = tmp_path_factory.mktemp("soft") / "lab"
     bench = VirtualWing(reduced_model(), SOFT)
     write_lab_folder(
@@ -126,7 +121,7 @@ def soft(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     )
     words, out = ("calibrate", "--data", lab, "--asset", "soft", "--fitted"), lab.with_name("calibrated")
     told = said(*words, "--out", out)
-    return Calibrated(words, out, told, load_calibration(out / "calibration.nc"))
+    return SimpleNamespace(words=words, out=out, said=told, result=load_calibration(out / "calibration.nc"))
 
 
 def test_the_truth_lies_in_the_posterior(soft):

@@ -22,6 +22,7 @@ from tests import command_line
 from tests.command_line import command, refused, said
 
 MODEL = "single_mass_rig"
+RIG = ("--model", MODEL)
 COLUMNS = ("--column", "Weg=displacement", "--column", "Dehnung=leaf_strain")
 
 
@@ -199,9 +200,6 @@ def test_a_terminal_is_asked(tmp_path):
     read = read_campaign(tmp_path / "lab")
     assert read.trials[0].values[1, 0] == 2e-3
     assert read.trials[0].release.displacement == 0.012
-
-
-RIG = ("--model", "single_mass_rig")
 
 
 @pytest.fixture

@@ -4,16 +4,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, PLAIN, Begin, Kernel, Laws, advance, steps_under
 from fe.runtime.motion import substeps as divided
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
-
-FloatArray = NDArray[np.float64]
 
 
 def simulate(

@@ -213,13 +213,11 @@ def test_a_run_can_be_stopped_and_taken_further():
 
 # ---------------------------------------------------------------- over the planform
 
-SPAN, ROOT, TIP = 1.8, 0.4, 0.25
-
 
 @pytest.mark.parametrize("kind", AT_EACH)
 def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind):
     """What is elsewhere in a patch stays as it is."""
-    share, item = planform_stations(SPAN, ROOT, TIP)[1], AT_EACH[kind]
+    share, item = planform_stations(1.8, 0.4, 0.25)[1], AT_EACH[kind]
     before, after = patch.PointMass(0.1, 1.0), FreePlay("root", 2.0, 1e-3)
     first, *spread, last = at_stations(ModelPatch((before, item, after)), share)
     assert (first, last) == (before, after)

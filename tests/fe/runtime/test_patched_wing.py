@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime import patch
-from fe.runtime.arrays import PLACE
+from fe.runtime.arrays import PLACE, FloatArray
 from fe.runtime.errors import InvalidPatchError, InvalidStateError, OutsideModelError
 from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patched_wing import PatchedState, PatchedWing
@@ -30,8 +30,6 @@ from fe.wing.parts import DISTRIBUTIONS
 from tests.fe.runtime.stepping import second_order
 from tests.refusals import Inputs, refused
 from tests.wings import rigid, wing_integrator
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
 HOLDING = PatchedState.holding
 STATE, MASSES = (1.0073, (0.2, 0.1)), (0.1688, 0.1344)

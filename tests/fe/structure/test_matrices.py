@@ -5,19 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import io, sparse
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import FiniteElementError
 from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.design import load_structure
-from fe.structure.operators import assemble_structure, load_and_assemble
+from fe.structure.operators import assemble_structure
 from tests import calculix_decks as decks
 from tests.calculix_decks import Point, needs_calculix
 from tests.refusals import Inputs, refused
-
-FloatArray = NDArray[np.float64]
 
 INPUTS = Inputs(__file__)
 PLACES = (300.0, 0.0, 0.0), (275.0, 0.0, 0.0), (50.0, 50.0, 0.0), (150.0, 50.0, 0.0)
@@ -181,11 +179,6 @@ CHANGED = [({old: new}, sentence) for old, new, sentence in INPUTS.refused("chai
 def test_what_is_no_structure_is_refused_in_a_sentence(changes, sentence, chain):
     with refused(FiniteElementError, sentence):
         chain(changes)
-
-
-def test_a_mesh_is_asked_for_where_one_is_needed(tmp_path):
-    with refused(FiniteElementError, "is a structure from matrices: without a mesh"):
-        load_and_assemble(write_chain(tmp_path))
 
 
 def test_the_hash_is_of_the_content_of_every_file(chain, tmp_path):

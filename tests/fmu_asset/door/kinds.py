@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import parse_structure
@@ -23,7 +23,6 @@ from tests.conftest import BEAM
 from tests.fmu_asset.making import parameters_of, tables
 from tests.fmu_asset.ours import OurFmus
 
-Floats = npt.NDArray[np.float64]
 Inputs = Mapping[str, Mapping[str, Any]]
 Shown = tuple[Any, Mapping[str, Any]]
 """Observations, a row for each step, and further outputs by name."""
@@ -133,7 +132,7 @@ def after(kind: Kind, first: Any, move: Callable[[Any, dict[str, Any]], Any]) ->
     return np.array([*accumulate(kind.rows, move, initial=first)][1:])
 
 
-def calls(kind: Kind) -> Floats:
+def calls(kind: Kind) -> FloatArray:
     """How often the FMU was asked for a step."""
     return kind.binding.binding.decimation * np.arange(1.0, STEPS + 1)
 
@@ -185,7 +184,7 @@ def array(kind: Kind, _: OurFmus) -> Shown:
         matrix[place] = kind.parameters.get(name, matrix[place])
     matrix = kind.parameters.get("gain", 1.0) * np.reshape(kind.parameters.get("A", matrix), (2, 3))
 
-    def move(total: Floats, row: dict[str, Any]) -> Floats:
+    def move(total: FloatArray, row: dict[str, Any]) -> FloatArray:
         u = row["u"] if "u" in row else np.array([row["first"], 0.0, row["third"]])
         return total + row.get("active", 1.0) * (matrix @ u + row["offset"])
 

@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +31,9 @@ from uav_twin import GaussianSensorModel, fly_fleet, learn_from_fleet, load_scen
 EACH = {"2g": 0.07, "3g": 0.2}
 
 
-def tiny(probability: Any, levels: int = 3, name: str = "growing_damage", success: float = 1.0) -> Scenario:
+def tiny(
+    probability: object, levels: int = 3, name: str = "growing_damage", success: float = 1.0
+) -> Scenario:
     """Return a shipped scenario with few levels, whose repairs may fail."""
     table = load_scenario(name).scenario.to_dict()
     for action in table["action"]:

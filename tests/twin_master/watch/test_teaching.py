@@ -179,7 +179,9 @@ def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence_and_is_no_deci
     assert kinds == [["verdict", "heard"], []]
 
 
-def test_live_turns_wait_for_neither_search_nor_model(noticing, mission, loose, tmp_path, monkeypatch):
+def test_live_turns_wait_neither_for_the_search_nor_for_the_patched_model(
+    noticing, mission, loose, tmp_path, monkeypatch
+):
     """It is built beside them, and believed behind the turn that the journal says, to the bit."""
     monkeypatch.setattr("twin_master.watch.tutor.COURTESY", 0)
     gate = tmp_path / "gate"
