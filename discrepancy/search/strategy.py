@@ -238,6 +238,7 @@ class Search:
             self.longer()
         if not self.best().candidate.is_family and self.unexplained():
             self.fit_pairs()
+        self.shorter()
         self.settle()
 
     @property
@@ -254,13 +255,11 @@ class Search:
         ]  # fmt: skip
         close = [one for one in able if self.score(one) > self.score(able[0]) - SEARCH.followed]
         close = close[: SEARCH.far_fits]
-        # where a reading jumps with the force, more laws follow what one alone is in a simulation
-        whole, known = {*able[0].candidate.key} if able else set(), [one.candidate.key for one in close]
-        close += [one for one in able if {*(key := one.candidate.key)} < whole and key not in known]
         for item in each(self.tell, close, lambda one: f"fitting {one.candidate.words} to the end"):
             found = attempt(self.problem, item.candidate, force.whole_point(item))
             if found is not None:
                 self.keep(found, exact=True)
+        self.shorter()
         self.settle()
 
     def unexplained(self) -> bool:
@@ -292,6 +291,23 @@ class Search:
             if not fitted or self.score(fitted[0]) <= before:
                 break
             current = fitted[0]
+
+    def shorter(self) -> None:
+        """Leave one effect at a time out of the best set, while that makes a better one.
+
+        An effect may have come first because the right one stood at another place, or was not followed to
+        its place: beside the right one it may say nothing.
+        """
+        while (count := len((best := self.best()).candidate.terms)) > 1:
+            for out in range(count):
+                kept = (number for number in range(count) if number != out)
+                candidate, effect = best.candidate.some(kept, best.effect)
+                begin, worst = replace(best.point, effect=effect), best.objective + SEARCH.out_of_reach
+                found = attempt(self.problem, candidate, begin, give_up=worst)
+                if found is not None:
+                    self.keep(found, exact=True)
+            if self.best() is best:
+                break
 
     def families(self) -> None:
         """Fit the free-shape families of single effects that come close, and keep those that fit.

@@ -14,6 +14,7 @@ from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Q
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
@@ -303,7 +304,13 @@ def test_one_law_stands_where_several_follow_the_jumps_that_an_accelerometer_sho
         noise = random.standard_normal((150, 2)) * [size for *_, size in known]
         trials.append(replace(bare, values=shown.values + noise))
     found = search(problem_of(Campaign("rubs", channels, tuple(trials), None, {}, ""), rig), FEW[:3])
-    assert found.best().candidate.identifiers == ("coulomb_friction",)
+    alone = found.best()
+    assert alone.candidate.identifiers == ("coulomb_friction",)
+    both, again = alone.candidate.plus(Term(FEW[0], "slide")), Search(found.problem, FEW[:3], found.none)
+    begun = replace(alone.point, effect=np.append(alone.effect, 0.0))
+    again.keep(fit(found.problem, both, begun), exact=True)  # the other one was found first
+    again.sets()
+    assert again.best().candidate.identifiers == ("coulomb_friction",)
 
 
 def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():
