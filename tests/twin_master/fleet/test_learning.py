@@ -190,6 +190,8 @@ def test_groups_share_their_rates_and_each_has_a_population_of_the_parameter(tmp
         assert group["noise_factor"]["mean"] == pytest.approx(150.0 / 125.0, rel=0.03)
     rates = [record["groups"][name]["probability"]["3g"]["mean"] for name in means]
     assert min(rates) < record["shared"]["3g"]["mean"] < max(rates)
+    few = [record["groups"][name]["probability"]["2g"]["mean"] for name in means]
+    assert max(few) < 0.1  # alone, of few turns, they would be 0.19 and 0.45
 
 
 def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
