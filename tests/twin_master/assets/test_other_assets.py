@@ -386,7 +386,8 @@ def test_a_watch_takes_features_with_their_covariance(file):
 def test_gauges_that_cannot_stand_beside_those_of_the_file(tmp_path):
     """What is wrong names the option."""
     panel = resolve_scenario(load_scenario("stiffened_panel"), Overrides())
-    found, folder = with_candidates(panel, "2", tmp_path / "2"), tmp_path / "0"
+    whole = panel.model_copy(update={"rewards": panel.rewards.model_copy(update={"health_sensors": "all"})})
+    found, folder = with_candidates(whole, "2", tmp_path / "2"), tmp_path / "0"
     limited = [found.observation.titles[number - 1] for number in found.rewards.health_sensors]
     assert limited == [*panel.observation.titles]  # health stays that of the gauges of the file
     with pytest.raises(MissionInputError, match="--candidates needs at least one place"):
