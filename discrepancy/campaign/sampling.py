@@ -58,24 +58,24 @@ def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
     """Return the times (N,) of printed cells, in any unit: on an even grid where they are even as printed."""
     # Trailing zeros may be dropped in print, so the finest cell says how many decimals there are.
     rounding = min(_last_digit(cell) for cell in cells)  # twice half of it
-    interval, off = (time[-1] - time[0]) / (len(time) - 1), even_grid(time)[1]
-    if not _EXACT < off <= EVEN + rounding / interval:
+    interval = (time[-1] - time[0]) / (len(time) - 1)
+    if not _EXACT < unevenness(time) <= EVEN + rounding / interval:
         return time
     place = np.arange(len(time)) - (0.0 if time[0] == 0.0 else 0.5 * (len(time) - 1))
     about = 0.0 if time[0] == 0.0 else time.mean()
     return np.asarray(about + place * (place @ (time - about)) / (place @ place))
 
 
-def even_grid(time: FloatArray) -> tuple[FloatArray, float]:
-    """Return the even grid (N,) through first and last of times (N,); how far off they are [intervals]."""
+def unevenness(time: FloatArray) -> float:
+    """Return how far times (N,) are off the even grid through first and last [intervals]."""
     interval = (time[-1] - time[0]) / max(len(time) - 1, 1)
-    grid: FloatArray = time[0] + interval * np.arange(len(time))
-    return grid, float(np.max(np.abs(time - grid))) / abs(interval or 1.0)
+    off = np.abs(time - time[0] - interval * np.arange(len(time)))
+    return float(off.max() / abs(interval or 1.0))
 
 
 def is_even(time: FloatArray) -> bool:
     """Whether samples lie on an even grid to a thousandth of the interval."""
-    return even_grid(time)[1] <= EVEN
+    return unevenness(time) <= EVEN
 
 
 def nearly_even(time: FloatArray) -> bool:

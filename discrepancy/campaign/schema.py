@@ -5,27 +5,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    ConfigDict,
-    Field,
-    SerializerFunctionWrapHandler,
-    WrapSerializer,
-    field_validator,
-    model_validator,
-)
+import pydantic
 
+from discrepancy.campaign import records
 from discrepancy.campaign.protocol import IN_FILES, LIST, Event, Release
-from discrepancy.campaign.records import (
-    Channel,
-    Hold,
-    InTables,
-    Quantity,
-    RecordedInput,
-    Start,
-    TrialKeys,
-    TrialKind,
-)
 from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignFileError, said
 from fe.runtime.patch import EVERY_CHANNEL
@@ -55,42 +38,42 @@ class NoiseFileSection(Section):
     interval: Positive | None = None
 
 
-def _factor(item: InTables) -> float:
+def _factor(item: records.InTables) -> float:
     try:
         return conversion_of(item.quantity, item.unit)
     except ValueError as cause:
         raise ValueError(f"the unit of {item.name!r}: {cause}") from None
 
 
-def _scaled(channel: Channel, scale: float) -> Channel:
+def _scaled(channel: records.Channel, scale: float) -> records.Channel:
     """Return a channel with its deviations in another unit."""
     noise = channel.noise
     noise = noise and replace(noise, standard_deviation=scale * noise.standard_deviation)
     return replace(channel, noise=noise, offset_deviation=scale * channel.offset_deviation)
 
 
-def _read(channel: Channel) -> Channel:
+def _read(channel: records.Channel) -> records.Channel:
     if channel.name == EVERY_CHANNEL or channel.name.startswith("#"):
         raise ValueError(f"a channel cannot be called {channel.name!r}")
     return _scaled(channel, _factor(channel))
 
 
-def _written(channel: Channel, dump: SerializerFunctionWrapHandler) -> object:
+def _written(channel: records.Channel, dump: pydantic.SerializerFunctionWrapHandler) -> object:
     return dump(_scaled(channel, 1.0 / _factor(channel)))
 
 
-ChannelInFile = Annotated[Channel, AfterValidator(_read), WrapSerializer(_written)]
+ChannelInFile = Annotated[records.Channel, pydantic.AfterValidator(_read), pydantic.WrapSerializer(_written)]
 """Its deviations are in its unit there."""
 
 
-def _read_input(item: RecordedInput) -> RecordedInput:
+def _read_input(item: records.RecordedInput) -> records.RecordedInput:
     held = _factor(item) * item.offset_deviation
     if item.table_column in INPUT_COLUMNS and item.table_column != "force":
         raise ValueError(said("campaign.reserved", item=item))
     smooth = item.quantity.moving and not item.reference
-    if smooth and item.hold not in (None, Hold.SMOOTH):
+    if smooth and item.hold not in (None, records.Hold.SMOOTH):
         raise ValueError(said("campaign.motion", item=item))
-    return replace(item, offset_deviation=held, hold=Hold.SMOOTH if smooth else item.hold)
+    return replace(item, offset_deviation=held, hold=records.Hold.SMOOTH if smooth else item.hold)
 
 
 def _in_si(release: Release) -> Release:
@@ -101,7 +84,7 @@ def _in_si(release: Release) -> Release:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialSection(TrialKeys):
+class TrialSection(records.TrialKeys):
     """`[[trial]]`; `health` has losses by damage region, and `deviation`."""
 
     __pydantic_config__ = IN_FILES
@@ -109,22 +92,22 @@ class TrialSection(TrialKeys):
     start: NotNegative | None = None
     temperature: Number | None = None
     health: dict[Name, NotNegative] = field(default_factory=dict)
-    release: Annotated[Release, AfterValidator(_in_si)] | None = None
+    release: Annotated[Release, pydantic.AfterValidator(_in_si)] | None = None
     channels: Annotated[tuple[Name, ...], LIST] | None = None
-    left_out: dict[str, Annotated[tuple[Annotated[int, Field(strict=True, ge=1)], ...], LIST]] = field(
-        default_factory=dict
+    left_out: dict[str, Annotated[tuple[Annotated[int, pydantic.Field(strict=True, ge=1)], ...], LIST]] = (
+        field(default_factory=dict)
     )
-    begins: Start | None = None
+    begins: records.Start | None = None
 
-    @model_validator(mode="before")
+    @pydantic.model_validator(mode="before")
     @classmethod
     def _ringdowns_have_releases(cls, content: object) -> object:
         """Let a ring-down's release be among all that is missing."""
-        if isinstance(content, dict) and content.get("kind") == TrialKind.RINGDOWN:
+        if isinstance(content, dict) and content.get("kind") == records.TrialKind.RINGDOWN:
             return {"release": {}, **content}
         return content
 
-    @field_validator("load_place", mode="before")
+    @pydantic.field_validator("load_place", mode="before")
     @classmethod
     def _place(cls, value: object) -> object:
         if isinstance(value, list):
@@ -134,8 +117,11 @@ class TrialSection(TrialKeys):
         return value
 
     def __post_init__(self) -> None:
-        kinds = {"release": {TrialKind.RINGDOWN}, "begins": {TrialKind.FORCED, TrialKind.DRIVEN}}
-        for key, allowed in {**kinds, "hold": {TrialKind.FORCED}}.items():
+        kinds = {
+            "release": {records.TrialKind.RINGDOWN},
+            "begins": {records.TrialKind.FORCED, records.TrialKind.DRIVEN},
+        }
+        for key, allowed in {**kinds, "hold": {records.TrialKind.FORCED}}.items():
             if getattr(self, key) is not None and self.kind not in allowed:
                 raise ValueError(said(f"campaign.no_{key}", trial=self))
         for region, loss in self.health.items():
@@ -151,22 +137,24 @@ def _twice(names: Iterable[str]) -> str | None:
 class CampaignSection(Section):
     """The whole file."""
 
-    model_config = ConfigDict(strict=False)
+    model_config = pydantic.ConfigDict(strict=False)
 
     format: Literal[1]
     name: str
-    reference_temperature: Annotated[Number, Field(ge=-273.15)] | None = None
-    parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
+    reference_temperature: Annotated[Number, pydantic.Field(ge=-273.15)] | None = None
+    parameters: dict[Name, ParameterSection] = pydantic.Field(default_factory=dict)
     noise: NoiseFileSection | None = None
-    channel: Annotated[tuple[ChannelInFile, ...], Field(min_length=1), LIST]
-    input: Annotated[tuple[Annotated[RecordedInput, AfterValidator(_read_input)], ...], LIST] = ()
-    trial: Annotated[tuple[TrialSection, ...], Field(min_length=1), LIST]
+    channel: Annotated[tuple[ChannelInFile, ...], pydantic.Field(min_length=1), LIST]
+    input: Annotated[
+        tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_read_input)], ...], LIST
+    ] = ()
+    trial: Annotated[tuple[TrialSection, ...], pydantic.Field(min_length=1), LIST]
     event: Annotated[tuple[Event, ...], LIST] = ()
     remarks: Annotated[tuple[str, ...], LIST] = ()
-    loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = Field(default_factory=dict)
+    loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = pydantic.Field(default_factory=dict)
 
     @property
-    def columns(self) -> tuple[InTables, ...]:
+    def columns(self) -> tuple[records.InTables, ...]:
         """Channels and inputs."""
         return (*self.channel, *self.input)
 
@@ -176,7 +164,7 @@ class CampaignSection(Section):
             twice = _twice(item.name for item in getattr(self, kind))
             yield twice, f"there is more than one {kind} called {twice!r}: rename one"
         lost = self.input and not any(
-            item.kind in (TrialKind.DRIVEN, TrialKind.STATIC) for item in self.trial
+            item.kind in (records.TrialKind.DRIVEN, records.TrialKind.STATIC) for item in self.trial
         )
         yield lost, '[[input]] is for trials of the kind "driven" or "static", and there is none'
         twice, what = (
@@ -185,11 +173,11 @@ class CampaignSection(Section):
         )
         yield twice, f"more than one {what} reads the column {twice!r}: give each its own `column`"
         # the force is one of static and forced trials only: a load cell may be called so in a driven one
-        forced = any(item.kind in (TrialKind.STATIC, TrialKind.FORCED) for item in self.trial)
+        forced = any(item.kind in (records.TrialKind.STATIC, records.TrialKind.FORCED) for item in self.trial)
         taken = {name for name in INPUT_COLUMNS if name != "force" or forced}
         for channel in self.channel:
             yield channel.table_column in taken, said("campaign.taken", item=channel)
-        scales = {item.unit == "K" for item in self.columns if item.quantity is Quantity.TEMPERATURE}
+        scales = {item.unit == "K" for item in self.columns if item.quantity is records.Quantity.TEMPERATURE}
         yield len(scales) > 1, "temperatures are given in degC and in K: give all of them in one of the two"
         yield from self._wrong_loggers()
         known = {item.name for item in self.channel}
@@ -201,7 +189,7 @@ class CampaignSection(Section):
     def _wrong_loggers(self) -> Iterator[Fault]:
         """Yield loggers of nothing, names that none or two of them record, and inputs on two of them."""
         inputs = {item.name for item in self.input}
-        inputs |= {"force"} if any(item.kind is TrialKind.FORCED for item in self.trial) else set()
+        inputs |= {"force"} if any(item.kind is records.TrialKind.FORCED for item in self.trial) else set()
         wanted = [*(item.name for item in self.channel), *sorted(inputs)] if self.loggers else []
         recorded = [name for names in self.loggers.values() for name in names]
         for name in recorded:

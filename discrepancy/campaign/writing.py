@@ -6,20 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from discrepancy.campaign import schema
+from discrepancy.campaign import records, schema
 from discrepancy.campaign.reading import CAMPAIGN_FILE, placed_events
-from discrepancy.campaign.records import (
-    USUAL_REGIONS,
-    Campaign,
-    Channel,
-    FloatArray,
-    Hold,
-    InTables,
-    RecordedInput,
-    Start,
-    Trial,
-    TrialKind,
-)
 from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion_of
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import atomic_write_text
@@ -30,7 +18,7 @@ NOISE_FILE = "noise.csv"
 """Name of the table of samples at rest."""
 
 
-def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) -> Path:
+def write_campaign(campaign: records.Campaign, folder: str | Path, *, si: bool = False) -> Path:
     """Write a campaign; `read_campaign` gives it back, equal to rounding but for its hash.
 
     Strain is written in microstrain, displacement in mm, the rest in SI (all, if asked for). `campaign.toml`
@@ -76,20 +64,20 @@ def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) 
 # ---------------------------------------------------------------- tables
 
 
-def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
-    columns: dict[str, FloatArray] = {}
+def _trial_table(campaign: records.Campaign, trial: records.Trial, si: bool) -> str:
+    columns: dict[str, records.FloatArray] = {}
     if trial.is_dynamic or np.any(trial.time != trial.start):
         columns["time"] = trial.time
-    if trial.kind in (TrialKind.STATIC, TrialKind.FORCED):
+    if trial.kind in (records.TrialKind.STATIC, records.TrialKind.FORCED):
         columns["force"] = trial.force
-    if trial.kind is TrialKind.FLIGHT:
+    if trial.kind is records.TrialKind.FLIGHT:
         columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
         if campaign.reference_temperature is None:
             raise CampaignFileError(said("campaign.no_reference", trial=trial))
         columns["temperature"] = trial.temperature + campaign.reference_temperature
     for index, region in enumerate(trial.regions):
-        name = region if region in USUAL_REGIONS else f"{schema.OF_REGION}{region}"
+        name = region if region in records.USUAL_REGIONS else f"{schema.OF_REGION}{region}"
         for key, values in ((name, trial.health), (f"{name}_deviation", trial.health_deviation)):
             if np.any(values[:, index] != 0.0):
                 columns[key] = values[:, index]
@@ -99,17 +87,17 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
     return table_text(columns)
 
 
-def _unit(item: InTables, si: bool) -> str:
+def _unit(item: records.InTables, si: bool) -> str:
     if item.unit in NEVER_CONVERTED:
         return item.unit
     return UNITS[item.quantity].si if si else UNITS[item.quantity].written
 
 
-def _in_unit(values: FloatArray, channel: Channel, si: bool) -> FloatArray:
+def _in_unit(values: records.FloatArray, channel: records.Channel, si: bool) -> records.FloatArray:
     return values / conversion_of(channel.quantity, _unit(channel, si))
 
 
-def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
+def _noise_table(campaign: records.Campaign, si: bool) -> tuple[str, float] | None:
     """Return the table of samples at rest and their interval, None without any."""
     recorded = {
         name: (channel.noise.samples, channel.noise.interval)
@@ -123,7 +111,7 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
     if intervals or interval is None:
         raise CampaignFileError(said("campaign.several_intervals"))
     longest = max(len(samples) for samples, _ in recorded.values())
-    columns: dict[str, FloatArray] = {"time": interval * np.arange(float(longest))}
+    columns: dict[str, records.FloatArray] = {"time": interval * np.arange(float(longest))}
     for name, (samples, _) in recorded.items():
         columns[name] = np.full(longest, np.nan)
         columns[name][: len(samples)] = _in_unit(samples, campaign.channels[name], si)
@@ -133,7 +121,9 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
 # ---------------------------------------------------------------- TOML
 
 
-def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float | None, si: bool) -> str:
+def _campaign_text(
+    campaign: records.Campaign, files: list[str], noise_interval: float | None, si: bool
+) -> str:
     source = f"The campaign {campaign.name!r}"
     inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
     section = schema.CampaignSection.model_construct(
@@ -157,7 +147,7 @@ def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float |
     return toml_text(content)
 
 
-def _channel(channel: Channel, si: bool) -> Channel:
+def _channel(channel: records.Channel, si: bool) -> records.Channel:
     """Return a channel as a file has it; samples at rest are in a table of their own."""
     noise = channel.noise
     if noise is not None:
@@ -165,19 +155,19 @@ def _channel(channel: Channel, si: bool) -> Channel:
     return replace(channel, unit=_unit(channel, si), column="", noise=noise)
 
 
-def _input(item: RecordedInput) -> RecordedInput:
-    reference = bool(item.quantity.moving) and item.hold is not Hold.SMOOTH
+def _input(item: records.RecordedInput) -> records.RecordedInput:
+    reference = bool(item.quantity.moving) and item.hold is not records.Hold.SMOOTH
     return replace(item, unit=_unit(item, True), column="", reference=reference)
 
 
-def _trial(campaign: Campaign, trial: Trial, file: str) -> schema.TrialSection:
+def _trial(campaign: records.Campaign, trial: records.Trial, file: str) -> schema.TrialSection:
     left_out = {
         name: tuple((np.flatnonzero(~trial.used[:, index]) + 1).tolist())
         for index, name in enumerate(trial.channels)
         if not trial.used[:, index].all()
     }
-    driven = trial.kind is TrialKind.DRIVEN and not trial.begin_assumed
-    said = driven or trial.begins is not Start.SETTLED
+    driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed
+    said = driven or trial.begins is not records.Start.SETTLED
     in_order = list(trial.channels) == [name for name in campaign.channels if name in trial.channels]
     return schema.TrialSection(
         **{**trial.said, "file": file}, left_out=left_out,

@@ -13,7 +13,7 @@ from scipy import stats
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError, said
-from discrepancy.location.residuals import FittedTrial, ResidualSet, mean_square
+from discrepancy.location.residuals import FittedTrial, ResidualSet, mean_square, of_channel
 from discrepancy.verdict import Gate, Proof, Scores
 
 PIT_BINS = 10
@@ -105,14 +105,12 @@ def chi_square_per_dof(residuals: ResidualSet) -> tuple[float, float]:
 
 
 def _rms(residuals: ResidualSet) -> dict[str, float]:
-    sums: dict[str, list[float]] = {}
-    for item in residuals.trials:
-        for column, name in enumerate(item.trial.channels):
-            values = item.residual[item.used[:, column], column]
-            total = sums.setdefault(name, [0.0, 0.0])
-            total[0] += float(values @ values)
-            total[1] += values.size
-    return {name: sqrt(total / count) for name, (total, count) in sums.items() if count}
+    found: dict[str, float] = {}
+    for name in residuals.measured:
+        records = of_channel(residuals.trials, name)
+        squares = np.concatenate([item.residual[used, column] ** 2 for item, column, used in records])
+        found |= {name: sqrt(squares.mean())} if squares.size else {}
+    return found
 
 
 def correlation_time(series: FloatArray) -> float:

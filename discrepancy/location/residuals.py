@@ -90,6 +90,13 @@ class FittedTrial:
         return self.trial.channels.index(channel)
 
 
+def of_channel(trials: Iterable[FittedTrial], channel: str) -> Iterator[tuple[FittedTrial, int, BoolArray]]:
+    """Yield the trials that have a channel, its column in each, and which samples of it count (N,)."""
+    for item in trials:
+        if channel in item.trial.channels:
+            yield item, item.column(channel), item.used[:, item.column(channel)]
+
+
 @dataclass(frozen=True, eq=False)
 class ResidualSet:
     """All trials of a campaign beside their predictions by one fitted hypothesis.
@@ -299,12 +306,8 @@ def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float,
     The trials of the set are all fitted, or all held out.
     """
     total, parts, held_out = 0.0, [], residuals.trials[0].trial.held_out
-    for item in residuals.trials:
-        for name in channels:
-            if name not in item.trial.channels:
-                continue
-            column = item.column(name)
-            used = item.used[:, column]
+    for name in channels:
+        for item, column, used in of_channel(residuals.trials, name):
             total += float(np.sum(item.standardised[used, column] ** 2))
             sensitive = None if item.sensitivity is None else item.sensitivity[used, column]
             parts.append((item.expected_variance[used, column], sensitive))

@@ -73,15 +73,10 @@ class FmuMotion(FmuPace):
         acting, start, memory = Acting(trial.time, stamps, loads), self._start(system, case, amounts), None
         if len(laws) and case.course is not None:  # it has settled under the first force
             first, gain = float(case.course.values[0]) * case.lever, system.gain
-
-            def acts(pulls: FloatArray) -> FloatArray:
-                return np.asarray(first - np.bincount(numbers, pulls[0], len(first)))
-
-            def asked(pulls: FloatArray) -> FloatArray:
-                return (still + gain @ acts(pulls))[None]
-
-            rest = self._with_laws(laws, asked, gain[np.ix_(seen, numbers)], trial.name)[1]
-            start, memory = system.at_rest(acts(rest.forces)), rest.memory
+            free, compliance = (still + gain @ first)[seen], gain[np.ix_(seen, numbers)]
+            rest = static_solution(laws, free[None], compliance, kernel=compiled_kernel())
+            start = system.at_rest(first - np.bincount(numbers, rest.forces[0], len(first)))
+            memory = rest.memory
         law = seen, numbers, still[seen], refinement, memory
         found = state_motion(system, acting, start, laws, *law)
         (states, forces), (rows, at_once) = found, system.rows(columns, orders)
@@ -124,7 +119,9 @@ class FmuMotion(FmuPace):
 
     def _begun(self, run: Run, laws: Laws, trial: str) -> tuple[Run, FloatArray | None]:
         """Return a run that has settled with laws under its first loads, and the memory of these."""
-        at = np.array([self.x[self.ports.index(name)] for name in laws.ports])
+        free = self.begun(run)[1][None]
+        if not run.courses or not np.any(free[:, [self.x[self.ports.index(name)] for name in laws.ports]]):
+            return run, None
 
         def under(pulls: FloatArray) -> Run:
             begin = self._less({name: np.full(1, value) for name, value in run.begin.items()}, laws, pulls)
@@ -133,12 +130,7 @@ class FmuMotion(FmuPace):
         def asked(pulls: FloatArray) -> FloatArray:
             return self.begun(under(pulls))[1][None]
 
-        free = asked(np.zeros((1, len(laws))))
-        if not run.courses or not free[0, at].any():
-            return run, None
-        sizes = np.diag([self.size(self.forces[self.ports.index(name)]) for name in laws.ports])
-        moved = np.array([free[0, at] - asked(size[None])[0, at] for size in sizes])
-        rest = self._with_laws(laws, asked, moved.T / np.diag(sizes), trial, free)[1]
+        rest = self._with_laws(laws, asked, free, run.state, trial)[1]
         return under(rest.forces), rest.memory
 
     def _beside(self, run: Run, laws: Laws, trial: str) -> FloatArray:
@@ -289,11 +281,11 @@ class FmuMotion(FmuPace):
             raise
         if not len(laws):
             return values
-        at = [self.ports.index(name) for name in laws.ports]
-        compliance = self.flexibility(states[0])[np.ix_(at, at)]
-        return self._with_laws(
-            laws, lambda pulls: self.rest(states, self._less(loads, laws, pulls)), compliance, trial, values
-        )[0]
+
+        def asked(pulls: FloatArray) -> FloatArray:
+            return self.rest(states, self._less(loads, laws, pulls))
+
+        return self._with_laws(laws, asked, values, states[0], trial)[0]
 
     def _less(self, loads: Mapping[str, FloatArray], laws: Laws, pulls: FloatArray) -> dict[str, FloatArray]:
         """Return loads less the forces (L, J) of laws, by input."""
@@ -304,8 +296,8 @@ class FmuMotion(FmuPace):
         return given
 
     def _with_laws(
-        self, laws: Laws, asked: Callable[[FloatArray], FloatArray], compliance: FloatArray, trial: str,
-        values: FloatArray | None = None,
+        self, laws: Laws, asked: Callable[[FloatArray], FloatArray], values: FloatArray, state: State,
+        trial: str,
     ) -> tuple[FloatArray, StaticSolution]:  # fmt: skip
         """Return the outputs (L, C) at rest with laws, and what these do then.
 
@@ -315,15 +307,15 @@ class FmuMotion(FmuPace):
             J of them.
         asked : callable
             Forces (L, J) of the laws to outputs at rest.
-        compliance : (J, J) ndarray
-            Displacements of their ports under unit forces at each.
+        values : (L, C) ndarray
+            Outputs without laws.
+        state : State
+            Whose flexibility leads to where laws and FMU agree.
         trial : str
             Where.
-        values : (L, C) ndarray, optional
-            Outputs without laws, where they are known.
         """
-        columns = [self.x[self.ports.index(name)] for name in laws.ports]
-        values = asked(np.zeros((1, len(laws)))) if values is None else values
+        at = [self.ports.index(name) for name in laws.ports]
+        columns, compliance = [self.x[port] for port in at], self.flexibility(state)[np.ix_(at, at)]
         linear = values[:, columns]
         for _ in range(STATIC_ITERATIONS):
             rest = static_solution(laws, linear, compliance, kernel=compiled_kernel())

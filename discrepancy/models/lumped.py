@@ -11,17 +11,10 @@ from scipy.linalg import eigh
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError, said
+from discrepancy.models import lumped_file
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
 from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.lumped_file import (
-    BLOCKS,
-    GAINS,
-    ControllerSection,
-    InputSection,
-    LoadSection,
-    LumpedDescription,
-)
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime import patch as changes
@@ -46,7 +39,7 @@ class Loop(NamedTuple):
     its error, zero without that gain.
     """
 
-    section: ControllerSection
+    section: lumped_file.ControllerSection
     gains: Sequence[float]
     sees: FloatArray
     acts: FloatArray
@@ -88,7 +81,7 @@ class Rig(NamedTuple):
     terms: Mapping[str, FloatArray]
     loops: Mapping[str, Loop]
 
-    def along(self, item: LoadSection, row: Sequence[float] | FloatArray) -> FloatArray:
+    def along(self, item: lumped_file.LoadSection, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a load (N,) along a row, through a matrix where it says so, times its own factor."""
         acting = np.zeros(len(self.terms["mass"]))
         acting[: len(row)] = row
@@ -107,7 +100,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     kept = 256
 
-    def __init__(self, description: LumpedDescription) -> None:
+    def __init__(self, description: lumped_file.LumpedDescription) -> None:
         self.description, padded = description, description.padded
         super().__init__(description, {item.name: item.quantity for item in description.output})
         self.load_places = tuple(item.name for item in description.input)
@@ -128,7 +121,7 @@ class LumpedModel(DescribedModel, SystemModel):
     @classmethod
     def load(cls, path: Path | str) -> "LumpedModel":
         """Return the model of a TOML file, or a shipped one by name; raises `ModelError`."""
-        return cls(LumpedDescription.read(path))
+        return cls(lumped_file.LumpedDescription.read(path))
 
     # ------------------------------------------------------------ what it is
 
@@ -207,7 +200,7 @@ class LumpedModel(DescribedModel, SystemModel):
         lacks = (*case.conditions.offset, *(0.0,) * len(recorded))
         return {item.name: (item, lack) for item, lack in zip(recorded, lacks, strict=False)}
 
-    def _recorded_at(self, trial: Trial, item: RecordedInput) -> InputSection:
+    def _recorded_at(self, trial: Trial, item: RecordedInput) -> lumped_file.InputSection:
         """Return the input that a trial records; raises `ModelError` if it is not the model's."""
         section = self._inputs.get(item.name)
         if section is None:
@@ -220,12 +213,12 @@ class LumpedModel(DescribedModel, SystemModel):
             raise ModelError(said("models.prescribed", item=item, trial=trial, model=self))
         return section
 
-    def _input_at(self, place: Place) -> InputSection:
+    def _input_at(self, place: Place) -> lumped_file.InputSection:
         """Return the input of a load place; raises `ModelError` if there is none."""
         known = [name for name, item in self._inputs.items() if name == place or not item.quantity.moving]
         return self._inputs[place_among(known, place, self.what)]
 
-    def _moved_row(self, rig: Rig, item: InputSection, change: LoadChange) -> FloatArray:
+    def _moved_row(self, rig: Rig, item: lumped_file.InputSection, change: LoadChange) -> FloatArray:
         """Return the row (N,) along which an input acts, where its place has been moved to."""
         row = np.array(item.vector)
         if change.along_span or change.along_chord:
@@ -337,7 +330,9 @@ class LumpedModel(DescribedModel, SystemModel):
             damping += factors.get("damping", 1.0) * own
         loops, integrals = dict[str, Loop](), iter(np.eye(description.width)[n + description.states :])
         for item in description.controller:
-            named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
+            named = (
+                factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in lumped_file.GAINS
+            )
             gains = [factors.get(item.name, 1.0) * gain for gain in named]
             sees = Shown.of(padded(item.vector), item.quantity.order, states=description.width - n).rows
             integral = next(integrals) if item.integral else np.zeros(description.width)
@@ -348,7 +343,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return what moves, with prescribed motions and controllers as the state says."""
         rig, description = self.rig(state), self.description
         matrices, padded = np.zeros((3, description.width, description.width)), description.padded
-        for kind, (order, *_) in BLOCKS.items():
+        for kind, (order, *_) in lumped_file.BLOCKS.items():
             matrices[order] += rig.terms[kind]
         rest = np.arange(description.size + description.states, description.width)
         matrices[2, rest, rest] = 1.0

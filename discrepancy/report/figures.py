@@ -24,15 +24,8 @@ from fe.wing.design import WingDesign
 from reporting import figures as style
 from reporting.page import ReportFigure
 
+from . import residual_figures
 from .motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
-from .residual_figures import (
-    heat_figure,
-    heat_map,
-    load_figure,
-    panels,
-    planform_figure,
-    time_line_figure,
-)
 from .text import WORDS, added_label, force_sentence, motion_of, scored
 
 _LARGEST_DISTANCE = 1e4
@@ -42,7 +35,7 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
     if not scores:
         return None
-    figure, grid = panels(1, 2, 1.9)
+    figure, grid = residual_figures.panels(1, 2, 1.9)
     cells = zip(style.first_of(grid, len(scores)), scores.items(), strict=True)
     top = max(max(item.pit) for item in scores.values())
     for number, (axes, (title, item)) in enumerate(cells):
@@ -64,9 +57,9 @@ def _map_of_names(
     texts: NDArray[np.str_] | None = None,
 ) -> tuple[Figure, Axes, AxesImage]:  # fmt: skip
     """Return a figure with a map of square cells between names of effects."""
-    figure, ((axes,),) = panels(1, 1, 0.175 * len(rows) + 1.6)
+    figure, ((axes,),) = residual_figures.panels(1, 1, 0.175 * len(rows) + 1.6)
     words = ([name.replace("_", " ") for name in names] for names in (rows, columns))
-    image = heat_map(axes, values, (next(words), next(words)), norm, 55, texts)
+    image = residual_figures.heat_map(axes, values, (next(words), next(words)), norm, 55, texts)
     axes.set_aspect("equal", anchor="W")
     axes.tick_params(labelsize=6.5)
     return figure, axes, image
@@ -124,7 +117,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
     first = max(min(first, len(strongest.time) - MOST_TURNS), 0)
     stretch = slice(first, first + MOST_TURNS)
-    figure, rows = panels(len(parts), 3, 2.4 * len(parts) + 0.5, sharey=True)
+    figure, rows = residual_figures.panels(len(parts), 3, 2.4 * len(parts) + 0.5, sharey=True)
     for number, (row, (title, name)) in enumerate(zip(rows, parts, strict=True)):
         law = "law" if missing.law and name == "force" else ""
         for axes, (motion, label) in zip(row[:2], along, strict=True):
@@ -227,12 +220,12 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         names = [item.trial.name for item in before.trials if item.trial.held_out]
         scale = {"beside": WORDS.say("beside", names=names, both=after is not None)}
         if content.design is not None:
-            add("residual_map", planform_figure(before, after, content.design), **scale)
-        add("residual_table", heat_figure(before, after), **scale)
-        add("load", load_figure(before, after))
+            add("residual_map", residual_figures.planform_figure(before, after, content.design), **scale)
+        add("residual_table", residual_figures.heat_figure(before, after), **scale)
+        add("load", residual_figures.load_figure(before, after))
         with_effect = any(item.with_effect for item in verdict.windows)
         left = " The thin bars below are what the hypothesis leaves." if with_effect else ""
-        add("time_line", time_line_figure(verdict.windows), left=left)
+        add("time_line", residual_figures.time_line_figure(verdict.windows), left=left)
         if (worst := worst_record(before.trials)) is not None:
             trial = before.trials[worst.trial].trial
             role = "held out" if trial.held_out else "fitted"

@@ -12,7 +12,7 @@ from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import Backbone, backbones, predicted_frequencies
-from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
 from reporting import figures as style
 
 from .residual_figures import draw_noise, models, panels, size
@@ -112,10 +112,10 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
 def _spectrum(residuals: ResidualSet, channel: str) -> tuple[FloatArray, FloatArray] | None:
     """Return frequency [Hz] and power over that of the stated white noise, mean of the trials."""
     found: dict[float, list[tuple[FloatArray, FloatArray]]] = {}
-    for item in residuals.trials:
-        if not item.trial.is_dynamic or channel not in item.trial.channels or len(item.trial.time) < 32:
+    for item, column, _ in of_channel(residuals.trials, channel):
+        if not item.trial.is_dynamic or len(item.trial.time) < 32:
             continue
-        series = np.nan_to_num(item.standardised[:, item.column(channel)])
+        series = np.nan_to_num(item.standardised[:, column])
         count = min(len(series), 512)
         at, power = welch(series, 1.0 / item.trial.interval, nperseg=count, detrend="constant")
         found.setdefault(round(item.trial.interval * len(at), 9), []).append(
@@ -186,13 +186,12 @@ def _backbones(
     Points whose errors leave nothing to be seen are left out; NaN stands between ring-downs.
     """
     found: dict[int, list[list[FloatArray]]] = {}
-    for item in residuals.trials:
-        if item.trial.kind is not TrialKind.RINGDOWN or channel not in item.trial.channels:
+    for item, column, used in of_channel(residuals.trials, channel):
+        if item.trial.kind is not TrialKind.RINGDOWN:
             continue
-        column = item.column(channel)
         noise, values = float(item.noise_deviation[column]), item.prediction[:, column]
         if measured:
-            values = np.where(item.used[:, column], item.trial.values[:, column], values)
+            values = np.where(used, item.trial.values[:, column], values)
         try:
             curves = backbones(item.trial.time, values, list(frequencies), noise_deviation=noise)
         except FitError:

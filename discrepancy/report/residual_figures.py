@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
-from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
 from discrepancy.verdict import GapWindow
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import WingDesign
@@ -118,12 +118,9 @@ BELOW: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "t
 def size(trials: Sequence[FittedTrial], channel: str) -> float:
     """Return the rms residual of a channel over what noise would leave; nan where the fit absorbed it all."""
     left = expected = 0.0
-    for item in trials:
-        if channel in item.trial.channels:
-            column = item.column(channel)
-            used = item.used[:, column]
-            left += float(np.sum(item.standardised[used, column] ** 2))
-            expected += float(item.expected_variance[used, column].sum())
+    for item, column, used in of_channel(trials, channel):
+        left += float(np.sum(item.standardised[used, column] ** 2))
+        expected += float(item.expected_variance[used, column].sum())
     return float(np.sqrt(left / expected)) if expected >= 0.5 else float("nan")
 
 

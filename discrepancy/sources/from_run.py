@@ -14,16 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.result.file import load_calibration
-from discrepancy.campaign.records import (
-    USUAL_REGIONS,
-    Campaign,
-    Channel,
-    FloatArray,
-    NoiseRecord,
-    Quantity,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign import records
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError, said
 from discrepancy.models.structures import WingModel
 from fmu_asset.door.binding import load_binding
@@ -57,7 +48,7 @@ def run_campaign(
     first_turn: int | None = None,
     last_turn: int | None = None,
     held_out_share: float = HELD_OUT_SHARE,
-) -> Campaign:
+) -> records.Campaign:
     """Return the flight of a run folder as a campaign.
 
     Parameters
@@ -96,9 +87,9 @@ def run_campaign(
 
 def _campaign(
     folder: Path, turns: tuple[int | None, int | None], held_out_share: float, scenario: dict[str, Any]
-) -> Campaign:
+) -> records.Campaign:
     states = {item["name"] for item in scenario["state"]}
-    if scenario["observation"].get("role") != STRAIN or states != {*USUAL_REGIONS}:
+    if scenario["observation"].get("role") != STRAIN or states != {*records.USUAL_REGIONS}:
         raise CampaignFileError(said("runs.no_wing", folder=folder))
     if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
         raise CampaignDataError(said("runs.force", force=force, folder=folder))
@@ -122,10 +113,13 @@ def _campaign(
     temperature, known = _temperature(run, since, size)
     noise, source = _noise(scenario)
     channels = {
-        name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
+        name: records.Channel(
+            name, records.Quantity.STRAIN, f"strain[{name[1:]}]", records.NoiseRecord(noise, inf)
+        )
+        for name in names
     }
-    whole = Trial.plain(
-        "turns", TrialKind.FLIGHT, names, _ends(folder, observed["step"].values),
+    whole = records.Trial.plain(
+        "turns", records.TrialKind.FLIGHT, names, _ends(folder, observed["step"].values),
         values=np.where(used, strain, 0.0), used=used, temperature=temperature,
         load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
         run=str(run.attrs.get("scenario", "run")), health=np.asarray(smoothed["mean"].values, dtype=float),
@@ -137,7 +131,7 @@ def _campaign(
         trials.append(whole.rows(held, name="turns held out", held_out=True))
     lost = int(used.size - used.sum())
     be = "was" if lost == 1 else "were"
-    return Campaign(
+    return records.Campaign(
         name=str(run.attrs.get("title", folder.name)),
         channels=channels,
         trials=tuple(trials),
@@ -229,7 +223,7 @@ def _run(folder: Path) -> xr.DataTree:
     return run
 
 
-def _ends(folder: Path, turns: FloatArray) -> FloatArray:
+def _ends(folder: Path, turns: records.FloatArray) -> records.FloatArray:
     """Return when turns end [s]; each takes a second where the run has no binding of its own."""
     path = folder / BINDING_FILE
     with CampaignFileError.instead_of(FmuError, before="The binding of the run cannot be read: "):
@@ -238,7 +232,7 @@ def _ends(folder: Path, turns: FloatArray) -> FloatArray:
     return np.asarray(start + interval * (turns + 1.0))
 
 
-def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[FloatArray, bool]:
+def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[records.FloatArray, bool]:
     """Return temperatures less the reference [K], and whether they were recorded."""
     for group, name in product(("observed", "truth"), TEMPERATURE):
         if group in run.children and name in run[group]:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from fe.runtime.patch import ModelPatch, Primitive
@@ -108,7 +109,9 @@ def flight_of(
     return fly(knowledge.scenario, knowledge.twin(), plant, *sinks)
 
 
-def estimates_of(estimator: Estimator, seen: Any, controls: Sequence[int] | None = None) -> list[Estimate]:
+def estimates_of(
+    estimator: Estimator, seen: np.ndarray, controls: Sequence[int] | None = None
+) -> list[Estimate]:
     """Return what an estimator makes of turns, under their controls or always the first one."""
     estimates: list[Estimate] = []
     for turn, (row, control) in enumerate(zip(seen, controls or [0] * len(seen), strict=True)):

@@ -25,23 +25,8 @@ from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
 from discrepancy.sources.examples import example_campaign, plan_for
-from fe.runtime.patch import (
-    EVERY_CHANNEL,
-    SENSORS,
-    Clock,
-    DecayingLine,
-    FreePlay,
-    LoadGain,
-    LoggerClock,
-    ModelPatch,
-    PointMass,
-    PowerStiffness,
-    RunOffset,
-    SensorDrift,
-    SensorGain,
-    SensorRotation,
-    StiffnessDrift,
-)
+from fe.runtime import patch as patches
+from fe.runtime.patch import FreePlay, LoadGain, ModelPatch, PointMass, PowerStiffness, SensorGain
 from tests.discrepancy.rigs import INPUTS, asked, campaign, chosen, model_of, seen, setting_of
 
 pytestmark = pytest.mark.xdist_group("compiling")
@@ -127,7 +112,7 @@ def test_it_builds_over_its_whole_prior_and_its_shape_is_free_around_the_canonic
         values = {item.name: item.prior.value(u) for item in (*effect.parameters, *effect.shape)}
         patch = effect.patch(setting, values, place)
         assert ModelPatch.from_list(json.loads(json.dumps(patch.to_list()))) == patch
-        inside = [primitive for primitive in patch if not isinstance(primitive, SENSORS)]
+        inside = [primitive for primitive in patch if not isinstance(primitive, patches.SENSORS)]
         assert all(setting.model.supports(type(primitive)) for primitive in inside)
         assert all(0.0 <= item.station <= LENGTH for item in inside if isinstance(item, PointMass))
         if not any(isinstance(item, PowerStiffness) for item in inside):  # a load may be too much for these
@@ -160,7 +145,7 @@ def test_sizes_in_closed_form(setting):
     assert friction.coefficient == pytest.approx(most)  # more would hold it still, which no drag does
     drag = only(setting, "coulomb_friction", {**strong, "velocity_exponent": 2.0}, "root")
     assert drag.coefficient > 10.0 * most
-    coupling = only(setting, "high_pass", {"corner_ratio": 0.1}, EVERY_CHANNEL)
+    coupling = only(setting, "high_pass", {"corner_ratio": 0.1}, patches.EVERY_CHANNEL)
     assert 1.0 / coupling.time_constant == pytest.approx(0.1 * scales.angular_frequency)
     for skin, side, loss, lost in (("upper", -1, 0.2, 0.2), ("lower", 1, 2.0, 0.9)):
         crack = only(setting, "breathing_crack", {"stiffness_loss": loss}, f"root, {skin} skin")
@@ -174,19 +159,19 @@ def test_sizes_in_closed_form(setting):
     assert mode.cosine == pytest.approx(0.1, rel=1e-3)  # the tip is released from its largest reading
     values = {"cosine_ratio": 0.01, "sine_ratio": 0.0, "frequency_error": 0.0}
     hum = only(setting, "mains_hum", values, "50 Hz, all strain")
-    assert (hum.channel, hum.quantity, hum.frequency) == (EVERY_CHANNEL, "strain", 50.0)
+    assert (hum.channel, hum.quantity, hum.frequency) == (patches.EVERY_CHANNEL, "strain", 50.0)
     largest = max(float(np.max(np.abs(trial.values[:, 2]))) for trial in setting.campaign.trials)
     gap = FreePlay("root", pytest.approx(0.9 * root.static_stiffness), pytest.approx(0.1 * root.displacement))
     for identifier, values, place, primitive in (
         ("point_mass", {"mass_ratio": 0.01, "station_ratio": 1.0}, "",
          PointMass(pytest.approx(0.01 * scales.modal_mass), LENGTH)),
         ("free_play", {"gap_ratio": 0.1, "stiffness_share": 5.0}, "root", gap),
-        ("stiffness_drift", {"stiffness_change": 0.05}, "", StiffnessDrift(0.05 / scales.duration)),
+        ("stiffness_drift", {"stiffness_change": 0.05}, "", patches.StiffnessDrift(0.05 / scales.duration)),
         ("load_cell", {"gain_error": 0.02, "tare_ratio": 0.01}, "", LoadGain(0.02, pytest.approx(0.3))),
         ("seating_offset", {"offset_ratio": 0.02}, "B",
-         RunOffset("B", pytest.approx(0.02 * 30.0 / scales.tip_stiffness))),
+         patches.RunOffset("B", pytest.approx(0.02 * 30.0 / scales.tip_stiffness))),
         ("gauge_zero_drift", {"drift_ratio": 0.1}, "g1",
-         SensorDrift("g1", pytest.approx(0.1 * largest), scales.campaign_time)),
+         patches.SensorDrift("g1", pytest.approx(0.1 * largest), scales.campaign_time)),
     ):  # fmt: skip
         assert only(setting, identifier, values, place) == primitive
 
@@ -202,7 +187,7 @@ def test_observations_are_responses_through_the_sensors_of_a_patch(setting):
         return observe(setting.model, setting.campaign, trial, ModelPatch(items), given).values
 
     # clocks of patch and conditions add up
-    one = seen(ring, Clock(0.004, 0.001), clock=(0.001, 0.002))
+    one = seen(ring, patches.Clock(0.004, 0.001), clock=(0.001, 0.002))
     assert one == pytest.approx(seen(ring, clock=(0.005, 0.003)), rel=1e-12)
     assert np.abs(one - seen(ring)).max() > 1e-5
     # a turned gauge asks for components
@@ -211,7 +196,7 @@ def test_observations_are_responses_through_the_sensors_of_a_patch(setting):
     parts = tuple((f"{output}{part}", Quantity.STRAIN) for part in ("", *ACROSS))
     strains = setting.model.respond(pull, parts, ModelPatch(), Conditions(np.ones(1))).values
     assert np.abs(strains[-1]).min() > 1e-6
-    turned = seen(pull, SensorRotation("g0", 0.2))[:, pull.channels.index("g0")]
+    turned = seen(pull, patches.SensorRotation("g0", 0.2))[:, pull.channels.index("g0")]
     assert turned == pytest.approx(strains @ [c**2, s**2, s * c])
     # a decaying line scales with the release
     for initial in (np.zeros((0, 2)), np.array([[0.1, 0.0]])):
@@ -225,7 +210,7 @@ def test_observations_are_responses_through_the_sensors_of_a_patch(setting):
         seen(ring, SensorGain("g7", 0.2))
 
 
-LINE = DecayingLine("tip", 7.0, 0.01, 0.2, 0.0)
+LINE = patches.DecayingLine("tip", 7.0, 0.01, 0.2, 0.0)
 
 
 # ---------------------------------------------------------------- mains and sampling
@@ -327,7 +312,7 @@ def test_each_logger_may_have_a_wrong_clock(loggers, places, motion):
     assert shared.places(setting) == places
     assert (own.unavailable(setting) is None) is motion
     patch = shared.patch(setting, {"rate_error": 4e-3}, places[0])
-    assert patch == ModelPatch((LoggerClock(places[0] or "*", 4e-3),))
+    assert patch == ModelPatch((patches.LoggerClock(places[0] or "*", 4e-3),))
 
 
 # ---------------------------------------------------------------- pages

@@ -16,15 +16,8 @@ from discrepancy.checks.quality import _freedom, check_data, clipped_run
 from discrepancy.errors import ModelError
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import ExamplePlan, example_campaign, plan_for, write_example
-from fe.runtime.patch import (
-    HighPass,
-    ModelPatch,
-    PointMass,
-    PowerDamping,
-    RootCompliance,
-    SensorDrift,
-    SensorGain,
-)
+from fe.runtime import patch as patches
+from fe.runtime.patch import ModelPatch, SensorGain
 from tests.discrepancy.core import kit
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
@@ -85,8 +78,8 @@ def campaign():
 def test_sound_data_have_no_fault(seed):
     for patch in (
         ModelPatch(),
-        ModelPatch((SensorGain("g0", 0.15), SensorDrift("g1", 2e-5, 5000.0))),
-        ModelPatch((SensorGain("*", -0.2, "strain"), HighPass("x", 2.0))),
+        ModelPatch((SensorGain("g0", 0.15), patches.SensorDrift("g1", 2e-5, 5000.0))),
+        ModelPatch((SensorGain("*", -0.2, "strain"), patches.HighPass("x", 2.0))),
     ):
         campaign = example_campaign(CANTILEVER, "complete", seed, PLAN, patch)
         assert campaign.channels["g0"].noise.degrees_of_freedom == 399
@@ -111,10 +104,10 @@ def test_examples_are_sound_and_repeat_whatever_effect_they_hide(tmp_path, seed)
     force = 0.05 * scales.ports["joint"].stiffness * scales.ports["joint"].displacement
     for items in (
         (),
-        (PointMass(0.3 * scales.modal_mass, 0.6),),
-        (RootCompliance(0.3 / scales.tip_stiffness / 0.36),),
-        (PowerDamping("joint", force, 0.0, 0.0, 1.0, 1.0),),
-        (SensorGain("base_strain", -0.15), HighPass("x3", 0.5)),
+        (patches.PointMass(0.3 * scales.modal_mass, 0.6),),
+        (patches.RootCompliance(0.3 / scales.tip_stiffness / 0.36),),
+        (patches.PowerDamping("joint", force, 0.0, 0.0, 1.0, 1.0),),
+        (SensorGain("base_strain", -0.15), patches.HighPass("x3", 0.5)),
     ):
         campaign = example_campaign(chain, "laboratory", seed, plan, ModelPatch(items))
         assert [fault for fault in check_data(campaign) if fault.fatal or not items] == []

@@ -15,19 +15,9 @@ from pydantic import TypeAdapter
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.document import PRIMITIVE_UNITS, shipped_schema
 from discrepancy.errors import VerdictFileError
+from discrepancy.files import verdict as files
 from discrepancy.files.residuals import read_residuals, write_residuals
-from discrepancy.files.verdict import (
-    PATCH_SCHEMA,
-    VERDICT_SCHEMA,
-    StoredPatch,
-    StoredVerdict,
-    patch_effects,
-    primitive_intervals,
-    read_patch,
-    write_patch,
-    write_verdict,
-)
-from discrepancy.files.verdict import read_verdict_file as read_verdict
+from discrepancy.files.verdict import StoredPatch, patch_effects, read_patch, write_patch, write_verdict
 from discrepancy.judgement.proof import prove
 from discrepancy.verdict import VerdictKind
 from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness, Window
@@ -40,7 +30,7 @@ INPUTS = Inputs(__file__)
 FITTED = Bench(amplitudes=(200.0, 150.0), held_out=(False, True)).fit(np.random.default_rng(7))
 GOLDEN = INPUTS.folder / "verdict.json"
 """A verdict with one of everything, written by this version."""
-STORED = read_verdict(GOLDEN)
+STORED = files.read_verdict_file(GOLDEN)
 VERDICT, ORIGIN = STORED.verdict, STORED.origin
 FRICTION, MASS = VERDICT.effects
 (STIFFNESS,) = VERDICT.parameters
@@ -62,7 +52,7 @@ def test_a_verdict_comes_back_equal(tmp_path):
     assert again.read_bytes() == GOLDEN.read_bytes()
     proof = prove(FITTED, FITTED)
     for number, content in enumerate((proof, replace(proof, held_out_before=None))):
-        back = read_verdict(write_verdict(tmp_path / f"{number}.json", VERDICT, content, ORIGIN))
+        back = files.read_verdict_file(write_verdict(tmp_path / f"{number}.json", VERDICT, content, ORIGIN))
         assert same(back.verdict, VERDICT)
         assert same(back.proof, content)
         assert back.origin == ORIGIN
@@ -144,7 +134,7 @@ def json_schema(record, schema):
 
 @pytest.mark.parametrize(
     ("name", "document", "schema"),
-    [("verdict", StoredVerdict, VERDICT_SCHEMA), ("patch", StoredPatch, PATCH_SCHEMA)],
+    [("verdict", files.StoredVerdict, files.VERDICT_SCHEMA), ("patch", StoredPatch, files.PATCH_SCHEMA)],
 )
 def test_the_shipped_schema_is_that_of_the_records_and_every_key_in_the_page(name, document, schema):
     shipped = shipped_schema(name)
@@ -171,9 +161,9 @@ def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_
         assert old in whole
         path.write_text(whole.replace(old, new, 1), encoding="utf-8")
         with refused(VerdictFileError, words):
-            read_verdict(path)
+            files.read_verdict_file(path)
     with refused(VerdictFileError, "There is no file"):
-        read_verdict(tmp_path / "nothing.json")
+        files.read_verdict_file(tmp_path / "nothing.json")
     path.write_text(whole, encoding="utf-8")
     with refused(VerdictFileError, "'uav-twin verdict 4', but 'uav-twin patch 2' is needed"):
         read_patch(path)
@@ -188,7 +178,7 @@ def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_
         patch_effects((FRICTION, MASS), ((),))
     other = ModelPatch((Line("g1", 50.0, 1.0, 0.0),))
     with refused(VerdictFileError, "Draw 1 of the posterior has the primitives line"):
-        primitive_intervals(MASS.patch, (other,))
+        files.primitive_intervals(MASS.patch, (other,))
 
 
 # ---------------------------------------------------------------- residuals
@@ -253,6 +243,6 @@ def test_files_of_earlier_numbers_are_read(number, tmp_path):
     told = VERDICT if number == 3 else replace(
         VERDICT, hypotheses=tuple(replace(item, parameters=()) for item in VERDICT.hypotheses)
     )  # fmt: skip
-    found = read_verdict(path)
+    found = files.read_verdict_file(path)
     assert same(found.verdict, replace(told, **later))
     assert found.origin == (ORIGIN if number == 3 else replace(ORIGIN, model_file=None))

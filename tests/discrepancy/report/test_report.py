@@ -42,15 +42,8 @@ from discrepancy.report.text import (
 )
 from discrepancy.verdict import ExplainedShare, NotFitted, RemainderEstimate, Verdict, VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
-from fe.runtime.patch import (
-    ModelPatch,
-    Overflow,
-    PointMass,
-    PowerDamping,
-    PowerStiffness,
-    SensorDrift,
-    SensorGain,
-)
+from fe.runtime import patch as patches
+from fe.runtime.patch import PowerDamping, SensorDrift
 from fe.wing.design import load_design
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_svg
@@ -294,20 +287,20 @@ def test_gauges_lie_where_the_design_has_them():
     [
         ("rig", PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
         ("rig", PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
-        ("rig", PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3 N at 0.01 m"),
-        ("rig", PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
-        ("rig", SensorGain("displacement", 0.02), ""),
+        ("rig", patches.PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3 N at 0.01 m"),
+        ("rig", patches.PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
+        ("rig", patches.SensorGain("displacement", 0.02), ""),
         ("rig", SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
         ("rig", SensorDrift("leaf_strain", 0.002, 10.0), ""),
         ("rig", PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N or N m"),
         ("tank", PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0), "flow 0.500 m/s times capacity at 2 m"),
-        ("tank", Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3 m"),
+        ("tank", patches.Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3 m"),
         ("wing", PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
         ("wing", PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
     ],
 )
 def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, coarse_patch_arrays, kind, primitive, text):
-    patch = ModelPatch((primitive,))
+    patch = patches.ModelPatch((primitive,))
     others = {"tank": lambda: tank_setting().model, "wing": lambda: WingModel(coarse_patch_arrays)}
     model = others.get(kind, lambda: drag.model)()
     found = si_sizes(patch, primitive_intervals(patch), model, drag.campaign)

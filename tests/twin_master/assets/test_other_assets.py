@@ -3,6 +3,7 @@
 import re
 import shutil
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -299,7 +300,7 @@ def mission(file: Path, **changes: Any) -> LoadedScenario:
 
 
 @pytest.fixture(scope="module")
-def file(write_beam: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_beam(tmp_path_factory.mktemp("beam"), TWO)
 
 

@@ -4,7 +4,6 @@ import pickle
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -151,7 +150,9 @@ def test_own_policy_planner_sensor_model_and_estimator(knowledge, seen):
     class Counting(ExactFilter):
         """An estimator that learns: it carries a figure from turn to turn beside the belief."""
 
-        def turn(self, before: Any, observation: np.ndarray, control_index: int, turn: int) -> Estimate:
+        def turn(
+            self, before: Carried | None, observation: np.ndarray, control_index: int, turn: int
+        ) -> Estimate:
             estimate = super().turn(before, observation, control_index, turn)
             count = 1.0 if before is None else float(before.arrays["count"]) + 1.0
             carried = Carried(control_index, {**estimate.carried.arrays, "count": np.array(count)})

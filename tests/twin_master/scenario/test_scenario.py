@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -172,7 +173,9 @@ def test_a_kind_of_one_s_own_is_one_class(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def folder(library_file: Path, make_calibration: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(
+    library_file: Path, make_calibration: Callable[..., Calibrated], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """What scenarios and options name: a library, another wing, hidden effects, a calibration, half of it."""
     place = tmp_path_factory.mktemp("given")
     shutil.copy(library_file, place / "UAVconfig.json")
@@ -185,6 +188,7 @@ def folder(library_file: Path, make_calibration: Any, tmp_path_factory: pytest.T
 
 BOUND, BELIEF = 'binding = "uav_wing"\n', '[belief]\nkind = "design"\ndesign = "uav_wing"\n'
 FLOWN_PATCH, OTHER = (BOUND, f'{BOUND}patch = "p.json"\n'), ('design = "uav_wing"', 'design = "other.toml"')
+HIDDEN = ("factor = 1.0073 }", 'factor = 1.0073, "effect.hiden.active" = 0 }')
 OF_CALIBRATION, DRAWN = ('design = "uav_wing"', 'design = "calibration"'), 'source = "static_test"'
 LIBRARY, WING = {"strain_library": "UAVconfig.json"}, {"asset/binding.toml", "asset/flown_design.toml"}
 FILE, TAILORED = {"calibration": "wing 7.nc"}, {"asset/binding.toml", "asset/calibration.nc"}
@@ -263,6 +267,8 @@ def test_what_options_change_and_what_stays_the_scenarios(folder):
         ("three_fmus", (OF_CALIBRATION,), {}, "the design of a calibration is asked for, and there is no"),
         ("level_turns", (), {"calibration": "half.nc"}, "damaged"),
         ("level_turns", (), {"calibration": "none.nc"}, "not there"),
+        ("level_turns", ((BOUND, f'{BOUND}patch = "q.json"\n'),), {}, r"q\.json cannot be read"),
+        ("level_turns", (FLOWN_PATCH, HIDDEN), {}, r"effect\.hiden\.active"),
         ("level_turns", (FLOWN_PATCH,), {"fmu": "x.fmu"}, r"`asset\.patch` goes into the FMU"),
         ("model_mismatch", (), {"fmu": "x.fmu"}, "binding"),
         ("three_fmus", (), {"fmu": "x.fmu"}, "the scenario couples several"),

@@ -3,12 +3,11 @@
 import csv
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.twin_master.runs import changed_scenario, flight_of, of_library, table_of
+from tests.twin_master.runs import flight_of, loaded_from, of_library, table_of
 from twin_master.errors import InvalidModelError, RunFolderError
 from twin_master.fleet.store import in_credible_set
 from twin_master.network.twin import build_graphical_model
@@ -72,7 +71,7 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
 
 
 def test_tables_are_in_the_units_of_their_headers(result):
-    texts = tables_of(groups_of(result), "strain")
+    texts = tables_of(groups_of(result), result.scenario.observation)
     tables = {name: [*csv.DictReader(text.splitlines())] for name, text in texts.items()}
     health, observed = tables["health"], tables["observed"]
     assert [float(row["z1_true_percent"]) for row in health[8:13]] == [0, 0, 2, 4, 6]
@@ -122,12 +121,12 @@ def test_fallback(gentle, truth, delay, early):
 @pytest.mark.parametrize("unit", [1.0, 1e-13, 1e9])
 def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
     """History, fallback and credible sets of leaks of square millimetres, told in square metres, too."""
-    changes: dict[str, Any] = {"state": table_of("level_turns")["state"], "truth": {"gains": []}}
-    for factor in changes["state"]:
+    table = table_of("level_turns")
+    for factor in table["state"]:
         factor["levels"] = [unit * level / 100 for level in factor.pop("levels_percent")]
-    for gain in table_of("level_turns")["truth"]["gains"]:
-        changes["truth"]["gains"].append(gain | {"gain": unit * gain.pop("gain_percent") / 100})
-    scenario = changed_scenario("level_turns", changes).scenario
+    for gain in table["truth"]["gains"]:
+        gain["gain"] = unit * gain.pop("gain_percent") / 100
+    scenario = loaded_from(table, "level_turns").scenario
     model, truth = build_graphical_model(scenario), scenario.scripted_history()
     np.testing.assert_allclose(truth, unit * SCENARIO.scripted_history(), rtol=1e-12)
     assert find_fallback(model.states, POLICY, 1, controls(40), truth).called_for_step == 30

@@ -92,7 +92,9 @@ def test_every_number_is_that_of_the_run(run):
     np.testing.assert_array_equal(flight.truth(flight.seen(0, TURNS)), stored["truth"]["state"].values)
 
 
-def test_turns_are_seen_once_their_lines_are_whole_and_forgotten_where_taken_back(begun, lines):
+def test_turns_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_they_are_taken_back(
+    begun, lines
+):
     """A line that was changed ends the view with its number."""
     flight = Flight(begun)
     assert not flight.update()

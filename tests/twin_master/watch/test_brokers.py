@@ -172,7 +172,9 @@ def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watc
     assert [decision["turn"] for decision in sent] == [0, 1, 2, 1, 2]
 
 
-def test_an_orderly_end_and_a_watch_in_place_of_another(scenario, base, watch, broker, tmp_path, monkeypatch):
+def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
+    scenario, base, watch, broker, tmp_path, monkeypatch
+):
     publisher, notes = broker.client("publisher"), list[str]()
 
     def watched(watch: Watch, turns: int, *sent: int) -> Counts:

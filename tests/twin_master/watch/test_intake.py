@@ -74,7 +74,9 @@ def same(first: Twin, second: Twin) -> bool:
     return first.save_state() == second.save_state()
 
 
-def test_late_doubled_and_garbled_messages_end_as_clean_ones(knowledge, strains, clean, expected, tmp_path):
+def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
+    knowledge, strains, clean, expected, tmp_path
+):
     chance = random.Random(5)
     order = sorted(range(TURNS), key=lambda turn: turn + (chance.random() < 0.2) * chance.randint(1, 15))
     lines: list[bytes] = []
@@ -154,7 +156,9 @@ def test_anything_is_an_observation_or_refused(content):
     assert isinstance(found, Refused) or not np.isinf(found.observed).any()
 
 
-def test_a_flood_and_messages_of_ten_megabytes_are_counted(knowledge, clean, expected, tmp_path, monkeypatch):
+def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
+    knowledge, clean, expected, tmp_path, monkeypatch
+):
     monkeypatch.setattr("twin_master.watch.intake.REJECTED_KEPT", 50)
     big = b'{"strain_1": "' + b"x" * 10_000_000 + b'"}\n'
     deep = b'{"strain": ' + b"[" * (LARGEST_MESSAGE // 4) + b"\n"
@@ -177,7 +181,9 @@ JITTERED = [time + 0.1 * (turn % 3 - 1) for turn, time in enumerate(RIGHT)]
 @pytest.mark.parametrize(
     "times", [[0.0, *RIGHT[1:]], [1.7e308, *RIGHT[1:]], [1.7e9, 4e9, *RIGHT[2:]], JITTERED]
 )  # the first three of a clock that was not yet set
-def test_times_stand_for_turns_and_a_clock_that_is_set_late_spoils_none(knowledge, strains, clean, times):
+def test_times_stand_for_turns_and_a_clock_that_is_set_after_the_first_spoils_none(
+    knowledge, strains, clean, times
+):
     section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
     timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
 

@@ -338,7 +338,9 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     assert "60 messages." in again.stderr
 
 
-def test_a_watch_is_opened_and_taken_up_from_python(scenario, base, mission, recorded, whole, tmp_path):
+def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
+    scenario, base, mission, recorded, whole, tmp_path
+):
     folder, decisions, opened = tmp_path / "watch", list[dict[str, object]](), []
 
     def decide(decision: Mapping[str, object]) -> None:
