@@ -231,6 +231,11 @@ def test_noise_without_a_record_is_what_the_fit_leaves():
     left = Remainder(*(size * np.ones(3) for size in (500.0, 5.0, 1.0, 0.0)), np.zeros(3, dtype=bool))
     for item in residual_set(unknown, replace(kit.fitted(unknown), remainder=left)).trials:
         assert np.all(item.predictive_deviation < 1.5 * item.noise_deviation)
+    apart = held_out_problem(5, noise=None)
+    for item in residual_set(apart, kit.fitted(apart)).trials:  # the same in trials that were held out
+        own = dict(zip(item.trial.channels, item.noise_deviation / item.trial.noise_factor, strict=True))
+        told = own if item.trial.name == "up" else told
+        assert own == pytest.approx({name: told[name] for name in own})
 
 
 def test_held_out_trials_move_nothing_that_is_shared():
