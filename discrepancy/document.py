@@ -18,9 +18,10 @@ from pydantic import PlainValidator, TypeAdapter, ValidationError, WithJsonSchem
 from discrepancy.errors import VerdictFileError
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
-from reporting.files import Provenance, atomic_write_text
+from reporting.files import atomic_write_text
 from reporting.json_file import plain as json_of
 from reporting.json_file import read_json
+from reporting.provenance import Provenance
 
 PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in PRIMITIVES.items()}
 """Unit of every real parameter of every primitive (translational or rotational port: the first or second)."""

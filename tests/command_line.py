@@ -35,6 +35,20 @@ def command(*words: object, columns: str = "200") -> subprocess.CompletedProcess
     return subprocess.CompletedProcess(words, code, said.getvalue(), complained.getvalue())
 
 
+class Terminal(io.StringIO):
+    """What is typed, or seen, at a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def seen(*words: object) -> str:
+    """Run `uav-twin` at a terminal, which must end well; return what people see there."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(Terminal()) as screen:
+        assert call(patch, *words) == 0
+    return screen.getvalue()
+
+
 def said(*words: object) -> str:
     """Run `uav-twin`, which must end well; return what it said."""
     done = command(*words)

@@ -11,10 +11,11 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_text, collect_provenance, remove_leftovers, write_members
+from reporting.files import atomic_write_text, remove_leftovers, write_members
 from reporting.folders import held, lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress
+from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError, said
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario

@@ -133,9 +133,9 @@ from reporting.figures import publication_style as publication_style
 from reporting.figures import save_figure as save_figure
 from reporting.figures import to_png as to_png
 from reporting.figures import to_svg as to_svg
-from reporting.files import collect_provenance as collect_provenance
 from reporting.files import hash_file as hash_file
 from reporting.json_file import plain as plain
+from reporting.provenance import collect_provenance as collect_provenance
 from reporting.table_file import table_text as table_text
 from reporting.toml_file import read_toml as read_toml
 from twin_master.assets.resolution import Overrides as Overrides

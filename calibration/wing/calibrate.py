@@ -39,9 +39,9 @@ from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
 from reporting.arrays import Float
-from reporting.files import collect_provenance
 from reporting.page import Page, Words
 from reporting.progress import Progress, reporter, stage
+from reporting.provenance import collect_provenance
 from reporting.words import brief, capital, plus_minus
 
 NOTICEABLE = 2.0

@@ -36,10 +36,11 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show. The noise
     of channels without a record is what the fitted trials leave of them.
     """
-    fitted = _predicted(problem, found, found, sensitivities=sensitivities)
+    precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(found.sums))
+    fitted = _predicted(problem, found, found, precision, sensitivities=sensitivities)
     if problem.campaign.held_out:
         there, adapted = held_out_fit(problem, found)
-        fitted += _predicted(there, found, adapted)
+        fitted += _predicted(there, found, adapted, precision)
     trials = {item.trial.name: item for item in fitted}
     return ResidualSet(
         problem.campaign.channels,
@@ -55,14 +56,17 @@ def held_out_fit(problem: Problem, found: CandidateFit) -> tuple[Problem, Candid
 
 
 def _predicted(
-    problem: Problem, found: CandidateFit, adapted: CandidateFit, *, sensitivities: bool = False
-) -> list[FittedTrial]:
-    """Return trials beside their predictions, by what was found and its nuisances as adapted to them."""
+    problem: Problem, found: CandidateFit, adapted: CandidateFit, precision: FloatArray, *,
+    sensitivities: bool = False,
+) -> list[FittedTrial]:  # fmt: skip
+    """Return trials beside their predictions, by what was found and its nuisances as adapted to them.
+
+    `precision` (channels,) is that of the noise of the fitted trials over the recorded one.
+    """
     root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
     at, items = len(root), []
     total = at + sum(data.unknowns.size for data in problem.trials)
     counted = float(found.remainder is None)
-    precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(found.sums))
     for number, data in enumerate(problem.trials):
         item = trial_rows(problem, number, adapted, adapted.candidate, precision)
         deviation = data.deviation / np.sqrt(precision[data.groups])

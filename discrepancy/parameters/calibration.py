@@ -21,8 +21,8 @@ from discrepancy.parameters.posterior import ParameterPosterior, parameter_poste
 from discrepancy.search.honest_evidence import left_by
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
-from reporting.files import collect_provenance
 from reporting.progress import Progress, reporter
+from reporting.provenance import collect_provenance
 from reporting.words import counted, small
 
 SAMPLES = 1000

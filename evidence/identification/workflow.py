@@ -10,9 +10,10 @@ import numpy as np
 
 from fe.wing.design import WingDesign, load_design
 from reporting.errors import FileNotWrittenError
-from reporting.files import atomic_write_text, collect_provenance
+from reporting.files import atomic_write_text
 from reporting.json_file import plain
 from reporting.progress import Progress, SilentProgress
+from reporting.provenance import collect_provenance
 
 from .comparison import compare, outputs
 from .design_file import design_toml

@@ -21,7 +21,7 @@ from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
-from reporting.files import collect_provenance
+from reporting.provenance import collect_provenance
 from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]

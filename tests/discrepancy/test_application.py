@@ -31,7 +31,7 @@ from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.archive.fmu_file import read_fmu
 from reporting.errors import FileNotWrittenError
-from reporting.files import collect_provenance
+from reporting.provenance import collect_provenance
 from tests import command_line
 from tests.discrepancy.core.kit import problem_of
 from tests.discrepancy.rigs import chosen, fmu_rig, hiding, simulated

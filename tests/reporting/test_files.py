@@ -26,7 +26,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from reporting import files, netcdf
+from reporting import files, netcdf, provenance
 from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
 from reporting.json_file import plain
 from reporting.memory import Memory
@@ -272,9 +272,9 @@ def test_the_fork_holds_no_file_of_this_process(path, monkeypatch):
 
 
 def test_a_record_names_versions_and_sources_and_no_machine():
-    def collected(**hashes: str) -> files.Provenance:
+    def collected(**hashes: str) -> provenance.Provenance:
         names = ["numpy", "no-such-distribution"]
-        return files.collect_provenance(7, input_hashes=hashes, distributions=names)
+        return provenance.collect_provenance(7, input_hashes=hashes, distributions=names)
 
     record = collected(z="1", a="2")
     assert record == collected(a="2", z="1")
@@ -284,11 +284,11 @@ def test_a_record_names_versions_and_sources_and_no_machine():
     assert told["versions"] == {"numpy": np.__version__, "no-such-distribution": "not installed"}
     assert (told["seed"], list(told["input_hashes"])) == (7, ["a", "z"])
     assert {len(value) for value in told["source_hashes"].values()} == {64}
-    assert len({*told["source_hashes"].values()}) == len(files.SOURCE_PACKAGES)
+    assert len({*told["source_hashes"].values()}) == len(provenance.SOURCE_PACKAGES)
     assert "/" not in json.dumps(told)
     assert socket.gethostname() not in json.dumps(told)
     with pytest.raises(ValueError, match="no package"):
-        files.source_hash("no_such_package")
+        provenance.source_hash("no_such_package")
 
 
 def test_hashes_see_names_and_contents_but_neither_line_ends_nor_order(tmp_path):

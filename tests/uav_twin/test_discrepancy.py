@@ -1,6 +1,5 @@
 """`uav-twin discrepancy` as a user calls it: import, with a terminal and without, example, check and run."""
 
-import io
 import itertools
 import json
 import re
@@ -19,7 +18,7 @@ from discrepancy.files.verdict import read_patch, read_verdict_file
 from discrepancy.model_choice import choose_model
 from discrepancy.sources.examples import example_campaign, plan_for
 from tests import command_line
-from tests.command_line import command, refused, said
+from tests.command_line import Terminal, command, refused, said
 
 MODEL = "single_mass_rig"
 RIG = ("--model", MODEL)
@@ -167,13 +166,6 @@ def test_the_documented_files_print_the_documented_tables():
 
 
 # ---------------------------------------------------------------- a terminal
-
-
-class Terminal(io.StringIO):
-    """What is typed, or seen, at a terminal."""
-
-    def isatty(self) -> bool:
-        return True
 
 
 def in_a_terminal(answers: list[str], *words: object) -> tuple[int, str]:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from reporting.files import (
     atomic_write_text,
-    collect_provenance,
     hash_record,
     members_of,
     write_members,
@@ -21,6 +20,7 @@ from reporting.files import (
 from reporting.folders import held
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
+from reporting.provenance import collect_provenance
 from twin_master import run_folder
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source

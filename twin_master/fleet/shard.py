@@ -25,8 +25,9 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.files import collect_provenance, hash_record, write_members
+from reporting.files import hash_record, write_members
 from reporting.progress import Progress, SilentProgress
+from reporting.provenance import collect_provenance
 from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.reduced_model import ReducedModelSource

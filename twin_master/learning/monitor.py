@@ -279,14 +279,14 @@ class WatchfulEstimator:
         log_model, known = rivals.weigh_model(
             shown, own["model_squares"], own["model"].reshape(-1), log_likelihood
         )
-        of_model = before, known, log_likelihood
+        of_model = rivals.OfModel(before, known, log_likelihood)
         gauges = own["gauge"].reshape(-1, len(size))
         with np.errstate(divide="ignore"):  # what is ruled out has the logarithm minus infinity
             log_gauges = rivals.weigh_gauges(
-                shown, self._gains, self._reach, *of_model, gauges, own["gauge_squares"], own["gauge_sums"]
+                shown, of_model, self._gains, self._reach, gauges, own["gauge_squares"], own["gauge_sums"]
             )
             log_none = rivals.weigh_none(
-                shown, self._settings.all_gain, *of_model, own["none"].reshape(-1), own["none_statistics"]
+                shown, of_model, self._settings.all_gain, own["none"].reshape(-1), own["none_statistics"]
             )
         own["log_gauge"] += log_gauges - log_model
         own["log_none"] += log_none - log_model

@@ -10,6 +10,7 @@ belief of each turn given the hypothesis.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
@@ -21,6 +22,31 @@ LARGE = 1e100
 """A product is taken to the logarithm above this."""
 NEGLIGIBLE = -70.0
 """States this many nats below the best of a hypothesis add nothing that doubles can hold."""
+
+
+class Compared(NamedTuple):
+    """One observation beside what each draw predicts in each state, and what may be learnt of the gauges.
+
+    Attributes
+    ----------
+    seen : (G,)
+        SI; NaN where a sensor is lost.
+    draw : (K,)
+        Of each hypothesis.
+    value : (E, S, G)
+        Predictions of each draw, SI.
+    inverse : (S, G)
+        Of the assumed standard deviation.
+    offset, gain : (G,)
+        Those of `GaugeRegression`.
+    """
+
+    seen: Float
+    draw: Index
+    value: Float
+    inverse: Float
+    offset: Float
+    gain: Float
 
 
 @dataclass(frozen=True)
@@ -72,14 +98,8 @@ class GaugeRegression:
 
         Parameters
         ----------
-        seen : (G,)
-            SI; NaN where a sensor is lost.
-        draw : (K,)
-            Of each hypothesis.
-        value : (E, S, G)
-            Predictions of each draw, SI.
-        inverse : (S, G)
-            Of the assumed standard deviation.
+        seen, draw, value, inverse
+            As `Compared` has them.
         statistics : (K, G, 6)
         count : (G,)
             Of the observations before.
@@ -93,9 +113,8 @@ class GaugeRegression:
         result = np.empty((len(draw), value.shape[1]))
         result[:] = np.sum(density, axis=-1, where=there)[..., None]
         result += np.log(inverse[:, there]).sum(axis=1)
-        _add_densities(
-            seen, draw, value, inverse, self.offset, self.gain, fitted, self.degrees, count, result
-        )
+        shown = Compared(seen, draw, value, inverse, self.offset, self.gain)
+        _add_densities(shown, fitted, self.degrees, count, result)
         return result
 
     def told(self, seen: Float, draw: Index, value: Float, inverse: Float, log_weight: Float) -> Float:
@@ -105,28 +124,18 @@ class GaugeRegression:
         constant of it.
         """
         result = np.zeros((len(draw), len(seen), 6))
-        _expect(seen, draw, value, inverse, self.offset, self.gain, log_weight, result)
+        _expect(Compared(seen, draw, value, inverse, self.offset, self.gain), log_weight, result)
         return result
 
 
 @compiled
-def _add_densities(
-    seen: Float,
-    draw: Index,
-    value: Float,
-    inverse: Float,
-    offset: Float,
-    gain: Float,
-    fitted: Float,
-    degrees: float,
-    count: Float,
-    result: Float,
-) -> None:
+def _add_densities(shown: Compared, fitted: Float, degrees: float, count: Float, result: Float) -> None:
     """Add to result (K, S) what the densities of all gauges have of the state.
 
     Factors are multiplied, those of Student's densities of the same degrees, before a logarithm is taken,
     which is what costs.
     """
+    seen, draw, value, inverse, offset, gain = shown
     for k in range(result.shape[0]):
         for s in range(result.shape[1]):
             total, product, half, wide = 0.0, 1.0, 0.0, 1.0
@@ -150,17 +159,9 @@ def _add_densities(
 
 
 @compiled
-def _expect(
-    seen: Float,
-    draw: Index,
-    value: Float,
-    inverse: Float,
-    offset: Float,
-    gain: Float,
-    log_weight: Float,
-    result: Float,
-) -> None:
+def _expect(shown: Compared, log_weight: Float, result: Float) -> None:
     """Add to result (K, G, 6) the products of a, c and x of each gauge, expected over the state."""
+    seen, draw, value, inverse, offset, gain = shown
     weight = np.empty(log_weight.shape[1])
     for k in range(len(draw)):
         best = np.max(log_weight[k])

@@ -50,6 +50,14 @@ class Shown(NamedTuple):
     degrees: float
 
 
+class OfModel(NamedTuple):
+    """What an observation says of the model: its squares (G,) before, and what `weigh_model` returns."""
+
+    squares: Float
+    known: Float
+    log_likelihood: Float
+
+
 def mix_onset(
     model: Float, belief: Single, log_weight: Float, log_inflow: float, turn: float, onset: Float
 ) -> Float:
@@ -91,23 +99,15 @@ def weigh_model(shown: Shown, squares: Float, belief: Float, log_likelihood: Flo
 
 @compiled
 def weigh_gauges(
-    shown: Shown,
-    gains: Float,
-    reach: Float,
-    squares_of_model: Float,
-    known: Float,
-    log_likelihood: Float,
-    belief: Single,
-    squares: Float,
-    sums: Float,
+    shown: Shown, model: OfModel, gains: Float, reach: Float, belief: Single, squares: Float, sums: Float
 ) -> Float:
     """Assimilate one observation under the rivals "gauge g shows 1 + gains[k] times what is there".
 
     The gain is learnt within gains[k] ± reach[k], its prior standard deviation, by the sums c² and cx of a
-    regression, sums (G, K, 2). squares_of_model (G,) are those before the observation; known and
-    log_likelihood are of the model. belief (G K, N), squares (G, K) and sums are brought up to date;
-    returned is the log evidence (G, K).
+    regression, sums (G, K, 2). belief (G K, N), squares (G, K) and sums are brought up to date; returned is
+    the log evidence (G, K).
     """
+    squares_of_model, known, log_likelihood = model
     there, residual, size, power, degrees = shown
     result, weight = np.empty_like(squares), np.empty(len(log_likelihood))
     for rival in range(len(belief)):
@@ -146,15 +146,7 @@ def weigh_gauges(
     return result
 
 
-def weigh_none(
-    shown: Shown,
-    gain: float,
-    squares_of_model: Float,
-    known: Float,
-    log_likelihood: Float,
-    belief: Single,
-    statistics: Float,
-) -> float:
+def weigh_none(shown: Shown, model: OfModel, gain: float, belief: Single, statistics: Float) -> float:
     """Assimilate one observation under the rival that some gauges have gains of their own; return its log.
 
     Which ones is not known: the predictive density of each gauge is a mixture of that without a gain and that
@@ -167,18 +159,18 @@ def weigh_none(
     if not place.size:
         return -np.inf
     free, plain, cc, cx, squares = statistics.T.copy()
-    x, c, known = shown.residual[place], gain * shown.size[place], known[place]
+    x, c, known = shown.residual[place], gain * shown.size[place], model.known[place]
     unknown = 1.0 / (1.0 + cc)
     innovation, wide = x - c * unknown * cx, 1.0 + c**2 * unknown
 
     def log_ratio(squared: Float, left: Float) -> Float:
-        constant = 0.5 * np.log((shown.degrees + squares_of_model) / left) * shown.there
+        constant = 0.5 * np.log((shown.degrees + model.squares) / left) * shown.there
         return np.asarray(constant + shown.power * np.log(known / (1.0 + squared / left)))
 
     free = free.clip(0.0, 1.0)  # rounding takes it above one
     with_gain = np.log(free) + log_ratio(innovation**2 / wide, shown.degrees + squares) - 0.5 * np.log(wide)
     both = np.logaddexp(with_gain, np.log1p(-free) + log_ratio(x**2, shown.degrees + plain))
-    log_value = log_likelihood[place] + both.sum(axis=1)
+    log_value = model.log_likelihood[place] + both.sum(axis=1)
     best = log_value.max()
     weight = belief[place] * np.exp(log_value - best)
     mass = weight.sum()

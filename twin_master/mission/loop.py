@@ -22,7 +22,7 @@ from twin_master.errors import (
     TwinMasterError,
     said,
 )
-from twin_master.learning.expectation import Expected, expected_of
+from twin_master.learning.expectation import Expected, expected_of, joined
 from twin_master.mission.journal import (
     JournalFile,
     array_of,
@@ -120,15 +120,26 @@ def expected_in(turns: History, knowledge: Knowledge, name: str, belief: Float) 
     return expected, joint.sum(axis=-2)
 
 
-def gap_of(history: History, skipped: int, knowledge: Knowledge) -> dict[str, Any]:
-    """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
+def spans_of(history: History, given: "Sequence[BelievedModel]") -> list[tuple[Knowledge, slice]]:
+    """Return what a twin knew, and in which of the turns of a history, by the models that it believed."""
+    models = in_turn(given)
+    starts = [max(0, model.from_turn - history.first_turn) for model in models]
+    parts = map(slice, starts, [*starts[1:], len(history.turns)])
+    return [(model.knowledge, part) for model, part in zip(models, parts, strict=True)]
+
+
+def gap_of(history: History, from_turn: int, models: "Sequence[BelievedModel]") -> dict[str, Any]:
+    """Return root mean square residual and log evidence of the turns from one on; None without any.
 
     The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
     """
-    left = history.behind(skipped)
+    left = history.behind(from_turn - history.first_turn)
     if not left.turns or np.isnan(left.observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    expected, _ = expected_in(left, knowledge, "filtered", left.filtered)
+    parts = [(known, replace(left, turns=left.turns[part])) for known, part in spans_of(left, models)]
+    expected = joined(
+        expected_in(own, known, "filtered", own.filtered)[0] for known, own in parts if own.turns
+    )
     residual = (left.observed - expected.mean) / expected.noise
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),

@@ -14,7 +14,7 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import plain
 from reporting.words import capital, parameter_title
-from twin_master.mission.loop import BelievedModel, in_turn
+from twin_master.mission.loop import BelievedModel, spans_of
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Truth
 from twin_master.network.estimator import Learnt
@@ -198,10 +198,7 @@ class MissionResult:
     @property
     def spans(self) -> list[tuple[Knowledge, slice]]:
         """What the twin knew, and in which of the turns."""
-        models = in_turn(self.models) or [BelievedModel(0, self.knowledge)]
-        starts = [max(0, model.from_turn - self.flight.first_turn) for model in models]
-        parts = map(slice, starts, [*starts[1:], len(self.flight.turns)])
-        return [(model.knowledge, part) for model, part in zip(models, parts, strict=True)]
+        return spans_of(self.flight, self.models or [BelievedModel(0, self.knowledge)])
 
     @property
     def state_unit(self) -> str:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from itertools import cycle
 from types import MappingProxyType
 from typing import Any
 
@@ -15,7 +14,7 @@ from twin_master.learning.expectation import joined
 from twin_master.mission.loop import expected_in
 from twin_master.mission.turns import SensorStatus, Truth
 from twin_master.scenario.schema import REWARD_NAMES
-from twin_master.scenario.section import printed_state
+from twin_master.scenario.section import ObservationSection, printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
 Words = Mapping[str, str]
@@ -189,24 +188,23 @@ def _truth(result: MissionResult, truth: Truth) -> Iterator[Entry]:
         yield "{monitor}", values, {"monitor": name, "unit": result.units.get(name, "1")}
 
 
-MICROSTRAIN = 1.0e6
-
 Columns = dict[str, Any]
 """Numbers or texts of each column, by its heading."""
 
 
-def tables_of(groups: Mapping[str, Group], role: str) -> dict[str, str]:
+def tables_of(groups: Mapping[str, Group], observation: ObservationSection) -> dict[str, str]:
     """Return the text of each CSV file by its name.
 
     Parameters
     ----------
     groups
         As `groups_of` returns them.
-    role
-        What is observed.
+    observation
+        How sensors are printed.
     """
     observed, filtered, policy = (groups[name] for name in ("observed", "filtered", "policy"))
     controls, asked = policy["control"].values, filtered["decision_probability"].values
+    role = observation.role
     steps: Columns = {"step": [str(step) for step in observed["step"].values]}
     known = {"true": groups["truth"]["state"]} if "truth" in groups else {}
     for kind in ("filtered", "smoothed"):
@@ -218,9 +216,9 @@ def tables_of(groups: Mapping[str, Group], role: str) -> dict[str, str]:
         for name, variable in known.items():
             health[f"{region}_{name}_{unit}"] = factor * variable.values[:, place]
     tables = {
-        "observed": steps | _observations(observed, role, role),
-        "estimated": steps | _observations(filtered, "quantity_mean", role),
-        **({"true": steps | _observations(groups["truth"], role, role)} if "truth" in groups else {}),
+        "observed": steps | _observations(observed, role, observation),
+        "estimated": steps | _observations(filtered, "quantity_mean", observation),
+        **({"true": steps | _observations(groups["truth"], role, observation)} if "truth" in groups else {}),
         "health": health,
         "decisions": steps
         | {"control": controls[observed["control_index"].values]}
@@ -237,16 +235,10 @@ def tables_of(groups: Mapping[str, Group], role: str) -> dict[str, str]:
     }
 
 
-def _observations(group: Group, variable: str, role: str) -> Columns:
-    sensors, units = group["sensor"].values, [group[variable].attrs["units"]]
-    if "sensor_unit" in group.coords:
-        units = group["sensor_unit"].values.tolist()
-    columns = {}
-    for values, sensor, unit in zip(group[variable].values.T, sensors, cycle(units), strict=False):
-        strain = role == "strain" and unit == "1"
-        factor, name = (MICROSTRAIN, "microstrain") if strain else (1.0, unit)
-        columns[f"{role}_{sensor}_{name}"] = factor * values
-    return columns
+def _observations(group: Group, variable: str, observation: ObservationSection) -> Columns:
+    factor, units = observation.printed
+    names = (f"{observation.role}_{number}_{unit}" for number, unit in enumerate(units, start=1))
+    return dict(zip(names, factor * group[variable].values.T, strict=True))
 
 
 def _each(title: str, names: Iterable[str], values: NDArray[Any]) -> Columns:

@@ -122,7 +122,7 @@ def store_flight(
     }
     groups = groups_of(result)
     write_run(folder, groups, told)
-    for name, text in tables_of(groups, result.scenario.observation.role).items():
+    for name, text in tables_of(groups, result.scenario.observation).items():
         atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
     if write_field is not None:
         write_field(folder / FIELD_NAME)

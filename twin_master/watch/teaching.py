@@ -107,15 +107,14 @@ def judged(
         replay(journal, models, scenario.watch.lag, first_turn=from_turn, end=end, question=question)[0]
         for question in (None, model)
     )
-    known, last = models[-1].knowledge, model.knowledge
     evidence = [
         sum(turn.concluded.log_evidence for turn in found.turns[begin - found.first_turn :][:count])
         for found in (before, after)
     ]
     record = {
-        "before": gap_of(before, from_turn - before.first_turn, known),
-        "after": gap_of(after, from_turn - after.first_turn, last),
-        "policy_change": policy_change(known, last),
+        "before": gap_of(before, from_turn, models),
+        "after": gap_of(after, from_turn, [*models, model]),
+        "policy_change": policy_change(models[-1].knowledge, model.knowledge),
     }
     return Outcome(patch, model, float(evidence[1] - evidence[0]), record)
 

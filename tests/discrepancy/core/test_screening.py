@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest
 
+from discrepancy.campaign.noise_tests import variance_p_value
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, Point, Remainder, Term
 from discrepancy.fits.fitting import fit
@@ -25,7 +26,7 @@ from . import kit
 
 def test_pairs_and_gains_are_those_of_fits():
     """For linear effects with wide priors the screen is the fit; one change alone is no pair."""
-    problem = kit.closed_problem(seed=12, effect=0.12)
+    problem = kit.closed_problem(seed=12, effect=0.12, gain_deviation=0.2)
     none = kit.fitted(problem)
     screen = Screen(problem, none)
     terms = (Term(kit.offset_effect(deviation=10.0), "y1"), Term(kit.drift_effect(deviation=10.0), "y1"))
@@ -79,6 +80,10 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
     whiteness = any(name.startswith("whiteness") for name, _ in absolute_tests(problem, found))
     assert whiteness or samples < 120
     assert rejected > 112 if gap else rejected <= binom.isf(1e-3, draws, 1e-3)
+    wide = Remainder(np.zeros(3), np.full(3, 2.0), *np.zeros((2, 3)), np.ones(3, dtype=bool))
+    told = dict(absolute_tests(problem, replace(found, remainder=wide)))["variance of y1"]
+    count = problem.counts[0] - found.spent[0]
+    assert told == pytest.approx(variance_p_value(found.sums[0] / count, count / 4.0, freedom / 4.0))
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0])
@@ -226,6 +231,11 @@ def test_noise_without_a_record_is_what_the_fit_leaves():
     left = Remainder(*(size * np.ones(3) for size in (500.0, 5.0, 1.0, 0.0)), np.zeros(3, dtype=bool))
     for item in residual_set(unknown, replace(kit.fitted(unknown), remainder=left)).trials:
         assert np.all(item.predictive_deviation < 1.5 * item.noise_deviation)
+    apart = held_out_problem(5, noise=None)
+    for item in residual_set(apart, kit.fitted(apart)).trials:  # the same in trials that were held out
+        own = dict(zip(item.trial.channels, item.noise_deviation / item.trial.noise_factor, strict=True))
+        told = own if item.trial.name == "up" else told
+        assert own == pytest.approx({name: told[name] for name in own})
 
 
 def test_held_out_trials_move_nothing_that_is_shared():

@@ -168,8 +168,17 @@ def test_what_moves_alike_is_no_copy():
         values[:, 0] = np.round(20.0 + TIME, 1)
         values[:, 1] = np.round(18.0 + 1.1 * TIME, 1)
 
-    for change in (without_noise, switched, warmed):
+    def stepped(values):
+        values[:, 0] = values[:, 1] = np.sign(np.cos(21.0 * TIME))
+
+    for change in (without_noise, switched, warmed, stepped):
         assert FaultKind.COPIED not in {item.kind for item in check_data(campaign_of(change))}
+
+    def same(values):
+        without_noise(values)
+        values[:, 1] = values[:, 0]
+
+    assert "digit for digit" in only(check_data(campaign_of(same)), FaultKind.COPIED).sentence
 
 
 # ---------------------------------------------------------------- units
@@ -322,6 +331,9 @@ def test_a_wrong_reading_is_found_at_the_ends(place):
     first[place] += 20.0
     assert ends(first, second) == []
     second[100] += 20.0
+    assert ends(second) == [(place, 0)]
+    second[100:] *= 30.0 if place < 100 else 1.0  # the roughness at its own end counts
+    second[:100] *= 30.0 if place > 100 else 1.0
     assert ends(second) == [(place, 0)]
 
 

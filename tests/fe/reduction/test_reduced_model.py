@@ -170,14 +170,14 @@ def test_a_load_that_no_output_sees(write_beam, tmp_path):
 def test_the_rounding_that_was_measured_is_allowed_for(write_beam, tmp_path):
     """On a soft spring the beam moves by metres and strains as before: digits of the strains are lost."""
     models, flange = [], 'rigid_about = [0, 10, 5], hold = ["x", "y", "rx", "ry", "rz"]'
-    for spring in (2e6, 1.0):
+    for spring in (2e6, 0.25):
         held = f"{flange}, springs = [0, 0, {spring}, 0, 0, 0]"
         file = write_beam(tmp_path, {'hold = ["x", "y", "z"]': held}, cells=2)
         models.append(reduce_structure(load_and_assemble(file), ROUGH).model)
     stiff, soft = (model.static_response({"load_factor": 1.0}) for model in models)
-    assert soft.displacement[0] > 1e5 * stiff.displacement[0]
+    assert soft.displacement[0] > 1e6 * stiff.displacement[0]
     assert models[0].rounding_allowance == 5e-6  # the least
-    assert 5e-6 < models[1].rounding_allowance < 1e-4
+    assert 5e-6 < models[1].rounding_allowance < 2e-3
     apart = np.abs(soft.strain - stiff.strain).max()
     assert apart <= soft.strain_error_bound + stiff.strain_error_bound
 

@@ -69,6 +69,9 @@ def test_the_slope_is_that_of_the_force(kind):
             for way in (-1e-7, 0.0, 1e-7)
         ]
         assert force[1][1] == pytest.approx((force[2][0] - force[0][0]) / 2e-7, rel=2e-3, abs=1e-6)
+        if kind in ("power_damping", "power_stiffness", "free_play"):
+            wanted = force_of(AT_EACH[kind], x, x / 0.02, memory)
+            assert force[1][0] == pytest.approx(wanted, rel=1e-12)
     assert not memory.any()
     assert {type(item) for item in AT_EACH.values()} == set(functions.LAWS)
 

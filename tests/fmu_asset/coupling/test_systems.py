@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from fmu_asset import errors
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
 from fmu_asset.coupling.structure import expand_connection as expand
@@ -91,6 +92,8 @@ def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(foreig
 
 def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
     structure, seen = of_ours(ours), []
+    direct = [read_fmu(ours(PARTS[name])).feedthrough for name in ("damage", "gauges")]
+    assert (direct[0]["z1"], direct[1]["reading[2]"]) == (set(), {"strain[2]"})
     for seed in (5.0, 6.0):
         options = {"isolated": False, "parameters": {"seed": seed}}
         with CoupledAsset(structure, BINDINGS["three"], **options) as asset:

@@ -277,6 +277,9 @@ def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(foreign_fmu, 
         with pytest.raises(errors.FmuEndedError, match="has ended its simulation at t = "):
             asset.step()
         asset.reset()
+        asset.step()
+        np.testing.assert_allclose(asset.simulate(steps=50).time, history.time[1:], rtol=1e-12)
+        asset.reset()
         assert [asset.step().values[0] for _ in range(whole)] == history.values[:whole, 0].tolist()
         with pytest.raises(errors.FmuEndedError, match="asked to end the simulation in the step") as caught:
             asset.step()

@@ -46,7 +46,7 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.message import MessageReader
 from uav_twin import fly as new_run
-from uav_twin import fly_fleet, load_scenario, open_run, resume, structure_files, watch
+from uav_twin import fly_fleet, load_scenario, open_run, report_figures, resume, structure_files, watch
 
 pytestmark = [pytest.mark.usefixtures("no_report"), pytest.mark.xdist_group("wing")]
 INPUTS = Inputs(__file__)
@@ -228,6 +228,10 @@ def test_the_twin_finds_the_damage_of_the_full_model(flown):
     assert np.all(loss[region == 0] == 0.0)
     assert 0.2 < loss[region == 1].max() < 0.6
     assert not (flown / "wing.vtu").exists()
+    (drawn,) = (figure.figure for figure in report_figures(flown) if figure.name == "structure")
+    surface, gauges, *_ = drawn.axes[0].collections
+    np.testing.assert_allclose(np.unique(surface.get_array()), 100.0 * np.unique(loss))
+    assert len(gauges.get_offsets()) == len(structure.gauges)
 
 
 @pytest.mark.long
@@ -382,7 +386,10 @@ def test_a_watch_takes_features_with_their_covariance(file):
 def test_gauges_that_cannot_stand_beside_those_of_the_file(tmp_path):
     """What is wrong names the option."""
     panel = resolve_scenario(load_scenario("stiffened_panel"), Overrides())
-    folder = tmp_path / "0"
+    whole = panel.model_copy(update={"rewards": panel.rewards.model_copy(update={"health_sensors": "all"})})
+    found, folder = with_candidates(whole, "2", tmp_path / "2"), tmp_path / "0"
+    limited = [found.observation.titles[number - 1] for number in found.rewards.health_sensors]
+    assert limited == [*panel.observation.titles]  # health stays that of the gauges of the file
     with pytest.raises(MissionInputError, match="--candidates needs at least one place"):
         with_candidates(panel, "0", folder)
     for name, point, words in (

@@ -17,7 +17,7 @@ from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import _noisier
-from twin_master.fleet.plan import Fleet, ensemble
+from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, population, refined, shared
 from twin_master.fleet.reading import Estimated, Outcomes, attention, leaving, severity
 from twin_master.fleet.report import WORST, fleet_page, write_fleet_report
@@ -172,6 +172,26 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
     found = scenario.observation.standard_deviation
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
+
+
+def test_groups_share_their_rates_and_each_has_a_population_of_the_parameter(tmp_path):
+    """Of wings whose model tells the strains at any value of it."""
+    means, text = {"soft": 0.99, "stiff": 1.02}, 'format = 1\nfleet = { name = "two", seed = 5 }\n'
+    for name, mean in means.items():
+        text += f'[[group]]\nname = "{name}"\nscenario = "growing_damage"\ncount = 8\nsteps = 12\n'
+        text += f"parameters = {{ young_modulus_factor = {{ mean = {mean}, standard_deviation = 0.002 }} }}\n"
+    folder = fly_fleet(load_fleet(written(tmp_path, text)), tmp_path / "fleet").folder
+    record = learn_from_fleet(folder, tmp_path / "learnt.toml")
+    for name, mean in means.items():
+        group = record["groups"][name]
+        found = group["population"]["mean"]
+        assert group["population"]["parameter"] == "young_modulus_factor"
+        assert abs(found["mean"] - mean) < 4.0 * found["standard_deviation"] < 0.02
+        assert group["noise_factor"]["mean"] == pytest.approx(150.0 / 125.0, rel=0.03)
+    rates = [record["groups"][name]["probability"]["3g"]["mean"] for name in means]
+    assert min(rates) < record["shared"]["3g"]["mean"] < max(rates)
+    few = [record["groups"][name]["probability"]["2g"]["mean"] for name in means]
+    assert max(few) < 0.1  # alone, of few turns, they would be 0.19 and 0.45
 
 
 def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):

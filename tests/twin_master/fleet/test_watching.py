@@ -4,7 +4,6 @@ import json
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import redirect_stdout
 from pathlib import Path
 from queue import Queue
 from threading import Event, Thread
@@ -13,10 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.command_line import call, command, said
+from tests.command_line import command, said, seen
 from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until, write_csv
-from tests.uav_twin.test_discrepancy import Terminal
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import group_figures, leaving
@@ -116,11 +114,10 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     last = {decision["asset"]: decision["turn"] for decision in decisions}
     assert last == {f"north/wing-{number}": 2 for number in range(3)}
     assert "3 assets, 9 turns, 3 alarms" in done.stderr
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(Terminal()) as screen:  # people see a table
-        assert call(patch, "fleet", "watch", fleet_file, "--out", tmp_path / "seen") == 0
-    rows = re.findall(r"(north/wing-\d) +5 +2g +.* 2g +1 ", screen.getvalue())
+    screen = seen("fleet", "watch", fleet_file, "--out", tmp_path / "seen")  # people see a table
+    rows = re.findall(r"(north/wing-\d) +5 +2g +.* 2g +1 ", screen)
     assert rows[-3:] == ["north/wing-0", "north/wing-1", "north/wing-2"]
-    assert '"asset"' not in screen.getvalue()
+    assert '"asset"' not in screen
 
 
 @pytest.fixture

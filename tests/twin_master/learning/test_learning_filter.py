@@ -194,14 +194,14 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(other):
 
 
 def test_predicted_follows_the_scenario_through_the_policy():
-    *_, turn = estimates_of(learner_of_all(), observations()[:3], CONTROLS[:3])
+    *_, turn = estimates_of(learner_of_all(), observations(), CONTROLS)
     expectation = LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
     found = expectation.predicted([turn.carried], [turn.filtered], [POLICY], 2)
-    table = enumerated(3).sum(axis=(0, 1, 4))  # (S, E)
+    table = enumerated(STEPS).sum(axis=(0, 1, 2, 5))  # (S, E)
     table = table / table.sum()
     matrix, value = model().transition.matrix, sensors().value_per_draw
     # p(D_t+1, D_t+2, U_t+2, draw), over D_t = n and U_t+1 = u
-    weight = np.einsum("nd,no,ou,uot,tv->otvd", table, matrix[CONTROLS[2]], POLICY, matrix, POLICY)
+    weight = np.einsum("nd,no,ou,uot,tv->otvd", table, matrix[CONTROLS[-1]], POLICY, matrix, POLICY)
     shown = np.broadcast_to(value.transpose(1, 2, 0, 3), (3, 3, 2, DRAWS, GAUGES))
     mean, deviation = moments(shown, weight)
     np.testing.assert_allclose(found.mean[0, 1], mean, atol=1e-8)

@@ -11,21 +11,20 @@ import xarray as xr
 from scipy.special import gammaln
 from scipy.stats import invgamma
 
-from reporting.page import ReportFigure
 from scenarios import scenario_files
 from tests.command_line import said
 from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
 from twin_master.command import _shown
 from twin_master.errors import TwinMasterError
-from twin_master.report.model import learnt_figure, sensor_rows
+from twin_master.report.model import sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.store.mission_result import MissionResult, printed_learnt
 from twin_master.viewer.flight import Flight
-from uav_twin import fly, load_scenario, open_run, prepare_twin
+from uav_twin import fly, load_scenario, open_run, prepare_twin, report_figures
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -127,8 +126,8 @@ def test_the_summary_says_what_was_learnt_and_what_was_believed_before(scenario,
 
 
 def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
-    record = read_run(folder)
-    figure = learnt_figure(record)
+    record, drawn = read_run(folder), {figure.name: figure for figure in report_figures(folder)}
+    figure = drawn["learnt"].figure
     assert len(figure.axes) == 2 + 3 * 2
     parameter = figure.axes[0]
     np.testing.assert_array_equal(parameter.get_lines()[0].get_ydata(), learnt["young_modulus_factor_mean"])
@@ -136,8 +135,7 @@ def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
     sensors = sensor_rows(record)
     assert len(sensors) == 24
     assert sensors[23].count("—") == 1  # the offset
-    figures = {"learnt": ReportFigure("learnt", None, "", "")}
-    text = render_page(record, {"learnt": b'<svg viewBox="0 0 1 1"></svg>'}, figures)
+    text = render_page(record, dict.fromkeys(drawn, b'<svg viewBox="0 0 1 1"></svg>'), drawn)
     assert "0.05 in 2g and 0.1 in 3g" in text
     assert re.search(r">Young modulus factor</td>.*>Factor on the transitions</td>", text, re.DOTALL)
     assert re.search(r"it learnt the Young modulus factor: [\d.]+ \([\d.]+ to [\d.]+, truth 0\.95\)\.", text)

@@ -209,16 +209,24 @@ def test_a_limit_is_kept_by_the_plan():
     assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
 
 
-def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path, monkeypatch):
+def test_the_command_plans_draws_and_says_what_inspections_gauges_and_simpler_rules_are_worth(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("twin_master.mission.planning.PERIODS", (5,))
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
     worse = 2 * (("[0, 40]", "[0, 80]"),)
-    words = ("plan", written(tmp_path, TEXT, *FOUR_STATES, *worse), "--value-of")
-    record = json.loads(said(*words, "inspect", "--out", policy, "--picture", picture, "--json"))
+    path = written(tmp_path, TEXT, *FOUR_STATES, *worse)
+    words = ("plan", path, "--value-of", "inspect", "--out", policy, "--picture", picture, "--json")
+    record = json.loads(said(*words))
     assert record["lower"] < record["upper"]
     assert record["value"]["mean"] > record["value"]["half_width"] > 0.0
     assert policy.stat().st_size > 1000
     assert picture.read_bytes().startswith(b"<?xml")
+    rules = json.loads(said("plan", path, "--json"))["rules"]
+    assert rules["QMDP"][0] < rules["inspection every 5 turns"][0] < rules["planned on the belief"][0]
+    worth = json.loads(said("design", path, "--sensors", 1, "--among", "17,24", "--worth", "--json"))["worth"]
+    assert worth["all beyond chosen"][0] == pytest.approx(worth["all"][0] - worth["chosen"][0])
+    assert worth["all beyond chosen"][1] < 0.2 * worth["all"][1]  # mission by mission
 
 
 def test_inspections_of_a_fleet_go_where_they_are_worth_most():

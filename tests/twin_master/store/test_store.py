@@ -71,7 +71,7 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
 
 
 def test_tables_are_in_the_units_of_their_headers(result):
-    texts = tables_of(groups_of(result), "strain")
+    texts = tables_of(groups_of(result), result.scenario.observation)
     tables = {name: [*csv.DictReader(text.splitlines())] for name, text in texts.items()}
     health, observed = tables["health"], tables["observed"]
     assert [float(row["z1_true_percent"]) for row in health[8:13]] == [0, 0, 2, 4, 6]

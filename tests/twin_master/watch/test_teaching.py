@@ -124,6 +124,8 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     figures, residual = figures_of(noticing.folder), run["filtered"]["residual"].values
     assert figures["gap_after_patch_15"] == pytest.approx(np.sqrt(np.nanmean(residual[15:20] ** 2)))
     assert "gap_before_patch_15" in figures
+    before_both = noticing.trial(folder / "patch.json", 10)().record["before"]["rms_residual"]
+    assert before_both == pytest.approx(np.sqrt(np.nanmean(residual[10:] ** 2)))
     believed, controls = run["filtered"]["probability"].values, run["observed"]["control_index"].values
     for part, model in zip((slice(15), slice(15, None)), noticing.models, strict=True):
         expected, _ = model.knowledge.sensor_model.moments(known_control(believed[part], controls[part], 2))

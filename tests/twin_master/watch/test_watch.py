@@ -4,6 +4,7 @@ import io
 import json
 import os
 import random
+import re
 import subprocess
 import sys
 import threading
@@ -18,7 +19,7 @@ import pytest
 
 import uav_twin
 from reporting.progress import SilentProgress
-from tests.command_line import command, said
+from tests.command_line import command, said, seen
 from tests.twin_master.runs import check_same, edited, figures_of, journal
 from tests.twin_master.watch.conftest import begun, killed_at, ran, viewed, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
@@ -336,6 +337,8 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     told = [json.loads(line) for line in again.stdout.splitlines()]
     assert [(decision["turn"], decision["told_again"]) for decision in told] == [(59, True)]
     assert "60 messages." in again.stderr
+    line = r"turn 59: 3g, z1 \d+ ± \d+ %, z2 \d+ ± \d+ %; next 2g with .*; by none of these \(1\.00\)"
+    assert re.search(line, seen("watch", "--resume", "--out", folder))  # as people read it
 
 
 def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
