@@ -150,6 +150,7 @@ def test_the_planform_is_the_posterior_mean_to_a_tenth_of_a_millimetre():
         assert length.posterior.mean == pytest.approx(mean, rel=1e-12)
         assert length.posterior.standard_deviation == pytest.approx(1e-3 * precision**-0.5 / 1.96)
         assert getattr(found, name) == round(mean, 4)
+        assert (length.prior.low, length.prior.high) == pytest.approx((0.9 * designed, 1.1 * designed))
 
 
 @pytest.mark.parametrize(("changes", "measured", "kind", "words"), INPUTS.refused("planform"))

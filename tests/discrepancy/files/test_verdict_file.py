@@ -193,7 +193,7 @@ def test_residuals_come_back_to_the_last_bit(tmp_path):
     item = FITTED.trials[0]
     used, residual = item.used.copy(), item.residual.copy()
     used[3, 1], residual[3, 1] = False, nan
-    place = replace(item.trial, used=used, load_place=(1.0, 0.35))
+    place = replace(item.trial, used=used, load_place=(1.0, 0.35), regions=("web", "z2"))
     trials = (replace(item, trial=place, residual=residual), *FITTED.trials[1:])
     trials = tuple(replace(one, sensitivity=None) for one in trials)  # which is not stored
     fitted = replace(FITTED, channels=channels, trials=trials)

@@ -323,6 +323,11 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
         records = [asset.record() for _, asset in sorted(assets.items())]
         assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
         assert sum(record["alarms"] > 0 for record in records) == alarmed
+    (tmp_path / "logs" / "wing-9.csv").write_text("turn,control\n")
+    few = fly_fleet(load_fleet(fleet_of(tmp_path, LOGS, "steps = 5")), tmp_path / "few", Engine(0)).failures
+    none = "its recording has no turn yet."
+    long = "it has 6 turns, and 5 at most are flown: set `steps` of the group."
+    assert few == {"north/wing-1": long, "north/wing-2": long, "north/wing-9": none}
 
 
 def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, alone, tmp_path):
