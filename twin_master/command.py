@@ -207,6 +207,8 @@ def watch(
             last=last, report=not no_report, otherwise="-", begun=opened, progress=terminal.progress(),
         )  # fmt: skip
         _write("", flush=True)
+        if terminal.loudness.quiet:
+            return
         counts = watches[0].intake.counts
         refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
         refused *= counts.rejected > 0

@@ -292,6 +292,7 @@ def attempt(problem: Problem, candidate: Candidate, start: Point, **options: Any
         return None
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a motion beyond all numbers has no probability
 def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
     """Return -ln posterior of a candidate at a point, up to a constant shared by all candidates [nat].
 

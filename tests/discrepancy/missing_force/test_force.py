@@ -31,7 +31,7 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.discrepancy.core.kit import fitted, problem_of
-from tests.discrepancy.rigs import FEW, chosen, fmu_rig, one_mass, simulated
+from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass, simulated
 from tests.refusals import Inputs
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
@@ -311,6 +311,14 @@ def test_one_law_stands_where_several_follow_the_jumps_that_an_accelerometer_sho
     again.keep(fit(found.problem, both, begun), exact=True)  # the other one was found first
     again.sets()
     assert again.best().candidate.identifiers == ("coulomb_friction",)
+
+
+def test_a_model_with_the_right_law_of_its_own_has_no_gap_at_any_time():
+    model = LumpedModel.load("single_mass_rig")
+    values = {"friction_ratio": 0.02}
+    rubs = hiding(simulated(model, "ringdown", 4), model, "coulomb_friction", values, "slide")
+    found = investigate(simulated(model, "ringdown", 4, rubs), model.patched(rubs), FEW[:1]).verdict
+    assert (found.kind, found.windows) == (VerdictKind.NOTHING_MISSING, ())
 
 
 def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():
