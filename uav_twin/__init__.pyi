@@ -20,6 +20,7 @@ from fe.wing.operators import solve_static as solve_static
 from fmu_asset.door.session import FmiAsset as FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
 from scenarios import structure_files as structure_files
+from twin_master.assets.resolution import Overrides as Overrides
 from twin_master.environment import ScenarioEnvironment as ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet as fly_fleet
 from twin_master.fleet.learn import learn_from_fleet as learn_from_fleet
