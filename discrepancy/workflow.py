@@ -179,8 +179,7 @@ def investigate(
     if thorough:
         with stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
-            if verdict.kind not in NO_GAP:  # the model's own laws are not exact along what is seen
-                windows = gap_windows(problem, fit, before, seed=seed)
+            windows = gap_windows(problem, fit, before, seed=seed)
             if after is not before:
                 windows += residual_windows(after, seed=seed, with_effect=True)
             remarks += [text for text in location.remarks if text not in remarks]

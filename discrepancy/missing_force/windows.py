@@ -46,12 +46,14 @@ def gap_windows(
     fit : CandidateFit
         Of the verdict: where its law at a port, acting throughout, tells more than events, there are none.
     residuals : ResidualSet
-        Of the model as it was; those of trials whose force cannot be seen are looked at themselves.
+        Of the model as it was; those of trials whose force cannot be seen, and of a model with laws
+        of its own, are looked at themselves.
     seed : int
         Of the draw that restores what the fit has absorbed.
     """
     dynamic = tuple(item.trial for item in residuals.trials if item.trial.is_dynamic)
-    if not dynamic or not problem.model.shows_ports:
+    own = problem.model.apart()[1]  # laws that are exact where they are simulated, not along what is seen
+    if not dynamic or not problem.model.shows_ports or len(own):
         return residual_windows(residuals, seed=seed)
     try:
         found = _of_force(problem.with_trials(dynamic), fit)
