@@ -1,6 +1,11 @@
 #if defined(_MSC_VER) && !defined(_CRT_SECURE_NO_WARNINGS)
 #define _CRT_SECURE_NO_WARNINGS /* fopen is what every platform has */
 #endif
+#if defined(_WIN32)
+#define WIN32_LEAN_AND_MEAN
+#define NOMINMAX
+#include <windows.h>
+#endif
 #include "structure_data.h"
 
 #include <math.h>
@@ -137,9 +142,30 @@ bool structure_data_parse(structure_data *data, const unsigned char *content, si
     return true;
 }
 
+#if defined(_WIN32)
+/* Open a file whose path is in UTF-8, as FMI has it: fopen would take it for text in the code page of the system.
+   A host that gives the path in that code page is understood as well, since such a path is hardly ever UTF-8. */
+static FILE *open_to_read(const char *path) {
+    const int length = MultiByteToWideChar(CP_UTF8, MB_ERR_INVALID_CHARS, path, -1, NULL, 0);
+    if (length <= 0) {
+        return fopen(path, "rb");
+    }
+    wchar_t *wide_path = malloc((size_t)length * sizeof *wide_path);
+    if (wide_path == NULL) {
+        return NULL;
+    }
+    (void)MultiByteToWideChar(CP_UTF8, MB_ERR_INVALID_CHARS, path, -1, wide_path, length);
+    FILE *file = _wfopen(wide_path, L"rb");
+    free(wide_path);
+    return file;
+}
+#else
+static FILE *open_to_read(const char *path) { return fopen(path, "rb"); }
+#endif
+
 bool structure_data_read(structure_data *data, const char *path, structure_problem *problem) {
     memset(data, 0, sizeof *data);
-    FILE *file = fopen(path, "rb");
+    FILE *file = open_to_read(path);
     if (file == NULL) {
         return structure_fail(problem, "the data file %s cannot be opened; extract the FMU again", path);
     }
