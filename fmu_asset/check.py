@@ -125,7 +125,7 @@ def check_fmu(
     description = read_fmu(path, given.binding.interface if given else None)
     found = list(check_file(description))
     try:
-        used = given or whole_binding(description, step_size=step_size)
+        used = given or drafted_binding(description, step_size)
         flights = Flights(description, used, step_timeout, memory_limit)
     except FmuError as error:
         undrafted = isinstance(error, BindingError) and given is None
@@ -138,6 +138,14 @@ def check_fmu(
     # Names of an FMU may hold control characters.
     findings = tuple(Finding(check, verdict, visible(text)) for check, verdict, text in found)
     return FmuCheck(description.path, findings)
+
+
+def drafted_binding(description: FmuDescription, step_size: float | None) -> Binding:
+    """Return a binding of the whole FMU, which ends where the FMU says, unless the checks fly further."""
+    binding = whole_binding(description, step_size=step_size)
+    checked_end = binding.binding.start_time + _STEPS * binding.interval
+    end = description.stop_time
+    return binding if end is None or end < checked_end else binding.with_header(stop_time=end)
 
 
 def check_file(description: FmuDescription) -> Iterator[tuple[str, *Told]]:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import typer
 
-from fmu_asset.errors import FmuInputError, SspError
+from fmu_asset.errors import FmuInputError, SspError, visible
 from reporting import terminal
 from reporting.errors import ReportingError
 from reporting.files import atomic_write_bytes, atomic_write_text, refuse_existing
@@ -128,10 +128,27 @@ def info(file: Path, *, variables: bool = True, json: bool = False) -> None:
     switches = [row for row in described["variables"] if _SWITCH.fullmatch(row["name"])]
     effects = (f"{row['name'].split('.')[1]} ({'on' if float(row['start']) else 'off'})" for row in switches)
     facts += [("effects", ", ".join(effects))] * bool(switches)
-    keys = ("name", "causality", "unit", "minimum", "maximum", "start", "description")
-    rows = [["" if row.get(key) is None else str(row[key]) for key in keys] for row in described["variables"]]
+    rows = [_variable_row(variable) for variable in description.variables]
     record = {"file": str(file)} | described | {"obstacle": obstacle}
     answer("fmu info", record=record, json=json, facts=facts, rows=rows if variables else ())
+
+
+def _variable_row(variable: "parts.VariableInfo") -> list[str]:
+    """Return what the table of variables shows of one; an enumeration's items stand with its description."""
+    about = variable.description
+    if variable.items:
+        items = f"items: {variable.item_list}"
+        about = f"{about}; {items}" if about else items
+    cells = (
+        variable.name,
+        variable.causality,
+        variable.unit,
+        variable.minimum,
+        variable.maximum,
+        variable.start,
+        about,
+    )
+    return ["" if cell is None else visible(str(cell)) for cell in cells]
 
 
 _MOST_PANELS, _MOST_LINES = 8, 10
@@ -165,14 +182,17 @@ def simulate(
             parts.read_fmu(file), stop_time=stop_time, step_size=step_size, values=_values_of(values)
         )
         bound = planned.binding
-    else:
-        bound = _interpolated(parts.load_binding(binding), interpolation)
+        with closing(
+            parts.FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)
+        ) as asset:
+            _finish(asset, parts.fly(asset, planned), file, out, plot)
+        return
+    assert inputs is not None  # it goes with a binding
+    bound = _interpolated(parts.load_binding(binding), interpolation)
+    steps, histories = parts.read_histories(inputs, bound)
+    bound = parts.ending_with_histories(bound, steps)
     with closing(parts.FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)) as asset:
-        if inputs is None:
-            history = parts.fly(asset, planned)
-        else:
-            history = parts.fly_histories(asset, *parts.read_histories(inputs, asset.binding))
-        _finish(asset, history, file, out, plot)
+        _finish(asset, parts.fly_histories(asset, steps, histories), file, out, plot)
 
 
 def simulate_system(
@@ -194,8 +214,9 @@ def simulate_system(
     _refuse_files(out, plot, replace=replace)
     given = _values_of(values)
     for name, value in given.items():
-        if isinstance(value, list):
-            raise FmuInputError(f"--set {name} has {len(value)} values; ends of a system take one number.")
+        count = len(value.split(","))
+        if count > 1:
+            raise FmuInputError(f"--set {name} has {count} values; ends of a system take one number.")
     with tempfile.TemporaryDirectory() as folder:
         wiring = parts.join_ssp(parts.read_ssp(file, folder), delay or ())
         if left_out := parts.left_out_sentence(wiring, file):
@@ -221,20 +242,18 @@ def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None
         refuse_existing(path, replace=replace, option=option)
 
 
-def _values_of(texts: list[str] | None) -> dict[str, float | list[float]]:
-    """Return values by name: numbers, true and false, or for an array several with commas between."""
-    found: dict[str, float | list[float]] = {}
+def _values_of(texts: list[str] | None) -> dict[str, str]:
+    """Return what `--set` gives, by name, as it is written: what it means depends on the variable."""
+    values: dict[str, str] = {}
     for text in texts or ():
-        name, _, value = text.rpartition("=")
-        words = [{"true": "1", "false": "0"}.get(word.strip(), word) for word in value.split(",")]
-        try:
-            numbers = [float(word) for word in words if name]
-        except ValueError:
-            numbers = []
-        if not numbers:
-            raise FmuInputError(said("fmu.set", text=text))
-        found[name] = numbers[0] if len(numbers) == 1 else numbers
-    return found
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise FmuInputError(
+                f"--set {text} is not understood; write NAME=VALUE: a number, true or false, the name of an "
+                "enumeration's item, a text, or several values with commas between."
+            )
+        values[name] = value
+    return values
 
 
 def _interpolated(binding: "parts.Binding", kind: str | None) -> "parts.Binding":

@@ -99,6 +99,7 @@ from fe.verification.wing_checks import Check as Check
 from fe.verification.wing_checks import all_checks as all_checks
 from fe.wing.design import load_design as load_design
 from fe.wing.operators import structural_mass as structural_mass
+from fmu_asset.archive.declared import VariableInfo as VariableInfo
 from fmu_asset.archive.declared import describe_fmu as describe_fmu
 from fmu_asset.archive.fmu_file import inspect_fmu as inspect_fmu
 from fmu_asset.archive.fmu_file import read_fmu as read_fmu
@@ -109,6 +110,7 @@ from fmu_asset.door.binding import Binding as Binding
 from fmu_asset.door.binding import load_binding as load_binding
 from fmu_asset.door.draft import draft_binding as draft_binding
 from fmu_asset.door.experiment import default_experiment as default_experiment
+from fmu_asset.door.experiment import ending_with_histories as ending_with_histories
 from fmu_asset.door.experiment import fly as fly
 from fmu_asset.door.experiment import fly_histories as fly_histories
 from fmu_asset.door.experiment import read_histories as read_histories

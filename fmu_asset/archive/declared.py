@@ -137,6 +137,16 @@ class VariableInfo:
         return self.numeric and not self.shape and not self.clocked
 
     @property
+    def is_text_parameter(self) -> bool:
+        """Whether it is a parameter that is one text."""
+        return self.kind == "String" and self.causality == "parameter" and not (self.shape or self.clocked)
+
+    @property
+    def item_list(self) -> str:
+        """The items of an enumeration with their values, for a sentence or a table; empty for other types."""
+        return ", ".join(f"{name} = {value}" for name, value in self.items.items())
+
+    @property
     def startable(self) -> bool:
         """Whether it is an output or local variable with a start value, to be set before initialisation."""
         free = self.causality in ("output", "local") and self.variability != "constant"
@@ -167,6 +177,8 @@ class FmuDescription(FmuIdentity):
     ----------
     path : Path
         The file.
+    shown_as : str
+        What sentences call it, where that is not the path: the FMU of an SSP file lies in a folder of ours.
     sha256 : str
         Hash of the file.
     file_size : int
@@ -197,6 +209,7 @@ class FmuDescription(FmuIdentity):
     """
 
     path: Path
+    shown_as: str = ""
     sha256: str = ""
     file_size: int = 0
     model_name: str = ""
@@ -217,6 +230,11 @@ class FmuDescription(FmuIdentity):
     stop_time: float | None = None
     fixed_step: float | None = None
     can_interpolate_inputs: bool = False
+
+    @property
+    def label(self) -> str:
+        """What sentences call it."""
+        return self.shown_as or str(self.path)
 
     @property
     def identity(self) -> FmuIdentity:

@@ -32,6 +32,10 @@ DESIGN_RECORD = "design.json"
 """Name of the file in the folder `resources` that says of which design an FMU of ours was made."""
 _LONGEST_RECORD = 10_000
 _LARGEST_DESCRIPTION = 256 * 1024**2
+_DOTTED = (
+    "FMI has the names of entries without './' in front. Pack it again, such as by `zip -r model.fmu *` in "
+    "its folder."
+)
 _UNREADABLE = (OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
 # A hyphen is none of C, but tools put one there, and the folder of the binary has no harm of it.
@@ -83,7 +87,7 @@ def inspect_fmu(
     size, sha256 = _size_and_hash(file)
     names = check_archive(file, size)
     if "modelDescription.xml" not in names:
-        raise FmuFileError(f"{file} is an archive without modelDescription.xml, so it is not an FMU.")
+        raise FmuFileError(_without_description(file, names))
     root = _model_description(file)
     version = root.get("fmiVersion") or ""
     if version not in ("1.0", "2.0") and not version.startswith("3."):
@@ -105,10 +109,36 @@ def inspect_fmu(
     binary = f"binaries/{here}/{description.model_identifier}{sharedLibraryExtension}"
     if binary in names:
         return description, ""
-    there = ", ".join(platforms) or "none"
-    return description, (
-        f"{file} has no binary for this platform ({binary} is not in it; binaries there: {there}); "
-        f"export it for {here}."
+    return description, _without_binary(file, names, binary, platforms)
+
+
+def _without_description(file: Path, names: set[str]) -> str:
+    """Return the sentence on an archive in which modelDescription.xml is not where FMI has it."""
+    lacking = f"{file} is an archive without modelDescription.xml"
+    if "./modelDescription.xml" in names:
+        return f"{lacking}, but with './modelDescription.xml': {_DOTTED}"
+    nested = sorted(name for name in names if name.endswith("/modelDescription.xml"))
+    if nested:
+        return f"{lacking} at its top: it has {nested[0]!r}. Pack the content of that folder, not the folder."
+    return f"{lacking}, so it is not an FMU."
+
+
+def _without_binary(file: Path, names: set[str], binary: str, platforms: tuple[str, ...]) -> str:
+    """Return the sentence on an FMU whose binary for this platform is not where FMI has it."""
+    if f"./{binary}" in names:
+        return f"{file} has no binary {binary}, but one named './{binary}': {_DOTTED}"
+    folder, _, _ = binary.rpartition("/")
+    suffix = PurePosixPath(binary).suffix
+    others = sorted(n for n in names if n.rpartition("/")[0] == folder and n.endswith(suffix))
+    if others:
+        return (
+            f"{file} has the binary {', '.join(others[:3])}, but its model description asks for {binary}: "
+            "the name must be its `modelIdentifier`. Rename the binary, or export the FMU again."
+        )
+    here = PurePosixPath(folder).name
+    return (
+        f"{file} has no binary for this platform ({binary} is not in it; binaries there: "
+        f"{', '.join(platforms) or 'none'}); export it for {here}."
     )
 
 
@@ -131,7 +161,7 @@ def extract_fmu(description: FmuDescription) -> Path:
         If the file has changed, cannot be extracted, or no folder with a plain path can be made.
     """
     if _size_and_hash(description.path)[1] != description.sha256:
-        raise FmuFileError(f"{description.path} has changed since it was checked; start again.")
+        raise FmuFileError(f"{description.label} has changed since it was checked; start again.")
     folder = plain_folder()
     try:
         with zipfile.ZipFile(description.path) as archive:
@@ -142,7 +172,7 @@ def extract_fmu(description: FmuDescription) -> Path:
             archive.extractall(folder)
     except _UNREADABLE as error:
         remove_folder(folder)
-        raise FmuFileError(f"{description.path} could not be extracted to {folder} ({error}).") from error
+        raise FmuFileError(f"{description.label} could not be extracted to {folder} ({error}).") from error
     return folder
 
 
@@ -200,10 +230,17 @@ def _refuse_unequal_twins(file: Path, archive: zipfile.ZipFile) -> None:
 
 def _check_entry(file: Path, entry: zipfile.ZipInfo) -> None:
     name = entry.orig_filename
-    parts = PurePosixPath(name).parts
-    outside = not name or name.startswith("/") or ".." in parts or not {*name}.isdisjoint("\\:\0")
+    slashed = name.replace("\\", "/")
+    parts = PurePosixPath(slashed).parts
+    outside = not name or slashed.startswith("/") or ".." in parts or not {*name}.isdisjoint(":\0")
     if outside or stat.S_ISLNK(entry.external_attr >> 16):
         raise FmuFileError(said("archive.outside", file=file, name=name))
+    if "\\" in name:
+        raise FmuFileError(
+            f"{file} holds the entry {name!r}, whose folders are separated by backslashes; ZIP files "
+            "separate them by '/' on every system (some packers on Windows do not). Pack it again with "
+            "another tool."
+        )
     if len(parts) > _DEEPEST:
         raise FmuFileError(said("archive.deep", file=file, deep=len(parts), most=_DEEPEST))
 

@@ -381,13 +381,20 @@ class CoupledAsset(FmiAsset):
         system = system_description(wiring, wiring_hash(wiring, binding, algorithm, iterations, tolerance))
         # Lines are drawn at the components.
         exchange = Exchange(system, binding.with_header(interpolation="zero-order"))
+        if exchange.health_slots:
+            names = ", ".join(exchange.health_slots)
+            raise BindingError(
+                f"The binding {binding.name} has the health {names}, which the system "
+                f"{wiring.structure.name} takes at its start only; in a system a health must be an input "
+                "or, in co-simulation, a tunable parameter."
+            )
         parts = parts_of(wiring, exchange, linear=binding.binding.interpolation == "linear")
         tuned = system.of_components(exchange.settings(parameters or {}))
         assets = {}
         for name, part in parts.items():
             with naming(name):
                 assets[name] = FmiAsset(
-                    wiring.declared[name].path,
+                    wiring.declared[name],
                     part.binding,
                     isolated=isolated,
                     step_timeout=step_timeout,

@@ -64,6 +64,8 @@ class Component:
         Number of steps that the FMU makes in one step of the system, its inputs held.
     interface : {"co-simulation", "model-exchange"}, optional
         How it is run; co-simulation where it offers that.
+    shown_as : str
+        What sentences call the FMU, where that is not its path.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Component:
     settings: Mapping[str, Setting] = field(default_factory=dict)
     substeps: int = 1
     interface: Interface | None = None
+    shown_as: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,8 @@ class SystemStructure:
         Connectors of the components, as a file declares them.
     span : (float or None, float or None)
         Start and end of the default experiment [s], where a file says them.
+    base_step : float or None
+        Step of the system that a file declares [s].
     unused : tuple of str
         Names of parameters that a file sets, but that are of no element of the system.
     """
@@ -154,6 +159,7 @@ class SystemStructure:
     units: tuple[UnitInfo, ...] = ()
     declared: Mapping[Endpoint, Connector] = field(default_factory=dict)
     span: tuple[float | None, float | None] = (None, None)
+    base_step: float | None = None
     unused: tuple[str, ...] = ()
 
     def component(self, name: str) -> Component:

@@ -40,9 +40,10 @@ class SystemDescription(FmuDescription):
         """Return what is set in the system by component and variable, in the FMUs' units."""
         found: dict[str, dict[str, float]] = {}
         for _, reference, (value,) in settings:
+            number = float(value)
             for port in self.ends[self.variables[reference].name]:
                 own = found.setdefault(port.end.component, {})
-                own[port.end.variable] = port.conversion.to_fmu(value)
+                own[port.end.variable] = port.conversion.to_fmu(number)
         return found
 
 
@@ -74,7 +75,10 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
         name, own = connector.name, wiring.ends[connector.name]
         causalities = {wiring.variable(port.end).causality for port in own} or {"connected to nothing"}
         causality = "output" if own and connector.kind == "output" else " and ".join(sorted(causalities))
-        offer(name, causality, wiring.units[name])
+        # An enumeration, where all ends of the connector are the same one.
+        enumerations = [wiring.variable(port.end).items for port in own] or [{}]
+        alike = enumerations.count(enumerations[0]) == len(enumerations)
+        offer(name, causality, wiring.units[name], items=enumerations[0] if alike else {})
         units = (unit for port in own for unit in wiring.declared[port.end.component].units)
         ends[name], definitions[name] = own, (*structure.units, *units)
     shown = {port.end for item in structure.connectors if item.kind == "output" for port in ends[item.name]}
@@ -85,8 +89,14 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
                 causality = "an input that is fed by a connection already"
             elif end in shown:
                 causality = "local"
-            said = {"variability": variable.variability, "description": variable.description}
-            offer(str(end), causality, variable.unit, **said)
+            offer(
+                str(end),
+                causality,
+                variable.unit,
+                variability=variable.variability,
+                description=variable.description,
+                items=variable.items,
+            )
             ends[str(end)] = (ConnectedVariable(end, IDENTITY, False),)
             definitions[str(end)] = declared.units
     steps = [declared.fixed_step or declared.step_size for declared in wiring.declared.values()]
@@ -99,7 +109,7 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
         variables=tuple(variables),
         start_time=structure.span[0],
         stop_time=structure.span[1],
-        step_size=min((size for size in steps if size is not None), default=None),
+        step_size=structure.base_step or min((size for size in steps if size is not None), default=None),
         ends=ends,
         definitions=definitions,
     )
@@ -224,6 +234,7 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
             decimation=component.substeps if linear else 1,
             interpolation="linear" if linear else "zero-order",
             start_time=binding.binding.start_time,
+            stop_time=binding.binding.stop_time,
             interface=component.interface,
             tolerance=binding.binding.tolerance,
         ),

@@ -9,7 +9,7 @@ beginning of the step can be used.
 
 import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from graphlib import TopologicalSorter
 from heapq import heappop, heappush
 from typing import NamedTuple, TypeVar
@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.units import IDENTITY, Conversion, between
-from fmu_asset.errors import CouplingError, said
+from fmu_asset.errors import CouplingError, FmuError, said
 
 from .structure import Component, Connection, Endpoint, Setting, SystemStructure
 
@@ -199,6 +199,24 @@ class ConnectedVariable(NamedTuple):
     delayed: bool
 
 
+def read_component(component: Component) -> FmuDescription:
+    """Return what the FMU of a component declares; sentences call it as the component does.
+
+    Raises
+    ------
+    FmuFileError, FmuUnsupportedError
+        If the FMU cannot be used.
+    """
+    try:
+        description = read_fmu(component.fmu, component.interface)
+    except FmuError as error:
+        if not component.shown_as:
+            raise
+        sentence = error.sentence.replace(str(component.fmu), component.shown_as)
+        raise type(error)(sentence, error.messages, error.time) from error
+    return replace(description, shown_as=component.shown_as)
+
+
 class Wiring:
     """A system whose connections were checked.
 
@@ -244,7 +262,7 @@ class Wiring:
             if names.count(name) > 1:
                 raise CouplingError(said("coupling.two_names", structure=structure, name=name))
         self.declared: dict[str, FmuDescription] = {
-            c.name: read_fmu(c.fmu, c.interface) for c in structure.components
+            component.name: read_component(component) for component in structure.components
         }
         self.left_out: list[str] = []
         self.structure = structure
@@ -402,4 +420,8 @@ class Wiring:
             fits = whole and math.isfinite(number) and not isinstance(value, bool)
         if not fits:
             raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
+        if variable.items and number not in variable.items.values():
+            raise CouplingError(
+                f"{end} cannot be set to {value!r}: it is an enumeration of {variable.item_list}."
+            )
         return number

@@ -117,9 +117,12 @@ class Input(Scalar):
 
 
 class Parameter(Input):
-    """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another."""
+    """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another.
 
-    value: Number | None = None
+    It is a text for a parameter that is one (of the unit "1"), and may be the name of an enumeration's item.
+    """
+
+    value: Number | str | None = None
 
 
 class Vector(Section):
@@ -204,6 +207,9 @@ class Header(Section):
         Communication steps between two observations; the inputs are held meanwhile.
     start_time : float
         Where the FMU begins [s].
+    stop_time : float, optional
+        End of the experiment that the FMU is told at its start [s]; some do not start without one. The asset
+        itself does not stop there.
     fmi_version : {"1.0", "2.0", "3.0"}, optional
         What the FMU must be; any of them if absent.
     interface : {"co-simulation", "model-exchange"}, optional
@@ -226,6 +232,7 @@ class Header(Section):
     step_size: Positive
     decimation: int = Field(default=1, ge=1, le=10_000_000)
     start_time: Number = 0.0
+    stop_time: Number | None = None
     fmi_version: Literal["1.0", "2.0", "3.0"] | None = None
     interface: Interface | None = None
     tolerance: Positive | None = None
@@ -233,6 +240,12 @@ class Header(Section):
     structural_parameters: dict[str, Number] = Field(default_factory=dict)
     state: Literal["auto", "serialised", "replay"] = "auto"
     description: str = ""
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield an end that does not come after the start."""
+        if self.stop_time is not None:
+            sentence = f"stop_time {self.stop_time:g} s must come after start_time {self.start_time:g} s"
+            yield self.stop_time <= self.start_time, sentence
 
 
 class Binding(Section):

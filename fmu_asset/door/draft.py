@@ -95,7 +95,7 @@ def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> l
     outputs = [variable for variable in usable if variable.causality == "output"]
     inner = [v for v in usable if v.causality in _INNER and v.kind in FLOAT_KINDS]
     if not (outputs or inner):
-        raise BindingError(f"{description.path} has no number that could be observed.")
+        raise BindingError(f"{description.label} has no number that could be observed.")
     return outputs or inner[:1]
 
 

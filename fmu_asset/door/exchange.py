@@ -19,8 +19,11 @@ from .units import IDENTITY, conversion
 _LARGEST = sys.float_info.max
 _NOWHERE = (0, 1.0, 0.0)
 
-Values = Mapping[str, float | Sequence[float]]
-"""Values by the binding's names: a number, or as many as the bound array or port has."""
+Values = Mapping[str, float | str | Sequence[float] | Sequence[str]]
+"""Values by the binding's names: a number, or as many as the bound array or port has.
+
+The value of an enumeration may be the name of its item; that of a parameter that is a text is the text.
+"""
 
 Histories = Mapping[str, npt.ArrayLike]
 """Inputs by the binding's names: a number for all steps, or one for each; (n,) or (N, n) for an array."""
@@ -42,12 +45,20 @@ def check_roles(inputs: Inputs) -> None:
             raise TypeError(f"Inputs are {', '.join(Inputs.__annotations__)}, and {role!r} came.")
 
 
-def plain_values(values: Values) -> dict[str, float | list[float]]:
-    """Return values as floats and lists of floats in the order of their names, to be kept as JSON."""
-    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in sorted(values.items())}
-    return {
-        name: array.item() if array.ndim == 0 else array.ravel().tolist() for name, array in arrays.items()
-    }
+PlainValue = float | str | list[float] | list[str]
+
+
+def plain_values(values: Values) -> dict[str, PlainValue]:
+    """Return values as floats, texts and lists of them in the order of their names, to be kept as JSON."""
+    return {name: _plain_value(value) for name, value in sorted(values.items())}
+
+
+def _plain_value(value: float | str | Sequence[float] | Sequence[str]) -> PlainValue:
+    array = np.asarray(value)
+    if array.dtype.kind != "U":
+        array = np.asarray(value, dtype=np.float64)
+    plain: PlainValue = array.item() if array.ndim == 0 else array.ravel().tolist()
+    return plain
 
 
 class Exchange:
@@ -69,6 +80,8 @@ class Exchange:
         Names of all values of the reply block.
     sent, read : tuple of VariableInfo
         What stands in the request and in the reply block, in order.
+    health_slots : dict of str to Slot
+        Health that is a parameter or start value of the FMU, which is set before the initialisation only.
 
     Raises
     ------
@@ -98,6 +111,7 @@ class Exchange:
             substeps=binding.binding.decimation,
             tolerance=binding.binding.tolerance or description.tolerance,
             solver_tolerance=binding.binding.tolerance or min(description.tolerance or 1.0, SOLVER_TOLERANCE),
+            stop_time=binding.binding.stop_time,
             configuration=configuration,
         )
 
@@ -137,10 +151,14 @@ class Exchange:
 
     def _make_inputs(self) -> None:
         """Lay out the request block: time, step size, all inputs."""
+        health_at_start = {
+            name: item for name, item in self.binding.health.items() if self._is_set_at_start(item.variable)
+        }
         wanted: list[tuple[str, str, Input, tuple[str, ...]]] = [
             (role, name, item, (item.variable,))
             for role in INPUT_ROLES
             for name, item in self.binding.inputs(role).items()
+            if not (role == "health" and name in health_at_start)
         ]
         wanted += [
             ("port", name, Input(variable=vector.variables[0], unit=vector.units[0]), vector.variables)
@@ -177,12 +195,28 @@ class Exchange:
             }
             for role, slots in self._slots.items()
         }
-        named = self.binding.parameter.items()
-        self._parameter_slots = {name: self._parameter_slot(name, item) for name, item in named}
+        self.health_slots = {
+            name: self._start_slot(f"health.{name}", item) for name, item in health_at_start.items()
+        }
+        self._text_parameters: dict[str, VariableInfo] = {}
+        self._parameter_slots: dict[str, Slot] = {}
+        for name, item in self.binding.parameter.items():
+            text = self.description.variable(item.variable)
+            if text is not None and text.is_text_parameter:
+                self._text_parameters[name] = text
+            else:
+                self._parameter_slots[name] = self._start_slot(f"parameter.{name}", item)
 
-    def _parameter_slot(self, name: str, item: Input) -> Slot:
-        """Return the slot of a parameter, whose positions count from the variable's own values."""
-        label = f"parameter.{name}"
+    def _is_set_at_start(self, name: str) -> bool:
+        """Return whether a variable can be set before the initialisation only."""
+        variable = self.description.variable(name) or self.description.variable(name.rpartition("[")[0])
+        if variable is None:
+            return False
+        tunable = variable.variability == "tunable" and self.description.interface == "co-simulation"
+        return variable.startable or (variable.causality == "parameter" and not tunable)
+
+    def _start_slot(self, label: str, item: Input) -> Slot:
+        """Return where a value goes before initialisation; positions count from the variable's own values."""
         place = self._find(item.variable, label, "parameter")
         return self._slot(label, item, place.variable, place.elements)
 
@@ -191,7 +225,7 @@ class Exchange:
         if self.binding.binding.interpolation == "zero-order":
             return
         asked = f"The binding {self.binding.name} asks for linear interpolation of inputs, but"
-        path = self.description.path
+        path = self.description.label
         if not self.description.can_interpolate_inputs:
             why = (
                 "FMI 3.0 has no derivatives of inputs in co-simulation"
@@ -207,9 +241,18 @@ class Exchange:
         variable = self.description.variable(name)
         bound = {slot.variable.name for slot in self._parameter_slots.values()}
         if variable is None or variable.causality != "parameter" or name in bound:
-            known = self._parameter_slots
+            known = self.binding.parameter
             raise BindingError(said("binding.no_parameter", self=self, name=name, known=known))
-        return self._parameter_slot(name, Input(variable=name, unit=variable.unit or "1"))
+        return self._start_slot(f"parameter.{name}", Input(variable=name, unit=variable.unit or "1"))
+
+    def _text_parameter(self, name: str) -> VariableInfo | None:
+        """Return the text that a name of the binding, or else of the FMU, means; None if it means none."""
+        if name in self._text_parameters or name in self._parameter_slots:
+            return self._text_parameters.get(name)
+        variable = self.description.variable(name)
+        bound = {variable.name for variable in self._text_parameters.values()}
+        is_own = variable is not None and variable.is_text_parameter and name not in bound
+        return variable if is_own else None
 
     def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
         scale = conversion(item.unit, variable, self.description.units_of(variable), where=label)
@@ -274,7 +317,7 @@ class Exchange:
             values += start_values(self.description, variable, given=variable.name in whole)
         return values + values[2 : 2 + self.plan.linear_count]
 
-    def settings(self, parameters: Values) -> Settings:
+    def settings(self, parameters: Values, health: Values | None = None) -> Settings:
         """Return what is set before initialisation: the values of the binding, then the caller's.
 
         Parameters
@@ -282,6 +325,8 @@ class Exchange:
         parameters : mapping of str to float or sequence of float
             By the binding's names and in its units; a parameter that the binding does not name goes by its
             name in the FMU, in the FMU's unit.
+        health : mapping of str to float, optional
+            Health that can be set at a start only, by the binding's names and in its units.
 
         Returns
         -------
@@ -297,8 +342,18 @@ class Exchange:
         """
         fixed = {n: entry.value for n, entry in self.binding.parameter.items() if entry.value is not None}
         set_values: dict[str, tuple[str, int, list[float]]] = {}
+        texts: Settings = []
+        slots: list[tuple[Slot, Any]] = []
         for name, value in {**fixed, **parameters}.items():
-            slot = self._parameter_slots.get(name) or self._own_slot(name)
+            text_parameter = self._text_parameter(name)
+            if text_parameter is None:
+                slots.append((self._parameter_slots.get(name) or self._own_slot(name), value))
+            elif isinstance(value, str):
+                texts.append(("String", text_parameter.reference, [value]))
+            else:
+                raise FmuInputError(f"parameter.{name} must be a text, but is {value!r}.")
+        slots += [(self.health_slots[name], value) for name, value in (health or {}).items()]
+        for slot, value in slots:
             variable = slot.variable
             if variable.name not in set_values:
                 kind = self.description.exchange_kind(variable)
@@ -307,7 +362,14 @@ class Exchange:
                 set_values[variable.name] = (kind, variable.reference, start)
             for position, number in zip(slot.positions, slot.numbers(value).tolist(), strict=True):
                 set_values[variable.name][2][position] = number
-        return list(set_values.values())
+        return [*set_values.values(), *texts]
+
+    def without_start_health(self, inputs: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return inputs by role without the health that is set at a start only, and that health."""
+        health = inputs.get("health") or {}
+        at_start = {name: value for name, value in health.items() if name in self.health_slots}
+        sent = {name: value for name, value in health.items() if name not in self.health_slots}
+        return {**inputs, "health": sent}, at_start
 
     def place(self, target: Any, inputs: Mapping[str, Any]) -> bool:
         """Put inputs where they belong; return whether there were any.
@@ -371,22 +433,36 @@ class Exchange:
             (self.slot(role, name), v) for role, part in roles.items() for name, v in (part or {}).items()
         ]
         arrays = [(slot, slot.numbers(values, history=True)) for slot, values in given]
-        count, source = steps, "`steps`"
-        if count is not None and (count := operator.index(count)) < 1:
-            raise FmuInputError(f"steps must be at least 1, but is {count}.")
-        for slot, array in arrays:
-            if array.ndim == 2:
-                if count is None:
-                    count, source = len(array), slot.label
-                elif len(array) != count:
-                    came = len(array)
-                    raise FmuInputError(said("inputs.steps", slot=slot, came=came, source=source, of=count))
-        if not count:
-            raise FmuInputError(said("inputs.no_steps"))
-        rows = np.tile(held, (count, 1))
+        rows = np.tile(held, (self.step_count(arrays, steps), 1))
         for slot, array in arrays:
             rows[:, list(slot.positions)] = array
         return rows
+
+    @staticmethod
+    def step_count(histories: Sequence[tuple[Slot, npt.NDArray[np.float64]]], steps: int | None) -> int:
+        """Return the number of steps that histories, and who asks for them, agree on.
+
+        Raises
+        ------
+        FmuInputError
+            If they do not agree, or nothing says a number.
+        """
+        count, source = steps, "`steps`"
+        if count is not None:
+            count = operator.index(count)
+            if count < 1:
+                raise FmuInputError(f"steps must be at least 1, but is {count}.")
+        for slot, array in histories:
+            if array.ndim != 2:
+                continue
+            if count is None:
+                count, source = len(array), slot.label
+            elif len(array) != count:
+                came = len(array)
+                raise FmuInputError(said("inputs.steps", slot=slot, came=came, source=source, of=count))
+        if not count:
+            raise FmuInputError(said("inputs.no_steps"))
+        return count
 
     def slot(self, role: str, name: str) -> Slot:
         """Return where an input goes.
@@ -397,6 +473,8 @@ class Exchange:
             If the binding has no such input.
         """
         slot = self._slots.get(role, {}).get(name)
+        if slot is None and role == "health":
+            slot = self.health_slots.get(name)
         if slot is None:
             known = ", ".join(self._slots.get(role, {})) or "none"
             raise BindingError(f"The binding {self.binding.name} has no {role} {name!r}; it has {known}.")

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuInputError, said
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text
@@ -142,7 +142,7 @@ def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistor
 _STEPS = 500
 _MOST_STEPS = 10_000_000
 
-Value = float | list[float]
+Value = float | str | list[float] | list[str]
 Bound = TypeVar("Bound", Input, Parameter)
 
 
@@ -184,35 +184,75 @@ def default_experiment(
         End [s]; the FMU's own, or one second after its start.
     step_size : float, optional
         Communication step size [s]; the FMU's own, or a 500th of the time to the end.
-    values : mapping of str to float or list, optional
-        Parameters (structural ones, too) and inputs by the names of the FMU's variables, in its units.
+    values : mapping of str to float, str or list, optional
+        Parameters (structural ones, too) and inputs by the names of the FMU's variables, in its units. A text
+        is read as `value_of_text` does.
 
     Raises
     ------
     BindingError
         If the FMU has no number to observe, or no parameter or input of a name, or the step is not positive.
     FmuInputError
-        If the end does not come after the start, or the steps are too many.
+        If the end does not come after the start, the steps are too many, or a text is no value.
     """
-    end = description.stop_time if stop_time is None else stop_time
-    steps, size = _steps_to(description.start_time or 0.0, end, description.step_of(step_size))
+    start = description.start_time or 0.0
+    wanted_end = description.stop_time if stop_time is None else stop_time
+    end = start + 1.0 if wanted_end is None else wanted_end
+    steps, size = _steps_to(start, end, description.step_of(step_size))
     binding = whole_binding(description, step_size=size)
     structural = [v.name for v in description.variables if v.causality == "structuralParameter"]
-    values = values or {}
     known = [*binding.parameter, *binding.load, *structural]
-    for name in values:
-        if name not in known:
-            raise BindingError(said("inputs.no_variable", fmu=description, name=name, known=known))
+    numbers: dict[str, Value] = {}
+    for name, value in (values or {}).items():
+        variable = description.variable(name)
+        if name not in known or variable is None:
+            raise BindingError(
+                f"{description.label} has no parameter or input {name!r} that can be set; it has "
+                f"{', '.join(known) or 'none'}."
+            )
+        numbers[name] = value_of_text(variable, value) if isinstance(value, str) else value
     parameters, load, sizes = (
-        {name: value for name, value in values.items() if name in names}
+        {name: value for name, value in numbers.items() if name in names}
         for names in (binding.parameter, binding.load, structural)
     )
-    binding = binding.with_header(structural_parameters=sizes)
+    # The last step may lead beyond the end that was asked for, where that is not a whole number of steps.
+    last_step_end = start + steps * size
+    told_end = last_step_end if last_step_end > end + _TIME_TOLERANCE * size else end
+    binding = binding.with_header(structural_parameters=sizes, stop_time=told_end)
     return Experiment(binding, steps, parameters, {"load": load})
 
 
+def value_of_text(variable: VariableInfo, text: str) -> Value:
+    """Return the value that a text, as somebody types it, means for a variable.
+
+    Parameters
+    ----------
+    variable : VariableInfo
+        The parameter or input. If it is a text, the text is its value as it stands.
+    text : str
+        A number, true or false, or the name of an enumeration's item; of an array several with commas.
+
+    Raises
+    ------
+    FmuInputError
+        If it is no such thing.
+    """
+    if variable.is_text_parameter or text in variable.items:
+        return text
+    numbers = []
+    for word in text.split(","):
+        plain = word.strip()
+        plain = {"true": "1", "false": "0"}.get(plain, plain)
+        try:
+            numbers.append(float(variable.items.get(plain, plain)))
+        except ValueError:
+            wanted = f"one of {variable.item_list}" if variable.items else "a number"
+            raise FmuInputError(f"{variable.name} must be {wanted}, but is {text!r}.") from None
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
 def whole_binding(description: FmuDescription, *, step_size: float | None = None) -> Binding:
-    """Return a binding of all numbers of an FMU, by their own names and in its units.
+    """Return a binding of all numbers and text parameters of an FMU, by their own names and in its units.
 
     Parameters
     ----------
@@ -228,8 +268,10 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
     """
     usable = [v for v in description.variables if bindable(v)]
 
+    settable = [*usable, *(v for v in description.variables if v.is_text_parameter)]
+
     def of(causality: str, kind: type[Bound]) -> dict[str, Bound]:
-        found = [v for v in usable if v.causality == causality and v.variability != "constant"]
+        found = [v for v in settable if v.causality == causality and v.variability != "constant"]
         return {v.name: kind(variable=v.name, unit=v.unit or "1") for v in found}
 
     return Binding(
@@ -247,15 +289,14 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
     )
 
 
-def _steps_to(start: float, end: float | None, size: float | None) -> tuple[int, float]:
-    """Return number and size of the steps to an end: a second, and 500 steps, where nothing says more.
+def _steps_to(start: float, end: float, size: float | None) -> tuple[int, float]:
+    """Return number and size of the steps to an end: 500 of them where nothing says more.
 
     Raises
     ------
     FmuInputError
         If the end does not come after the start, or the steps are too many.
     """
-    end = start + 1.0 if end is None else end
     if not (math.isfinite(end) and end > start):
         raise FmuInputError(said("inputs.end", start=start, end=end))
     size = size or (end - start) / _STEPS
@@ -264,6 +305,23 @@ def _steps_to(start: float, end: float | None, size: float | None) -> tuple[int,
         ends = start, end
         raise FmuInputError(said("inputs.most_steps", ends=ends, steps=steps, size=size, most=_MOST_STEPS))
     return steps, size
+
+
+def ending_with_histories(binding: Binding, steps: int) -> Binding:
+    """Return the binding with the end of a file's histories as its stop time, unless it has one.
+
+    Parameters
+    ----------
+    binding : Binding
+        The binding.
+    steps : int
+        Number of rows of the file: each is a step, but for the first one under linear interpolation.
+    """
+    header = binding.binding
+    moves = steps if header.interpolation == "zero-order" else steps - 1
+    if header.stop_time is not None or moves < 1:
+        return binding
+    return binding.with_header(stop_time=header.start_time + moves * binding.interval)
 
 
 def fly_histories(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:

@@ -58,7 +58,7 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     variable = description.variable(name)
     place = _element(description, name, label) if variable is None else Place(variable, range(variable.size))
     if place is None:
-        unknown = f"{label} names {name!r}, which is not a variable of {description.path}"
+        unknown = f"{label} names {name!r}, which is not a variable of {description.label}"
         raise BindingError(unknown + description.hint(name))
     variable = place.variable
     sent = (
@@ -209,6 +209,7 @@ class Slot(NamedTuple):
             If there are others than n values, or one is no number, not finite, not whole or out of range.
         """
         count = len(self.positions)
+        given = self._without_names(given)
         try:
             array = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -233,7 +234,9 @@ class Slot(NamedTuple):
             inside = np.clip(values, self.low, self.high)
             near = np.abs(inside - values) <= 1e-12 * np.maximum(np.abs(inside), 1.0)
             whole = np.floor(values) == values if self.whole else True
-            wrong_ones = np.argwhere(~(np.isfinite(values) & near & whole))
+            items = self.variable.items
+            defined = np.isin(values, [*items.values()]) if items else True
+            wrong_ones = np.argwhere(~(np.isfinite(values) & near & whole & defined))
         if len(wrong_ones):
             step, element = wrong_ones[0].tolist()
             where = f" It is the value of step {step} of the {len(rows)}." if per_step else ""
@@ -242,9 +245,34 @@ class Slot(NamedTuple):
         inside = np.where((self.low <= values) & (values <= self.high), values, inside)
         return inside if per_step else inside[0]
 
+    def _without_names(self, given: Any) -> Any:
+        """Return values with the names of an enumeration's items replaced by their numbers."""
+        if not self.variable.items:
+            return given
+        if isinstance(given, str):
+            return self._number_of_item(given)
+        if isinstance(given, np.ndarray) and given.dtype.kind == "U":
+            given = given.tolist()
+        if isinstance(given, list | tuple):
+            return [self._number_of_item(item) if isinstance(item, str) else item for item in given]
+        return given
+
+    def _number_of_item(self, name: str) -> float:
+        if name not in self.variable.items:
+            raise FmuInputError(
+                f"{self.label} must be an item of the enumeration {self.variable.name!r} "
+                f"({self.variable.item_list}), but is {name!r}; nothing was sent to the FMU."
+            )
+        return float(self.variable.items[name])
+
     def _refusal(self, given: float, number: float) -> str:
         if not math.isfinite(number):
             return f"{self.label} must be finite, but is {given!r}; nothing was sent to the FMU."
+        if self.variable.items:
+            return (
+                f"{self.label} must be an item of the enumeration {self.variable.name!r} "
+                f"({self.variable.item_list}), but is {given!r}; nothing was sent to the FMU."
+            )
         if self.whole and not float(number).is_integer():
             return f"{self.label} must be a whole number, but is {given!r}; nothing was sent to the FMU."
         return (
@@ -318,6 +346,16 @@ class ObservationHistory:
     values: Float
     extra: dict[str, Float]
     ended: str = ""
+
+
+def joined_histories(parts: Sequence[ObservationHistory]) -> ObservationHistory:
+    """Return what came out of steps that were made in several parts, one after the other."""
+    return ObservationHistory(
+        np.concatenate([part.time for part in parts]),
+        np.vstack([part.values for part in parts]),
+        {name: np.concatenate([part.extra[name] for part in parts]) for name in parts[0].extra},
+        parts[-1].ended,
+    )
 
 
 class OutputTable:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.errors import FmuError, FmuOutputError, FmuStateError, said
 from fmu_asset.instances.base import status_name
@@ -22,7 +23,7 @@ from fmu_asset.instances.plan import Instance
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
-from .exchange import Exchange, Inputs, Values, check_roles, plain_values
+from .exchange import Exchange, Inputs, PlainValue, Values, check_roles, plain_values
 from .layout import Observation
 from .placement import Housing, Start, limits_of
 
@@ -86,8 +87,12 @@ class SavedState(PackedState):
         SHA-256 of the FMU file.
     step_size, start_time : float
         Time between observations and start of the binding [s].
-    parameters : dict of str to float, or to a list for an array
+    parameters : dict of str to float or text, or to a list for an array
         As the caller gave them.
+    health : dict of str to float
+        Health that was set at the start of the instance, by the binding's names and in its units.
+    first_index : int
+        Number of the step at which the instance was started: 0, or where such health changed last.
     start_inputs : bytes
         Inputs during initialisation, as doubles; empty if the FMU's start values held.
     inputs : bytes
@@ -104,7 +109,9 @@ class SavedState(PackedState):
     fmu: str
     step_size: float
     start_time: float
-    parameters: dict[str, float | list[float]]
+    parameters: dict[str, PlainValue]
+    health: dict[str, PlainValue] = Field(default_factory=dict)
+    first_index: int = Field(0, ge=0)
     start_inputs: bytes
     inputs: bytes
     outputs: bytes
@@ -149,7 +156,7 @@ class OpenedFmu:
 
     def __init__(
         self,
-        fmu_path: str | os.PathLike[str],
+        fmu_path: str | os.PathLike[str] | FmuDescription,
         binding: Binding | str | os.PathLike[str],
         *,
         isolated: bool = True,
@@ -160,7 +167,11 @@ class OpenedFmu:
     ) -> None:
         given = binding if isinstance(binding, Binding) else load_binding(binding)
         limits = limits_of(given, step_timeout, load_timeout, memory_limit)
-        exchange = Exchange(read_fmu(fmu_path, given.binding.interface), given)
+        if isinstance(fmu_path, FmuDescription):
+            description = fmu_path
+        else:
+            description = read_fmu(fmu_path, given.binding.interface)
+        exchange = Exchange(description, given)
         housing = Housing(exchange.description, exchange.plan, limits, isolated=isolated)
         self._settle(exchange, housing, parameters or {})
 
@@ -178,7 +189,8 @@ class OpenedFmu:
         )
         self._start_time, self._interval = self.binding.binding.start_time, self.binding.interval
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
-        self.step_index = 0
+        self.step_index = self._first_index = 0
+        self._health: dict[str, PlainValue] = {}
         self._set_parameters(parameters)
         self._step_size = self.binding.step_size
         self._lines = exchange.plan.linear_count
@@ -319,29 +331,63 @@ class OpenedFmu:
         other._phase, other.step_index = "new", 0
         other._record, other._start_inputs = [], b""
         other._log = deque(maxlen=_LOG_LENGTH)
-        if parameters is not None:
-            other._set_parameters(parameters)
+        other._first_index = 0
+        other._health = {}
+        if parameters is not None or self._health:
+            other._set_parameters(self._parameters if parameters is None else parameters)
         return other
 
     # ------------------------------------------------------------------ inside
 
     def _set_parameters(self, parameters: Values) -> None:
-        self._settings, self._parameters = self._exchange.settings(parameters), plain_values(parameters)
+        self._settings = self._exchange.settings(parameters, self._health)
+        self._parameters = plain_values(parameters)
 
     def _start_anew(self, inputs: Mapping[str, Any], *, renewed: bool = False) -> None:
+        if self._exchange.health_slots:
+            inputs, health = self._exchange.without_start_health(inputs)
+            self._settings = self._exchange.settings(self._parameters, health)
+            self._health = plain_values(health)
         start = self._exchange.start_values(inputs)
         given = self._exchange.place(start, inputs)
         self._begin(start, with_inputs=given, renewed=renewed)
 
-    def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
-        start = Start(self._start_time, self._settings, request, with_inputs)
+    def _enter_health(self, inputs: Mapping[str, Any]) -> dict[str, Any]:
+        """Start the FMU anew where health that is set at a start only changes; return the other inputs.
+
+        It starts at this moment and under the inputs that hold now; what it remembers of earlier steps is
+        lost.
+        """
+        inputs, health = self._exchange.without_start_health(inputs)
+        wanted = self._health | plain_values(health)
+        if wanted == self._health:
+            return inputs
+        settings = self._exchange.settings(self._parameters, wanted)
+        if self._phase == "ready":
+            request, with_inputs = list(self._request), True
+            self._exchange.place(request, inputs)
+        else:
+            self._refuse_closed()
+            request = self._exchange.start_values(inputs)
+            with_inputs = self._exchange.place(request, inputs)
+        self._settings = settings
+        self._health = wanted
+        self._begin(request, with_inputs=with_inputs, index=self.step_index)
+        return inputs
+
+    def _begin(
+        self, request: list[float], *, with_inputs: bool, renewed: bool = False, index: int = 0
+    ) -> None:
+        """Bring an instance to its start, which is the moment after `index` steps of the asset."""
+        time = self._start_time + index * self._interval
+        start = Start(time, self._settings, request, with_inputs)
         try:
             instance = self._housing.start(start, renewed=renewed)
             self._adopt(instance)
         except FmuError as error:
             self.close()
             self._fail(error, "the start")
-        self.step_index = 0
+        self.step_index = self._first_index = index
         self._record = []
         self._start_inputs = bytes(instance.request)[16:] if with_inputs else b""
         self._phase = "ready"
@@ -364,15 +410,18 @@ class OpenedFmu:
 
         Where a step gives a whole array that was resized, its start values need not fit.
         """
-        if self._phase == "broken":
-            raise FmuStateError("A state could not be restored; reset the asset to go on.")
-        if self._phase == "closed":
-            raise FmuStateError("The asset is closed; reset it to start anew.")
+        self._refuse_closed()
         if self._phase == "new":
             # Without them: what keeps its start values, and lines, which begin at them.
             known = given if self.binding.binding.structural_parameters and not self._lines else None
             self._begin(self._exchange.start_values(known or {}), with_inputs=False)
         return self._instance
+
+    def _refuse_closed(self) -> None:
+        if self._phase == "broken":
+            raise FmuStateError("A state could not be restored; reset the asset to go on.")
+        if self._phase == "closed":
+            raise FmuStateError("The asset is closed; reset it to start anew.")
 
     def _observation(self) -> Observation:
         self._refuse_not_finite()
@@ -396,6 +445,6 @@ class OpenedFmu:
             tool = what == "the start" and self.description.needs_tool
             hint = " It declares that it needs its authoring tool on this machine." if tool else ""
             raise type(error)(
-                f"{self.description.path}, {what}: {error.sentence}{hint}", error.messages, error.time
+                f"{self.description.label}, {what}: {error.sentence}{hint}", error.messages, error.time
             ) from error
         raise error

@@ -117,13 +117,13 @@ class ResetTrial:
         self.works, self.way = False, Way.RENEWAL
         self.fault = "It cannot be reset; every start takes a new instance."
 
-    def agrees(self, path: Path, way: Way, reply: Float) -> bool:
+    def agrees(self, label: str, way: Way, reply: Float) -> bool:
         """Return whether a start can be believed; if not, say it once and turn to the next way for good.
 
         Parameters
         ----------
-        path : Path
-            The FMU.
+        label : str
+            What the FMU is called.
         way : Way
             How it was started.
         reply : (n,) ndarray
@@ -146,9 +146,9 @@ class ResetTrial:
             f"{what} (an output is {reply[at]:.9g} where that of a new instance is {true[at]:.9g}); "
             f"every start takes a new {instead} instead.{doubted}"
         )
-        if (path, way) not in _said:
-            _logger.warning("%s: %s", path, self.fault)
-            _said.add((path, way))
+        if (label, way) not in _said:
+            _logger.warning("%s: %s", label, self.fault)
+            _said.add((label, way))
         return False
 
 
@@ -275,7 +275,7 @@ class Housing:
         if trial.first is None:
             trial.first, trial.reply = (start, request), np.array(reply)
             return None
-        same = (start, request) != trial.first or trial.agrees(self._description.path, self._way, reply)
+        same = (start, request) != trial.first or trial.agrees(self._description.label, self._way, reply)
         return None if same else self.start(start)
 
     def renew(self) -> Instance:
@@ -305,7 +305,7 @@ class Housing:
                 instance = again()
                 if trial.first is None:
                     return instance
-                if trial.agrees(self._description.path, self._way, trial.first_step(instance)):
+                if trial.agrees(self._description.label, self._way, trial.first_step(instance)):
                     return again()
         self._way = Way.LOADING
         return self._another()
@@ -344,7 +344,7 @@ class Housing:
         grants = self._limits.grants
         if grants is not None and (missing := missing_path(grants, plan.folder)):
             raise FmuInputError(said("binding.grant", missing=missing))
-        say_sandbox(self._description.path, grants)
+        say_sandbox(self._description.label, grants)
         scratch = plain_folder()
         try:
             return WorkerInstance(plan, scratch, limits=self._limits)
@@ -365,10 +365,10 @@ def _release(instance: Instance, extraction: Extraction) -> None:
         forget_modules(str(extraction.folder))
 
 
-def say_sandbox(path: Path, grants: Grants | None) -> None:
+def say_sandbox(label: str, grants: Grants | None) -> None:
     """Say once that FMUs, or that this one, are not kept from the user's files, where that is so."""
     if grants is None:
-        said = f"{path}: its binding turns the sandbox off, so that it has all rights of its user."
+        said = f"{label}: its binding turns the sandbox off, so that it has all rights of its user."
     elif not landlock_version():
         said = (
             "This kernel has no Landlock (Linux 5.13 or later), so that FMUs have all rights of their user; "

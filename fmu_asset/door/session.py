@@ -1,20 +1,26 @@
 """`FmiAsset`: the only door to an FMU. It knows FMI and roles, not wings."""
 
-from typing import Self
+from collections.abc import Mapping
+from typing import Any, Self
 
 import numpy as np
 
-from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, said
+from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, said
 from fmu_asset.instances.plan import Instance
 from reporting.arrays import Float
 from reporting.progress import Progress, Stage, reporter
 
 from .exchange import Histories, Values, plain_values
-from .layout import Observation, ObservationHistory
+from .health_at_start import courses_of_equal_health
+from .layout import Observation, ObservationHistory, joined_histories
 from .life import OpenedFmu, SavedState
 
 _BLOCK_BYTES = 2**20
 """Of the requests or replies that are sent in one message."""
+_REPLAY_INSTEAD = (
+    'If it cannot save and restore its state, though it declares so, write `state = "replay"` into [binding] '
+    "of its binding."
+)
 
 
 class FmiAsset(OpenedFmu):
@@ -25,8 +31,8 @@ class FmiAsset(OpenedFmu):
 
     Parameters
     ----------
-    fmu_path : path-like
-        An FMU of FMI 1, 2 or 3, for co-simulation or model exchange.
+    fmu_path : path-like or FmuDescription
+        An FMU of FMI 1, 2 or 3, for co-simulation or model exchange, or what `read_fmu` returned for it.
     binding : Binding or path-like
         The binding, or its file.
     isolated : bool
@@ -96,7 +102,9 @@ class FmiAsset(OpenedFmu):
         FmuWorkerError, FmuTimeoutError
             If the worker died or took too long.
         """
-        inputs = {"control": control, "health": health, "load": load, "port": port}
+        inputs: dict[str, Any] = {"control": control, "health": health, "load": load, "port": port}
+        if self._exchange.health_slots:
+            inputs = self._enter_health(inputs)
         instance = self._opened(inputs)
         request = self._request
         before = request.tobytes()
@@ -135,7 +143,9 @@ class FmiAsset(OpenedFmu):
         FmuInputError, BindingError
             As `step`.
         """
-        inputs = {"control": control, "health": health, "load": load, "port": port}
+        inputs: dict[str, Any] = {"control": control, "health": health, "load": load, "port": port}
+        if self._exchange.health_slots:
+            inputs = self._enter_health(inputs)
         self._opened(inputs)
         before = self._request.tobytes()
         try:
@@ -178,7 +188,27 @@ class FmiAsset(OpenedFmu):
             As `step`; the message says at which step. A worker that dies or takes too long reports every 20
             ms: the step named may be a little early.
         """
-        roles = {"control": control, "health": health, "load": load, "port": port}
+        roles: dict[str, Any] = {"control": control, "health": health, "load": load, "port": port}
+        if self._exchange.health_slots:
+            return self._simulate_states(roles, steps, progress)
+        return self._simulate(roles, steps, progress)
+
+    def _simulate_states(
+        self, roles: Mapping[str, Any], steps: int | None, progress: Progress | None
+    ) -> ObservationHistory:
+        """Make many steps, each run of equal health after a start of its own."""
+        histories = []
+        for course in courses_of_equal_health(self._exchange, roles, steps):
+            self._enter_health(course.first_inputs)
+            histories.append(self._simulate(course.histories, course.steps, progress))
+            if histories[-1].ended:
+                break
+        return joined_histories(histories)
+
+    def _simulate(
+        self, roles: Mapping[str, Any], steps: int | None, progress: Progress | None
+    ) -> ObservationHistory:
+        """Make many steps in one instance; see `simulate`."""
         self._opened(roles)
         rows = self._exchange.rows(np.array(self._request), roles, steps)
         index = np.arange(self.step_index, self.step_index + len(rows) + 1)
@@ -271,11 +301,9 @@ class FmiAsset(OpenedFmu):
         if self.state_method == "serialised":
             try:
                 body = self._instance.save()
-            except FmuCallError as error:
-                hint = 'If it cannot save its state, write `state = "replay"` into [binding] of its binding.'
-                self._fail(FmuCallError(f"{error.sentence} {hint}", error.messages), "saving the state")
             except FmuError as error:
-                self._fail(error, "saving the state")
+                told = type(error)(f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time)
+                self._fail(told, "saving the state")
         else:
             body = b"".join(self._record)
         return SavedState(
@@ -285,6 +313,8 @@ class FmiAsset(OpenedFmu):
             step_size=self._interval,
             start_time=self._start_time,
             parameters=self._parameters,
+            health=self._health,
+            first_index=self._first_index,
             start_inputs=self._start_inputs,
             inputs=bytes(self._instance.request)[16:],
             outputs=self._outputs_now(),
@@ -307,19 +337,23 @@ class FmiAsset(OpenedFmu):
         self._refuse_foreign(saved, width)
         replayed = saved.method == "replay"
         ready = self._phase == "ready" and not self._instance.lost
-        same = (plain_values(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
+        same = (plain_values(saved.parameters), saved.start_inputs) == (
+            self._parameters,
+            self._start_inputs,
+        ) and (saved.health, saved.first_index) == (self._health, self._first_index)
         # An instance that was initialised in the same way takes the state as it is: what an ensemble needs.
         if replayed or not (ready and same):
+            self._health = dict(saved.health)
             self._set_parameters(saved.parameters)
             # Arrays that were resized may have no start values: zeros keep their place, and are not sent.
             empty = bytes(width) if self.binding.binding.structural_parameters else b""
             held = np.frombuffer(saved.start_inputs or empty).tolist()
             start = [0.0, 0.0, *held] if held else self._exchange.start_values({})
-            self._begin(start, with_inputs=bool(saved.start_inputs))
+            self._begin(start, with_inputs=bool(saved.start_inputs), index=saved.first_index)
         instance = self._instance
         try:
             if replayed:
-                for index in range(saved.index):
+                for index in range(saved.index - saved.first_index):
                     inputs = saved.body[index * width : (index + 1) * width]
                     self._request[0], self._request[1] = self.time, self._step_size
                     self._request.cast("B")[16:] = inputs
@@ -333,6 +367,8 @@ class FmiAsset(OpenedFmu):
             saved.refuse_other_outputs(self._outputs_now(), self._exchange.output_names)
         except FmuError as error:
             self._phase = "broken"
+            if not replayed and not isinstance(error, FmuStateError):  # whose sentence says it
+                error = type(error)(f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time)
             self._fail(error, "restoring the state")
 
     def fork(self) -> Self:
@@ -366,7 +402,8 @@ class FmiAsset(OpenedFmu):
             saved.method != self.state_method
             or len(saved.inputs) != width
             or len(saved.start_inputs) not in (0, width)
-            or (saved.method == "replay" and len(saved.body) != width * saved.index)
+            or not saved.first_index <= saved.index
+            or (saved.method == "replay" and len(saved.body) != width * (saved.index - saved.first_index))
         ):
             raise FmuStateError(said("state.damaged"))
 

@@ -33,6 +33,10 @@ STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
 ACCEPTED = frozenset({OK, WARNING})
 _MESSAGES_IN_ERROR = 10
+_NO_STOP_TIME = (
+    ". It was told no end of the experiment: if it asks for one, give `stop_time` in the table [binding] of "
+    "its binding"
+)
 
 Calls = list[tuple[str, Callable[[], int], Callable[[], object] | None]]
 """Name of the function, the prepared call, and what converts the values before or after it, if needed."""
@@ -146,7 +150,12 @@ class FmuInstance(Instance):
 
     def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         """Bring the instance to its first communication point."""
-        fmu, experiment = self._fmu, {"startTime": start_time, "tolerance": self._plan.tolerance}
+        fmu = self._fmu
+        experiment = {
+            "startTime": start_time,
+            "stopTime": self._plan.stop_time,
+            "tolerance": self._plan.tolerance,
+        }
         if self._version < 3:
             fmu.setupExperiment(**experiment)
         if self._plan.configuration:
@@ -199,7 +208,8 @@ class FmuInstance(Instance):
             self._start(start_time, parameters, with_inputs=with_inputs)
             self._phase = "stepping"
         if self._errors > errors:
-            raise FmuCallError("The FMU refused its initialisation.", self._texts())
+            hint = "" if self._plan.stop_time is not None else _NO_STOP_TIME
+            raise FmuCallError(f"The FMU refused its initialisation{hint}.", self._texts())
 
     def step(self) -> None:
         """Make the step that the request block describes."""
@@ -308,7 +318,10 @@ class FmuInstance(Instance):
 
     def _apply(self, parameters: Settings) -> None:
         for kind, reference, values in parameters:
-            doubles = (ctypes.c_double * len(values))(*values)
+            if kind == "String":
+                self._fmu.setString([reference], values)
+                continue
+            doubles = (ctypes.c_double * len(values))(*map(float, values))
             self._make(self._blocks("Set", (Group(kind, (reference,), len(values)),), doubles, 0))
 
     def _make(self, calls: Calls, what: str = "setting inputs") -> None:
@@ -353,6 +366,8 @@ class FmuInstance(Instance):
             ERROR: "its values are no longer to be trusted; reset the asset or restore a state",
             PENDING: "asynchronous steps are not supported; export it to step synchronously",
         }.get(status, "the instance is lost; reset the asset or restore a state")
+        if what == "initialisation" and self._plan.stop_time is None:
+            after += _NO_STOP_TIME
         return FmuCallError(f"{function} returned {status_name(status)} in {what}: {after}.", self._texts())
 
     def _texts(self) -> list[str]:

@@ -36,16 +36,17 @@ class FMU1CoSimulation(FMU1Slave):  # type: ignore[misc]
         for name in ("InitializeSlave", "DoStep"):
             getattr(self.dll, f"{self.modelIdentifier}_fmi{name}").restype = ctypes.c_int
 
-    def setupExperiment(self, *, startTime: float, tolerance: float | None) -> None:
-        """Keep the start time."""
+    def setupExperiment(self, *, startTime: float, stopTime: float | None, tolerance: float | None) -> None:
+        """Keep start and end of the experiment until the initialisation."""
         self._start_time = startTime
+        self._stop_time = stopTime
 
     def enterInitializationMode(self) -> None:
         """Do nothing: FMI 1.0 has no modes."""
 
     def exitInitializationMode(self) -> None:
         """Initialise."""
-        self.initialize(tStart=self._start_time)
+        self.initialize(tStart=self._start_time, stopTime=self._stop_time)
 
 
 class CoSimulation(FmuInstance):
@@ -128,8 +129,8 @@ class FMU1ModelExchange(FMU1Model):  # type: ignore[misc]
 
     getNominalsOfContinuousStates = FMU1Model.getNominalContinuousStates
 
-    def setupExperiment(self, *, startTime: float, tolerance: float | None) -> None:
-        """Set the time, and keep the tolerance."""
+    def setupExperiment(self, *, startTime: float, stopTime: float | None, tolerance: float | None) -> None:
+        """Set the time, and keep the tolerance; this interface is told no end."""
         self._tolerance = tolerance
         self.setTime(startTime)
 

@@ -20,8 +20,8 @@ SOLVER_TOLERANCE = 1e-6
 REPORT_PERIOD = 0.02
 """Seconds after which many steps report what is done, at the end of the step that is being made."""
 
-Settings = list[tuple[str, int, list[float]]]
-"""FMI base type, value reference, values: one for a scalar, all elements for an array."""
+Settings = list[tuple[str, int, list[float] | list[str]]]
+"""FMI base type, value reference, values: one for a scalar, all elements for an array; texts of a String."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,8 @@ class Plan:
         Relative tolerance that the FMU is told.
     solver_tolerance : float
         Relative tolerance of our solver (model exchange).
+    stop_time : float or None
+        End of the experiment that the FMU is told [s].
     configuration : Settings
         Structural parameters (FMI 3), set before everything else.
     """
@@ -108,6 +110,7 @@ class Plan:
     substeps: int = 1
     tolerance: float | None = None
     solver_tolerance: float = SOLVER_TOLERANCE
+    stop_time: float | None = None
     configuration: Settings = field(default_factory=list)
 
     @property

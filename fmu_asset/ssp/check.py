@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.asset import Algorithm, CoupledAsset
 from fmu_asset.coupling.structure import SystemStructure
 from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring, loop_sentence
-from fmu_asset.door.experiment import whole_binding
+from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError, said
 from fmu_asset.folders import scratch_folder
@@ -32,6 +32,8 @@ class SspCheck:
         Name of each component and of its model, in the order in which they are evaluated.
     connections, parameters : int
         How many there are.
+    step : float or None
+        The step that was made [s]; None where none could be made.
     loops : tuple of str
         Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to break it.
     unused : tuple of str
@@ -45,6 +47,7 @@ class SspCheck:
     components: tuple[tuple[str, str], ...] = ()
     connections: int = 0
     parameters: int = 0
+    step: float | None = None
     loops: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
     left_out: str = ""
@@ -106,7 +109,9 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
 
 
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
-    """Check an SSP file: archive, schemas, connections against the FMUs, and one step of 1 s in workers.
+    """Check an SSP file: archive, schemas, connections against the FMUs, and one step in workers.
+
+    The step is the one that `ssp simulate` takes, of the default experiment.
 
     Raises
     ------
@@ -117,6 +122,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
     if not file.is_file():
         raise SspError(f"There is no SSP file {file}.")
     problems: tuple[str, ...] = ()
+    step: float | None = None
     with scratch_folder() as folder:
         try:
             wiring = join_ssp(read_ssp(file, folder))
@@ -124,9 +130,11 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
             return SspCheck(file, (str(error),))
         plan = wiring.schedule
         try:  # with an algebraic loop, too: whether it may be simulated is the user's choice
-            binding = whole_binding(system_description(wiring), step_size=1.0)
-            with CoupledAsset(wiring, binding, algorithm="jacobi" if plan.loops else "gauss_seidel") as asset:
+            experiment = default_experiment(system_description(wiring))
+            algorithm: Algorithm = "jacobi" if plan.loops else "gauss_seidel"
+            with CoupledAsset(wiring, experiment.binding, algorithm=algorithm) as asset:
                 asset.step()
+            step = experiment.binding.step_size
         except FmuError as error:
             problems = (str(error),)
     return SspCheck(
@@ -135,6 +143,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
         components=tuple((name, wiring.declared[name].model_name) for name in plan.order),
         connections=len(wiring.structure.connections),
         parameters=sum(map(len, wiring.settings.values())),
+        step=step,
         loops=(loop_sentence(plan.loops),) if plan.loops else (),
         unused=tuple(wiring.left_out),
         left_out=left_out_sentence(wiring, file),

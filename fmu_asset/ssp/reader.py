@@ -78,7 +78,8 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
         file = Path(folder) / component.fmu
         atomic_write_bytes(file, package.read(str(component.fmu)))
         own = {node.variable: value for node, value in tree.settings.items() if node.component == name}
-        components.append(replace(component, fmu=file, settings=own))
+        shown_as = f"{component.fmu} in {package.path}"
+        components.append(replace(component, fmu=file, settings=own, shown_as=shown_as))
     experiment = root.find("ssd:DefaultExperiment", NAMESPACES)
     told = {} if experiment is None else experiment.attrib
     start, stop = (float(told[name]) if name in told else None for name in ("startTime", "stopTime"))
@@ -90,8 +91,43 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
         _units(root, "ssd"),
         declared={node: own for node, own in tree.connectors.items() if node.component in tree.components},
         span=(start, stop),
+        base_step=_base_step(root, str(package.path)),
         unused=tuple(tree.unused),
     )
+
+
+_STEP_ATTRIBUTES = {"FixedStepAlgorithm": "baseStepSize", "FixedStepMaster": "stepSize"}
+"""Annotations by which others declare the step of a system [s]: Open Simulation Platform, OMSimulator."""
+
+
+def _base_step(root: Any, where: str) -> float | None:
+    """Return the step that annotations of the outermost system or the experiment declare [s], if any does.
+
+    Raises
+    ------
+    SspError
+        If it is no positive number.
+    """
+    experiment, system = (root.find(f"ssd:{name}", NAMESPACES) for name in ("DefaultExperiment", "System"))
+    for owner in (experiment, system, root):
+        annotations = None if owner is None else owner.find("ssd:Annotations", NAMESPACES)
+        for element in () if annotations is None else annotations.iter(etree.Element):
+            attribute = _STEP_ATTRIBUTES.get(etree.QName(element).localname, "")
+            if attribute in element.attrib:
+                return _positive_step(str(element.get(attribute)), attribute, where)
+    return None
+
+
+def _positive_step(text: str, attribute: str, where: str) -> float:
+    try:
+        step = float(text)
+    except ValueError:
+        step = 0.0
+    if not (isfinite(step) and step > 0.0):
+        raise SspError(
+            f"{SSD_NAME} in {where}: {attribute} must be a positive number of seconds, and {text!r} came."
+        )
+    return step
 
 
 class _Tree:

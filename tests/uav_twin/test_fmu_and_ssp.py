@@ -211,6 +211,33 @@ def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
         assert not columns or max(map(len, rest)) <= 80
 
 
+def test_the_items_of_an_enumeration_are_shown(foreign_fmu):
+    shown = " ".join(said("fmu", "info", foreign_fmu("siren2")).split())
+    assert "of the horn; items: quiet = 1, loud = 3" in shown
+    record = json.loads(said("fmu", "info", foreign_fmu("siren2"), "--json"))
+    items = {variable["name"]: variable["items"] for variable in record["variables"]}
+    assert items["loudness"] == {"quiet": 1, "loud": 3}
+
+
+def test_an_enumeration_a_text_and_the_stop_time_are_given_on_the_command_line(foreign_fmu, tmp_path):
+    fmu, out = foreign_fmu("siren2", "WANTS_STOP_TIME=86400.0"), tmp_path / "y.csv"
+    wanted = ("--stop-time", 86400, "--step-size", 900, "--set", "loudness=loud", "--set", "label=a=b, 1")
+    said("fmu", "simulate", fmu, *wanted, "--out", out)
+    assert np.genfromtxt(out, delimiter=",", names=True)["y"][-1] == 10.0 + len("a=b, 1")
+
+
+def test_the_rows_of_a_file_say_when_the_experiment_ends(foreign_fmu, tmp_path):
+    binding, inputs, out = (tmp_path / name for name in ("b.toml", "u.csv", "y.csv"))
+    binding.write_text(
+        "binding = { name = 'siren', step_size = 1.0 }\ncontrol.u = { variable = 'u', unit = '1' }\n"
+        "observation.y = { variables = 'y', unit = '1' }\n"
+    )
+    inputs.write_text("time,u\n0,1\n1,2\n2,3\n")
+    fmu = foreign_fmu("siren2", "WANTS_STOP_TIME=3.0")
+    said("fmu", "simulate", fmu, "--binding", binding, "--inputs", inputs, "--out", out)
+    assert np.genfromtxt(out, delimiter=",", names=True)["y"].tolist() == [1.0, 2.0, 3.0]
+
+
 GRID = "--grid health.wear=0,0.3 --grid clogging=0,0.6 --grid speed=1000 --grid pressure=100:140:2"
 
 

@@ -174,7 +174,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
         if any(b <= a for a, b in itertools.pairwise(levels)):
             raise MissionInputError(f"the levels of {name} must increase, and {levels} came.")
     fmu = FmiAsset(grid.fmu, binding)
-    say_sandbox(Path(grid.fmu), binding.limits.grants)
+    say_sandbox(grid.fmu, binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
     count: int = sensors.stop - sensors.start
     check_fits(

@@ -4,7 +4,9 @@ import re
 import stat
 import struct
 import zipfile
+from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -102,6 +104,40 @@ def test_odd_files_that_are_sound(fmu, tmp_path) -> None:
         read_fmu(path)
     with pytest.raises(errors.FmuFileError, match="has changed since it was checked"):
         extract_fmu(description)
+
+
+def renamed(fmu: Path, target: Path, rename: Callable[[str], str]) -> Path:
+    """Write a copy of an FMU whose entries have other names."""
+    return archive_of(target, {rename(name): content for name, content in members(fmu).items()})
+
+
+def test_names_that_begin_with_a_dot_are_told(foreign_fmu, tmp_path) -> None:
+    dotted = renamed(foreign_fmu("room2"), tmp_path / "dotted.fmu", lambda name: f"./{name}")
+    with pytest.raises(errors.FmuFileError, match=r"but with '\./modelDescription\.xml': FMI has the names"):
+        read_fmu(dotted)
+
+
+def test_a_binary_whose_name_begins_with_a_dot_is_told(foreign_fmu, tmp_path) -> None:
+    half = renamed(
+        foreign_fmu("room2"), tmp_path / "half.fmu", lambda name: name.replace("binaries", "./binaries")
+    )
+    with pytest.raises(errors.FmuUnsupportedError, match=r"one named '\./binaries/linux64/room2\.so'"):
+        read_fmu(half)
+
+
+def test_a_folder_that_was_packed_instead_of_its_content_is_told(foreign_fmu, tmp_path) -> None:
+    nested = renamed(foreign_fmu("room2"), tmp_path / "nested.fmu", lambda name: f"room/{name}")
+    with pytest.raises(errors.FmuFileError, match=r"it has 'room/modelDescription\.xml'\. Pack the content"):
+        read_fmu(nested)
+
+
+def test_a_binary_of_another_name_is_told_by_its_name(foreign_fmu, tmp_path) -> None:
+    other = renamed(
+        foreign_fmu("room2"), tmp_path / "x.fmu", lambda name: name.replace("room2.so", "Room.so")
+    )
+    words = r"has the binary binaries/linux64/Room\.so, but .* asks for binaries/linux64/room2\.so"
+    with pytest.raises(errors.FmuUnsupportedError, match=words):
+        read_fmu(other)
 
 
 @settings(max_examples=60, deadline=None)

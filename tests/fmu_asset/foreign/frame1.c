@@ -9,6 +9,7 @@
 
 HOOK void model_start(Model *m) {}
 HOOK int model_initialise(Model *m) { return OK; }
+HOOK int model_take_text(Model *m, unsigned int reference, const char *text) { return ERROR; }
 HOOK int model_input_slope(Model *m, unsigned int reference, double slope) { return ERROR; }
 HOOK int model_step(Model *m, double time, double size) { return OK; }
 HOOK void model_outputs(Model *m) {}
@@ -43,7 +44,10 @@ GET(Real, fmi1Real, r) SET(Real, fmi1Real, r)
 GET(Integer, fmi1Integer, i) SET(Integer, fmi1Integer, i)
 GET(Boolean, fmi1Boolean, b) SET(Boolean, fmi1Boolean, b)
 fmi1Status F(GetString)(fmi1Component c, const fmi1ValueReference vr[], size_t n, fmi1String value[]) { return fmi1Error; }
-fmi1Status F(SetString)(fmi1Component c, const fmi1ValueReference vr[], size_t n, const fmi1String value[]) { return fmi1Error; }
+fmi1Status F(SetString)(fmi1Component c, const fmi1ValueReference vr[], size_t n, const fmi1String value[]) {
+    for (size_t k = 0; k < n; k++) if (model_take_text(M, vr[k], value[k]) != OK) return fmi1Error;
+    return fmi1OK;
+}
 
 #ifndef MODEL_EXCHANGE
 const char *F(GetTypesPlatform)(void) { return "standard32"; }
@@ -53,6 +57,7 @@ fmi1Component F(InstantiateSlave)(fmi1String name, fmi1String guid, fmi1String l
 }
 fmi1Status F(InitializeSlave)(fmi1Component c, fmi1Real start, fmi1Boolean defined, fmi1Real stop) {
     M->time = start;
+    if (experiment_status(M, defined, stop) != OK) return fmi1Error;
     return (fmi1Status)model_initialise(M);
 }
 fmi1Status F(TerminateSlave)(fmi1Component c) { return fmi1OK; }

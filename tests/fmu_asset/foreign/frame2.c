@@ -4,6 +4,7 @@
 
 HOOK void model_start(Model *m) {}
 HOOK int model_initialise(Model *m) { return OK; }
+HOOK int model_take_text(Model *m, unsigned int reference, const char *text) { return ERROR; }
 HOOK int model_input_slope(Model *m, unsigned int reference, double slope) { return ERROR; }
 HOOK int model_step(Model *m, double time, double size) { return OK; }
 HOOK void model_outputs(Model *m) {}
@@ -39,7 +40,7 @@ void fmi2FreeInstance(fmi2Component c) { model_free(M); free(c); }
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean t, fmi2Real tolerance, fmi2Real start, fmi2Boolean s, fmi2Real stop) {
     M->time = start;
     M->r[63] = t ? tolerance : 0.0;
-    return fmi2OK;
+    return (fmi2Status)experiment_status(M, s, stop);
 }
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 #ifdef NEGATIVE_STATUS_AT_THE_START
@@ -78,7 +79,10 @@ GET(Real, fmi2Real, r) SET(Real, fmi2Real, r)
 GET(Integer, fmi2Integer, i) SET(Integer, fmi2Integer, i)
 GET(Boolean, fmi2Boolean, b) SET(Boolean, fmi2Boolean, b)
 fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2String value[]) { return fmi2Error; }
-fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2String value[]) { return fmi2Error; }
+fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2String value[]) {
+    for (size_t k = 0; k < n; k++) if (model_take_text(M, vr[k], value[k]) != OK) return fmi2Error;
+    return fmi2OK;
+}
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
     if (*state == NULL) *state = calloc(1, sizeof(Model));

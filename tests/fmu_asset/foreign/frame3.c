@@ -7,6 +7,7 @@
 
 HOOK void model_start(Model *m) {}
 HOOK int model_initialise(Model *m) { return OK; }
+HOOK int model_take_text(Model *m, unsigned int reference, const char *text) { return ERROR; }
 HOOK int model_step(Model *m, double time, double size) { return OK; }
 HOOK void model_outputs(Model *m) {}
 HOOK void model_derivatives(Model *m, double *dx) {}
@@ -52,7 +53,7 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token
 void fmi3FreeInstance(fmi3Instance c) { free(M->parts[0]); free(c); }
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean t, fmi3Float64 tolerance, fmi3Float64 start, fmi3Boolean s, fmi3Float64 stop) {
     M->time = start;
-    return fmi3OK;
+    return (fmi3Status)experiment_status(M, s, stop);
 }
 fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { return (fmi3Status)model_initialise(M); }
 fmi3Status fmi3EnterEventMode(fmi3Instance c) { return fmi3OK; }
@@ -99,7 +100,10 @@ WHOLE(Int8, fmi3Int8, i, 100) WHOLE(UInt8, fmi3UInt8, i, 100) WHOLE(Int16, fmi3I
 WHOLE(UInt16, fmi3UInt16, i, 100) WHOLE(Int32, fmi3Int32, i, 100) WHOLE(UInt32, fmi3UInt32, i, 100)
 WHOLE(Int64, fmi3Int64, i, 100) WHOLE(UInt64, fmi3UInt64, i, 100) WHOLE(Boolean, fmi3Boolean, b, 200)
 fmi3Status fmi3GetString(fmi3Instance c, VR, fmi3String values[], size_t n) { return fmi3Error; }
-fmi3Status fmi3SetString(fmi3Instance c, VR, const fmi3String values[], size_t n) { return fmi3Error; }
+fmi3Status fmi3SetString(fmi3Instance c, VR, const fmi3String values[], size_t n) {
+    for (size_t k = 0; k < nvr; k++) if (model_take_text(M, vr[k], values[k]) != OK) return fmi3Error;
+    return fmi3OK;
+}
 fmi3Status fmi3GetBinary(fmi3Instance c, VR, size_t sizes[], fmi3Binary values[], size_t n) { return fmi3Error; }
 fmi3Status fmi3SetBinary(fmi3Instance c, VR, const size_t sizes[], const fmi3Binary values[], size_t n) { return fmi3Error; }
 fmi3Status fmi3GetClock(fmi3Instance c, VR, fmi3Clock values[]) { return fmi3Error; }

@@ -23,6 +23,7 @@ void model_start(Model *m);                          /* start values */
 int model_initialise(Model *m);                      /* status */
 int model_configure(Model *m, int begins);           /* FMI 3: configuration mode begins or ends; status */
 int model_input_slope(Model *m, unsigned int reference, double slope); /* status */
+int model_take_text(Model *m, unsigned int reference, const char *text); /* status */
 int model_step(Model *m, double time, double size);  /* status */
 void model_outputs(Model *m);                        /* before values are read */
 void model_derivatives(Model *m, double *dx);
@@ -31,4 +32,15 @@ void model_event(Model *m, int *due, double *time);  /* at an event, and at the 
 int model_locate(unsigned int reference, int *first, int *count); /* FMI 3: place and length in r */
 void model_free(Model *m);
 void model_say(Model *m, int status, const char *text); /* given by the frame */
+
+/* Whether the end of the experiment is the one that -DWANTS_STOP_TIME=... asks for; a status. */
+static inline int experiment_status(Model *m, int told, double stop) {
+#ifdef WANTS_STOP_TIME
+    if (!told || stop != WANTS_STOP_TIME) {
+        model_say(m, ERROR, "the stop time must be given, in whole days");
+        return ERROR;
+    }
+#endif
+    return OK;
+}
 #endif

@@ -26,7 +26,9 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
     expand_connection,
 )
+from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import CouplingError, SspError
 from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
@@ -34,7 +36,7 @@ from fmu_asset.ssp.package import write_ssp
 from fmu_asset.ssp.reader import read_ssp
 from tests.fmu_asset.coupling.reference import PARTS, of_ours
 from tests.fmu_asset.door.kinds import BINDINGS
-from tests.fmu_asset.making import archive_of, bound, tables, watch
+from tests.fmu_asset.making import archive_of, bound, members, tables, watch
 from tests.fmu_asset.ours import OurFmus
 
 HERE = Path(__file__).parent
@@ -305,7 +307,7 @@ def test_what_is_wrong_is_said_in_one_sentence(theirs, case) -> None:
 def test_archives_that_are_unsafe_or_damaged(theirs, tmp_path) -> None:
     """Checked as those of FMUs are."""
     (sentence,) = check_ssp(theirs(**{"resources/wing.fmu": "no FMU"})).problems
-    assert "resources/wing.fmu is not a sound FMU archive" in sentence
+    assert re.match(r"resources/wing\.fmu in \S+/theirs\.ssp is not a sound FMU archive", sentence)
     good, damaged = theirs().read_bytes(), tmp_path / "damaged.ssp"
     # Half of the file ends with one of its FMUs, which is an archive as well.
     damaged.write_bytes(good[: len(good) // 2])
@@ -330,3 +332,96 @@ def test_an_algebraic_loop_is_reported(theirs) -> None:
     check = check_ssp(theirs(change))
     assert check.problems == ()
     assert "algebraic loop (structure.wing.tip_displacement -> structure.wing.load_factor" in check.loops[0]
+
+
+# ---------------------------------------------------------------------- the step, and what FMUs are called
+
+SIREN = (
+    '<ssd:SystemStructureDescription version="1.0" name="alarm" '
+    'xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" '
+    'xmlns:ssd="http://ssp-standard.org/SSP1/SystemStructureDescription"><ssd:System name="top"><ssd:Elements>'
+    '<ssd:Component name="siren" type="application/x-fmu-sharedlibrary" source="resources/horn.fmu"/>'
+    "</ssd:Elements>{system}</ssd:System>"
+    '<ssd:DefaultExperiment startTime="0" stopTime="10">{experiment}</ssd:DefaultExperiment>'
+    "</ssd:SystemStructureDescription>"
+)
+ANNOTATED = '<ssd:Annotations><ssc:Annotation type="x">{}</ssc:Annotation></ssd:Annotations>'
+BASE_STEP = ANNOTATED.format(
+    '<osp:Algorithm xmlns:osp="http://opensimulationplatform.com/SSP/OSPAnnotations">'
+    '<osp:FixedStepAlgorithm baseStepSize="{}"/></osp:Algorithm>'
+)
+MASTER_STEP = ANNOTATED.format(
+    '<oms:SimulationInformation xmlns:oms="https://raw.githubusercontent.com/OpenModelica">'
+    '<oms:FixedStepMaster description="oms-ma" stepSize="0.25"/></oms:SimulationInformation>'
+)
+
+
+@pytest.fixture
+def alarm(foreign_fmu: Any, tmp_path: Path) -> Pack:
+    """Return what packs a system of one siren, which itself declares no step."""
+
+    def pack(fmu: Path | None = None, *, system: str = "", experiment: str = "") -> Path:
+        horn = fmu or foreign_fmu("siren2")
+        description = SIREN.format(system=system, experiment=experiment)
+        contents = {"SystemStructure.ssd": description, "resources/horn.fmu": horn.read_bytes()}
+        return archive_of(tmp_path / "alarm.ssp", contents)
+
+    return pack
+
+
+def test_a_check_makes_the_step_that_a_simulation_takes(alarm) -> None:
+    """A 500th of the time to the end, where nothing declares a step."""
+    check = check_ssp(alarm())
+    assert (check.problems, check.step) == ((), 0.02)
+
+
+def test_a_check_makes_the_step_that_an_fmu_declares(foreign_fmu, alarm) -> None:
+    """An FMU that takes 10 ms only, and refuses the step of 1 s."""
+    check = check_ssp(alarm(foreign_fmu("fixed2")))
+    assert (check.problems, check.step) == ((), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("place", "annotation", "step"),
+    [("experiment", BASE_STEP.format("0.5"), 0.5), ("system", MASTER_STEP, 0.25)],
+)
+def test_a_declared_base_step_is_the_step(alarm, tmp_path, place, annotation, step) -> None:
+    file = alarm(**{place: annotation})
+    described = system_description(join_ssp(read_ssp(file, tmp_path / "fmus")))
+    assert default_experiment(described).binding.step_size == step
+    assert check_ssp(file).step == step
+
+
+def test_a_base_step_that_is_none_is_refused(alarm) -> None:
+    (sentence,) = check_ssp(alarm(experiment=BASE_STEP.format("-1"))).problems
+    assert "baseStepSize must be a positive number of seconds, and '-1' came" in sentence
+
+
+def test_a_failing_fmu_is_named_as_in_the_file(foreign_fmu, alarm) -> None:
+    """Never by the folder that it was extracted to."""
+    (sentence,) = check_ssp(alarm(foreign_fmu("hostile2", "SEGFAULT", "AFTER=0"))).problems
+    assert sentence.startswith("component siren: resources/horn.fmu in ")
+    assert "uav-twin-fmu-" not in sentence
+
+
+def test_an_fmu_for_another_platform_is_named_as_in_the_file(fmus, alarm, tmp_path) -> None:
+    contents = {n: c for n, c in members(fmus["wing"]).items() if not n.startswith("binaries/linux64")}
+    (sentence,) = check_ssp(alarm(archive_of(tmp_path / "elsewhere.fmu", contents))).problems
+    assert re.match(r"resources/horn\.fmu in \S+/alarm\.ssp has no binary for this platform", sentence)
+
+
+def test_the_stop_time_of_a_system_is_told_to_its_fmus(foreign_fmu, alarm) -> None:
+    assert check_ssp(alarm(foreign_fmu("siren2", "WANTS_STOP_TIME=10.0"))).problems == ()
+
+
+def test_an_enumeration_in_a_system_is_set_by_name(alarm, tmp_path) -> None:
+    wiring = join_ssp(read_ssp(alarm(), tmp_path / "fmus"))
+    experiment = default_experiment(system_description(wiring), values={"siren.loudness": "loud"})
+    with CoupledAsset(wiring, experiment.binding, isolated=False, parameters=experiment.parameters) as asset:
+        assert asset.step().values[0] == 10.0
+
+
+def test_a_value_that_an_enumeration_of_a_system_lacks_is_refused(foreign_fmu) -> None:
+    siren = Component("siren", foreign_fmu("siren2"), {"loudness": Setting(2)})
+    with pytest.raises(CouplingError, match="it is an enumeration of quiet = 1, loud = 3"):
+        Wiring(SystemStructure("one", (siren,)))
