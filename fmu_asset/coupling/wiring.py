@@ -304,7 +304,8 @@ class Wiring:
         variable = declared.variable(end.variable)
         if variable is None:
             hint = declared.hint(end.variable)
-            raise CouplingError(said("coupling.no_variable", end=end, declared=declared, hint=hint))
+            file = declared.shown_as or declared.path.name
+            raise CouplingError(said("coupling.no_variable", end=end, file=file, hint=hint))
         return variable
 
     def _connector(self, end: Endpoint, kinds: tuple[str, ...], verb: str) -> VariableInfo:

@@ -268,13 +268,13 @@ class Slot(NamedTuple):
     def _refusal(self, given: float, number: float) -> str:
         if not math.isfinite(number):
             return f"{self.label} must be finite, but is {given!r}; nothing was sent to the FMU."
+        if self.whole and not float(number).is_integer():
+            return f"{self.label} must be a whole number, but is {given!r}; nothing was sent to the FMU."
         if self.variable.items:
             return (
                 f"{self.label} must be an item of the enumeration {self.variable.name!r} "
                 f"({self.variable.item_list}), but is {given!r}; nothing was sent to the FMU."
             )
-        if self.whole and not float(number).is_integer():
-            return f"{self.label} must be a whole number, but is {given!r}; nothing was sent to the FMU."
         return (
             f"{self.label} = {given!r} lies outside the range of {self.variable.name!r}, {self.low:g} to "
             f"{self.high:g}{self.variable.in_unit}; nothing was sent to the FMU."

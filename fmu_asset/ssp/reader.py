@@ -112,8 +112,8 @@ def _base_step(root: Any, where: str) -> float | None:
     for owner in (experiment, system, root):
         annotations = None if owner is None else owner.find("ssd:Annotations", NAMESPACES)
         for element in () if annotations is None else annotations.iter(etree.Element):
-            attribute = _STEP_ATTRIBUTES.get(etree.QName(element).localname, "")
-            if attribute in element.attrib:
+            attribute = _STEP_ATTRIBUTES.get(etree.QName(element).localname)
+            if attribute is not None and attribute in element.attrib:
                 return _positive_step(str(element.get(attribute)), attribute, where)
     return None
 

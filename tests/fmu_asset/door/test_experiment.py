@@ -101,7 +101,7 @@ def test_an_input_moves_through_items_by_name_or_number(foreign_fmu, history) ->
         assert asset.simulate({"switch": history}).values[:, 0].tolist() == [1.0, 10.0, 1.0]
 
 
-@pytest.mark.parametrize("value", [2, 2.5, "noisy"])
+@pytest.mark.parametrize("value", [2, 4, "noisy"])
 def test_a_value_that_an_enumeration_does_not_define_is_refused(foreign_fmu, value) -> None:
     binding = bound(1.0, SIREN, control={"switch": ("switch", "1")})
     words = r"control\.switch must be an item of the enumeration 'switch' \(quiet = 1, loud = 3\), but is "
