@@ -12,11 +12,12 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fmu_asset.door.binding import Binding
-from fmu_asset.door.exchange import Exchange, Values
+from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.life import PackedState
 from fmu_asset.door.placement import Housing, ResetTrial, Start
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import IDENTITY
+from fmu_asset.door.values import Values
 from fmu_asset.errors import (
     BindingError,
     CouplingError,

@@ -23,9 +23,10 @@ from fmu_asset.instances.plan import Instance
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
-from .exchange import Exchange, Inputs, PlainValue, Values, check_roles, plain_values
+from .exchange import Exchange
 from .layout import Observation
 from .placement import Housing, Start, limits_of
+from .values import Inputs, PlainValue, Values, check_roles, plain_values
 
 StateMethod = Literal["serialised", "replay"]
 """How a state is kept: serialised by the FMU, or as the inputs of all steps, to be replayed."""
@@ -355,8 +356,7 @@ class OpenedFmu:
     def _enter_health(self, inputs: Mapping[str, Any]) -> dict[str, Any]:
         """Start the FMU anew where health that is set at a start only changes; return the other inputs.
 
-        It starts at this moment and under the inputs that hold now; what it remembers of earlier steps is
-        lost.
+        It starts at this moment and under the inputs that hold now, and forgets its earlier steps.
         """
         inputs, health = self._exchange.without_start_health(inputs)
         wanted = self._health | plain_values(health)

@@ -10,10 +10,10 @@ from fmu_asset.instances.plan import Instance
 from reporting.arrays import Float
 from reporting.progress import Progress, Stage, reporter
 
-from .exchange import Histories, Values, plain_values
 from .health_at_start import courses_of_equal_health
 from .layout import Observation, ObservationHistory, joined_histories
 from .life import OpenedFmu, SavedState
+from .values import Histories, Values, plain_values
 
 _BLOCK_BYTES = 2**20
 """Of the requests or replies that are sent in one message."""
