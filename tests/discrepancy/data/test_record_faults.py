@@ -138,7 +138,7 @@ STEP = 2.0 * np.pi / 1024.0
 
 
 def _swing_with_friction(interval=0.002, seconds=8.0):
-    """Return angles [rad] of a pendulum under dry friction, which sticks for a moment at each turning point."""
+    """Return angles [rad] of a pendulum under dry friction, which sticks for a moment where it turns."""
     steps_of_each, angle, speed = 10, 0.6, 0.0
     step, angles = interval / steps_of_each, []
     for _ in range(round(seconds / interval)):
