@@ -11,11 +11,11 @@ import numpy as np
 
 from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign
+from discrepancy.campaign.records import BoolArray, Campaign, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.catalogue.needs import NO_PORT
-from discrepancy.checks.fault import DataFault
+from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
@@ -270,7 +270,9 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             trial = trials[data.trial.name]
             if not trial.is_dynamic:
                 continue
-            found = wrong_ends(residual, data.weight > 0.0)
+            has_noise = [campaign.channels[name].noise is not None for name in trial.channels]
+            noise = np.array(has_noise, dtype=float)  # residuals are in deviations of the noise
+            found = wrong_ends(residual, data.weight > 0.0, noise) & ~_taken_as_right(campaign, trial)
             for number in np.flatnonzero(found.any(axis=0)):
                 count = int(found[:, number].sum())
                 told = {"channel": trial.channels[number], "trial": trial.name, "are": be(count)}
@@ -280,6 +282,12 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
         return problem
     campaign = replace(problem.campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
     return Problem(campaign, problem.model, replace(problem.setting, campaign=campaign))
+
+
+def _taken_as_right(campaign: Campaign, trial: Trial) -> BoolArray:
+    """Return the channels (C,) of a trial of which the campaign accepts readings that look like outliers."""
+    word = FaultKind.OUTLIERS.value
+    return np.array([word in campaign.accepted(name, trial.name) for name in trial.channels])
 
 
 def strained(problem: Problem, fit: CandidateFit) -> list[str]:

@@ -12,7 +12,14 @@ from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.campaign.sampling import as_meant
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
-from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion, conversion_of, quantities_of
+from discrepancy.campaign.units import (
+    LOGGER_NAMES,
+    NEVER_CONVERTED,
+    UNITS,
+    conversion,
+    conversion_of,
+    quantities_of,
+)
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import hash_record
 from reporting.table_file import TextTable
@@ -175,9 +182,11 @@ class Understanding:
         try:
             if role == "temperature" and unit == "K":
                 raise ValueError("a temperature must be in degC, and 'K' came")
-            if role == "force" and self.kinds[sheet.name] == TrialKind.DRIVEN:
+            driven = self.kinds[sheet.name] == TrialKind.DRIVEN
+            is_output = driven and self._quantity_of is not None and self._quantity_of(role) is not None
+            if role == "force" and driven and not is_output:
                 raise ValueError(f"a driven trial has {INPUT}NAME in the place of force")
-            if role in _SI:
+            if role in _SI and not (role == "force" and is_output):
                 kind = {"force": Quantity.FORCE, "temperature": Quantity.TEMPERATURE}.get(role)
                 number = "1" if (role, unit) == ("load_factor", "g") else unit
                 to_si = conversion(number, _SI[role]) if kind is None else conversion_of(kind, unit)
@@ -185,7 +194,8 @@ class Understanding:
             if (quantity := self._quantity(head, role, unit)) is None:
                 return Column(sheet, head, role, unit)
             to_si = conversion_of(quantity, unit)
-            si = unit if unit in NEVER_CONVERTED else UNITS[quantity].si
+            known = LOGGER_NAMES.get(unit, unit)
+            si = known if known in NEVER_CONVERTED else UNITS[quantity].si
             return Column(sheet, head, role, unit, si, quantity, to_si)
         except ValueError as cause:
             raise CampaignFileError(f"{sheet.name}, column {head!r}: {cause}; say another.") from None

@@ -41,6 +41,31 @@ Deviation = Annotated[
 ]
 """In files an infinite one is "free"."""
 
+ACCEPTABLE = (
+    "clipped",
+    "dead",
+    "held",
+    "copied",
+    "outliers",
+    "too short",
+    "undersampled",
+    "unit slip",
+    "input slip",
+    "sign",
+    "swapped",
+)
+"""Faults of data that a campaign may accept, as `discrepancy.checks.fault.FaultKind` calls them."""
+
+
+def _is_acceptable(word: str) -> str:
+    if word not in ACCEPTABLE:
+        raise ValueError(f"{word!r} is no fault that can be accepted; these are {', '.join(ACCEPTABLE)}")
+    return word
+
+
+Accepted = Annotated[tuple[Annotated[str, AfterValidator(_is_acceptable)], ...], LIST]
+"""Faults of data that a campaign, a channel or a trial accepts: words of `ACCEPTABLE`."""
+
 
 @dataclass(frozen=True)
 class Release:

@@ -110,6 +110,7 @@ def assemble(section: schema.CampaignSection, tables: Mapping[str, TextTable], d
         parameters={name: (item.mean, item.deviation) for name, item in section.parameters.items()},
         data_hash=data_hash,
         loggers=section.loggers,
+        accept=section.accept,
         events=tuple(placed_events(section.event, trials, CAMPAIGN_FILE)),
         remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
     )

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
-from discrepancy.campaign.protocol import IN_FILES, NOT_IN_FILES, Deviation, Event, InFiles, Release
+from discrepancy.campaign.protocol import IN_FILES, NOT_IN_FILES, Accepted, Deviation, Event, InFiles, Release
+from discrepancy.campaign.quantity import Quantity as Quantity
 from discrepancy.campaign.sampling import nearly_even
 from reporting.toml_file import Name, NotNegative, Number, Positive
 from reporting.words import brief
@@ -22,54 +23,6 @@ from reporting.words import brief
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
-
-
-class Quantity(StrEnum):
-    """What a channel or an input is; the unit of its values here is that of `units.UNITS`."""
-
-    STRAIN = "strain"
-    DISPLACEMENT = "displacement"
-    VELOCITY = "velocity"
-    ACCELERATION = "acceleration"
-    SIGNAL = "signal"  # uncalibrated, e.g. V: the channel's gain is unknown and fitted
-    ANGLE = "angle"
-    ANGULAR_VELOCITY = "angular_velocity"
-    ANGULAR_ACCELERATION = "angular_acceleration"
-    FORCE = "force"
-    TORQUE = "torque"
-    PRESSURE = "pressure"
-    LEVEL = "level"
-    FLOW = "flow"
-    TEMPERATURE = "temperature"
-    HEAT = "heat"
-    VOLTAGE = "voltage"
-    CURRENT = "current"
-    CHARGE = "charge"
-
-    @property
-    def moving(self) -> "tuple[Quantity, ...]":
-        """The quantity, if it is of a motion, among those that follow one another by derivation."""
-        return next((family for family in _MOVING if self in family), ())
-
-    @property
-    def order(self) -> int:
-        """How often a displacement is derived to be this; if it is, it is nought at rest."""
-        return _ORDERS.get(self, 0)
-
-    def derivatives_of(self, output: "Quantity") -> int:
-        """Return how often an output of a model is derived in time for a channel of this quantity."""
-        return max(self.order - output.order, 0) if output in self.moving else 0
-
-    def shows(self, output: "Quantity") -> bool:
-        """Whether a channel of this quantity can measure what an output of a model is."""
-        return self is output or self is Quantity.SIGNAL or self.derivatives_of(output) > 0
-
-
-_MOVING = (
-    (Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION),
-    (Quantity.ANGLE, Quantity.ANGULAR_VELOCITY, Quantity.ANGULAR_ACCELERATION),
-)
-_ORDERS = {quantity: order for family in _MOVING for order, quantity in enumerate(family)}
 
 
 class Hold(StrEnum):
@@ -198,6 +151,8 @@ class Channel(InTables):
         Place along the span [m], for maps.
     chord : float or None
         Place along the chord [fraction], for maps.
+    accept : tuple of str
+        Faults of its data that are no faults, in all trials: words of `ACCEPTABLE`.
     """
 
     output: Name
@@ -206,6 +161,7 @@ class Channel(InTables):
     offset_deviation: Deviation = 0.0
     station: Number | None = None
     chord: Number | None = None
+    accept: Accepted = ()
 
     def noise_in(self, trial: "Trial") -> float:
         """Return the deviation of its noise in a trial [its unit], 0 where it is not known."""
@@ -238,6 +194,8 @@ class TrialKeys:
         Ring-downs only.
     hold : Hold or None
         Forced trials: as that of an input, for the force.
+    accept : tuple of str
+        Faults of its data that are no faults, in all channels: words of `ACCEPTABLE`.
     """
 
     name: Name
@@ -249,6 +207,7 @@ class TrialKeys:
     load_place: Name | tuple[Number, Number] = "tip_load"
     release: Release | None = None
     hold: Hold | None = None
+    accept: Accepted = ()
 
     @property
     def said(self) -> dict[str, Any]:
@@ -387,6 +346,8 @@ class Campaign:
         Channels and inputs ("force": of forced trials) that share a clock, by logger; empty: one has all.
     events : tuple of Event
         In the order of the file; those of one name are in different trials.
+    accept : tuple of str
+        Faults of the data that are no faults, in all channels and trials: words of `ACCEPTABLE`.
     """
 
     name: str
@@ -398,9 +359,19 @@ class Campaign:
     remarks: tuple[str, ...] = field(default=())
     loggers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
+    accept: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return brief(self, name=self.name, trials=len(self.trials), channels=self.channels)
+
+    def accepted(self, channel: str = "", trial: str = "") -> frozenset[str]:
+        """Return the faults of data that are accepted in a channel and a trial; an empty name is none."""
+        words = list(self.accept)
+        if channel in self.channels:
+            words += self.channels[channel].accept
+        for item in self.trials:
+            words += item.accept if item.name == trial else ()
+        return frozenset(words)
 
     def event_times(self, trial: str) -> dict[str, float]:
         """Return the moments in a trial [s] by the names that expressions use."""

@@ -15,6 +15,16 @@ EVEN = 1e-3
 LEAST_SAMPLES = 8
 """Fewest samples of a dynamic record."""
 _EXACT = 1e-9
+LEAST_LEVELS = 5
+"""Fewest values at which neighbouring readings must repeat to show a sensor's quantum."""
+OFF_LATTICE = 0.1
+"""Largest departure of a value from a lattice, in its steps."""
+ON_LATTICE = 0.8
+"""Least share of the distances between repeated values that are whole numbers of a lattice's steps."""
+ROUNDING_GAP = 10.0
+"""Least ratio of a true difference to the largest one that rounding leaves."""
+LEAST_ROUNDED = 8
+"""Fewest differences that are taken as left by rounding."""
 ALIKE = 0.1
 """Largest departure of a step, as a share of the interval, at which a filter of even samples holds."""
 
@@ -84,10 +94,58 @@ def nearly_even(time: FloatArray) -> bool:
     return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0)) if len(steps) else True
 
 
-def digit_of(values: FloatArray) -> float:
-    """Return the least difference of two readings (N,) that differ; 0 where all are alike."""
-    distinct = np.unique(values)
-    return float(np.diff(distinct).min()) if len(distinct) > 1 else 0.0
+def quantum_of(values: FloatArray) -> float:
+    """Return the step between two readings of a sensor, 0 where all readings (N,) are alike.
+
+    It is the step of the lattice on which the readings repeat (`lattice_step`). Where they do not repeat it
+    is the least difference of two readings that is more than the rounding of their printed decimals.
+    """
+    step = lattice_step(values)
+    if step is not None:
+        return step
+    return least_beyond_rounding(np.diff(np.unique(values)))
+
+
+def lattice_step(values: FloatArray) -> float | None:
+    """Return the step of the lattice on which the readings (N,) of a quantised sensor stand still.
+
+    An encoder of 4096 steps, printed with six decimals, has steps of 0.001534 and 0.001533: the quantum is
+    the step and not their difference. Resampled by straight lines it also shows readings between its steps,
+    but does not repeat them.
+
+    Parameters
+    ----------
+    values : (N,) ndarray
+        Readings in the order of time.
+
+    Returns
+    -------
+    float or None
+        The step; None where neighbouring readings repeat at fewer than `LEAST_LEVELS` values, or at values
+        that are not evenly spaced.
+    """
+    repeats = np.diff(values) == 0.0
+    levels = np.unique(values[1:][repeats])
+    if len(levels) < LEAST_LEVELS:
+        return None
+    distances = np.diff(levels)
+    step = float(np.quantile(distances, 0.25))
+    off_lattice = np.abs(distances / step - np.round(distances / step))
+    on_lattice = np.mean((off_lattice < OFF_LATTICE) & (distances > (1.0 - OFF_LATTICE) * step))
+    return step if on_lattice >= ON_LATTICE else None
+
+
+def least_beyond_rounding(differences: FloatArray) -> float:
+    """Return the least positive difference that is not left by the rounding of printed decimals; 0 if none.
+
+    Differences left by rounding are many, and far below all others.
+    """
+    sizes = np.sort(differences[differences > 0.0])
+    if not sizes.size:
+        return 0.0
+    gaps = np.flatnonzero(sizes[1:] > ROUNDING_GAP * sizes[:-1]) + 1
+    beyond = gaps[gaps >= LEAST_ROUNDED]
+    return float(sizes[beyond[0]] if beyond.size else sizes[0])
 
 
 def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:

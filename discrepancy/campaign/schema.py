@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from discrepancy.campaign import records
-from discrepancy.campaign.protocol import IN_FILES, LIST, Event, Release
+from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Release
 from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignFileError, said
 from fe.runtime.patch import EVERY_CHANNEL
@@ -152,6 +152,7 @@ class CampaignSection(Section):
     event: Annotated[tuple[Event, ...], LIST] = ()
     remarks: Annotated[tuple[str, ...], LIST] = ()
     loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = pydantic.Field(default_factory=dict)
+    accept: Accepted = ()
 
     @property
     def columns(self) -> tuple[records.InTables, ...]:

@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, time, timedelta
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
 
 from discrepancy.campaign.units import conversion, quantities_of
@@ -41,7 +42,14 @@ _NUMBERS = {
 """Numbers with either decimal mark: those with groups of three digits have no exponent."""
 _PLAIN = re.compile(r"[+-]?\d*[.,]?\d+(?:[eE][+-]?\d+)?", re.ASCII)
 """What most of them are, found sooner."""
-_CLOCK = re.compile(r"(?:(\S+)[ T]+|(?=\d))(\d{1,2}:\d\d:\d\d)([.,]\d+)?", re.ASCII)
+_CLOCK = re.compile(
+    r"(?:([^\sT]+)(?:[ ]+|T)|(?=\d))(\d{1,2}:\d\d:\d\d)([.,]\d+)?"
+    r"(?: ?([AaPp])\.?[Mm]\.?)?(Z|[+-]\d\d:?\d\d)?",
+    re.ASCII,
+)
+"""Date, clock, fraction of a second, half of the day, and offset from UTC."""
+_HALF_DAY, _DAY = 43_200, 86_400
+_LOGICAL = {"true": "1", "false": "0"}
 _HEAD = re.compile(r"(.+?)(?:(?!\S\d+\S$)\s*(?:\[([^][]+)\]|\(([^()]+)\))|\s+/\s+(.+)|,\s+(.+)|\s+in\s+(.+))")
 """Name and unit; a number that touches its name, as in `strain[1]`, is part of it."""
 
@@ -110,12 +118,16 @@ def read_sheet(path: Path) -> Sheet:
         name, unit = _named(title or f"column {at + 1}", units[at])
         if any(map(_CLOCK.fullmatch, cells)):
             times = [_time(cell, f"{where} {line}") for cell, line in zip(cells, lines, strict=True)]
+            if not any(_has_date(cell) for cell in cells):
+                times = _past_midnight(times)
             unit, cells = "s", tuple(_Typed(time - times[0]) for time in times)
         if texts := [cell for cell in cells if cell and not _is_value(cell)]:
             count = sum(map(bool, cells)) - len(texts)
             held = f"{counted(count, 'number')} and {counted(len(texts), 'text')}" if count else "no numbers"
             left += f"; the column {title!r} holds {held} and is left out"
         elif any(cells):
+            if all(cell.lower() in _LOGICAL for cell in cells if cell):
+                unit = unit or "1"
             names.append((name, unit))
             columns.append(cells)
     heads = [name for name, _ in names]
@@ -136,6 +148,8 @@ def _number(cell: str, mark: str) -> str | None:
     """Return a number as `float` reads it, None for anything else; `mark` is that of its decimals."""
     if isinstance(cell, _Typed):
         return str(cell)
+    if cell.lower() in _LOGICAL:
+        return _LOGICAL[cell.lower()]
     text = cell.replace("−", "-")
     found = _NUMBERS[mark].fullmatch(text)
     return None if found is None else text.replace(found[1] or " ", "").replace(mark, ".")
@@ -146,16 +160,43 @@ def _is_value(cell: str) -> bool:
     return bool(plain or any(_number(cell, mark) for mark in _NUMBERS) or _CLOCK.fullmatch(cell))
 
 
-def _time(cell: str, where: str) -> Decimal:
-    """Return a time of day, with a date or without, in seconds."""
+def _has_date(cell: str) -> bool:
     found = _CLOCK.fullmatch(cell)
-    day, clock, fraction = ("", "", "") if found is None else found.groups(default="")
+    return found is not None and bool(found[1])
+
+
+def _time(cell: str, where: str) -> Decimal:
+    """Return a time of day, with a date or without, in seconds; with an offset from UTC in UTC."""
+    found = _CLOCK.fullmatch(cell)
+    day, clock, fraction, half, offset = [""] * 5 if found is None else found.groups(default="")
     for layout in ("%Y-%m-%d", "%d.%m.%Y"):
+        text, full_layout = f"{day or '1.1.2000'} {clock}", f"{layout} %H:%M:%S"
+        if half:
+            text, full_layout = f"{text} {half}M", f"{layout} %I:%M:%S %p"
         with suppress(ValueError):
-            moment = datetime.strptime(f"{day or '1.1.2000'} {clock}", f"{layout} %H:%M:%S")
+            moment = datetime.strptime(text, full_layout)
             whole = (moment - datetime.min) // timedelta(seconds=1)
-            return whole + Decimal(f"0{fraction.replace(',', '.')}")
+            return whole - _offset_seconds(offset) + Decimal(f"0{fraction.replace(',', '.')}")
     raise CampaignFileError(said("sheets.no_time", where=where, cell=cell))
+
+
+def _offset_seconds(offset: str) -> int:
+    """Return an offset from UTC such as `Z`, `+01:00` or `-0530` in seconds."""
+    if offset in ("", "Z"):
+        return 0
+    digits = offset[1:].replace(":", "")
+    seconds = 3600 * int(digits[:2]) + 60 * int(digits[2:])
+    return -seconds if offset[0] == "-" else seconds
+
+
+def _past_midnight(times: Sequence[Decimal]) -> list[Decimal]:
+    """Return times of day, in seconds, a day later from where they fall by more than half a day."""
+    days, found = 0, [times[0]]
+    for previous, time_of_day in pairwise(times):
+        if time_of_day < previous - _HALF_DAY:
+            days += 1
+        found.append(time_of_day + days * _DAY)
+    return found
 
 
 def _decimal(
@@ -217,13 +258,14 @@ def _text_rows(path: Path) -> tuple[Rows, str]:
             raise CampaignFileError(f"{path.name}, line {reader.line_num}: {one_line(cause)}.") from cause
         return [(line, row) for line, row in found if any(row)]
 
-    def numbers(separator: str) -> tuple[bool, int]:
-        """Return whether a separator makes a table, and how many more numbers than texts it makes."""
-        found, is_table = rows(separator, _LOOKED_AT), False
+    def numbers(separator: str) -> tuple[bool, bool, int]:
+        """Return whether a separator makes a table, whether its head is of words, and numbers less texts."""
+        found, is_table, has_words = rows(separator, _LOOKED_AT), False, False
         values = [(sum(map(_is_value, row)), sum(map(bool, row))) for _, row in found]
         with suppress(CampaignFileError):
-            is_table = bool(_laid_out(found, path.name, ""))
-        return is_table, sum(2 * count - of for count, of in values if count > 1)
+            head, *_ = _laid_out(found, path.name, "")
+            is_table, has_words = True, not any(map(_is_value, head))
+        return is_table, has_words, sum(2 * count - of for count, of in values if count > 1)
 
     separator = max(SEPARATORS, key=numbers)
     return rows(separator), separator

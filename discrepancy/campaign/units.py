@@ -17,6 +17,17 @@ _TABLES = Path(__file__).with_suffix(".toml")
 NEVER_CONVERTED = {"degC", "°C", "K"}
 """Temperatures: a campaign has one of the two for all."""
 
+LOGGER_NAMES = {
+    "uE": "microstrain", "µE": "microstrain", "μE": "microstrain", "ue": "microstrain",
+    "uStrain": "microstrain", "ustrain": "microstrain", "1e-6": "microstrain", "1E-6": "microstrain",
+    "10^-6": "microstrain", "G": "g", "Gs": "g", "lb": "lbf", "lbs": "lbf", "Lbs": "lbf", "LBS": "lbf",
+    "Lbf": "lbf", "RPM": "rpm",
+    "Rpm": "rpm", "deg C": "degC", "Deg C": "degC", "DegC": "degC", "degrees C": "degC", "Celsius": "degC",
+    "Sec": "s", "sec": "s", "SEC": "s", "secs": "s", "Seconds": "s", "msec": "ms", "Volts": "V", "Deg": "deg",
+    "Newtons": "N", "KN": "kN", "inches": "inch", "Inches": "inch",
+}  # fmt: skip
+"""Names of units that loggers write and pint does not know, or knows as something else."""
+
 
 class Units(NamedTuple):
     """Units of a quantity.
@@ -55,6 +66,7 @@ def conversion(unit: str, si: str) -> float:
     ValueError
         pint does not know the unit, or it is of another quantity.
     """
+    unit = LOGGER_NAMES.get(unit, unit)
     if unit == si:
         return 1.0  # pint takes a third of a second to load
     gravity = si == UNITS[Quantity.ACCELERATION].si
@@ -68,7 +80,7 @@ def conversion(unit: str, si: str) -> float:
 def conversion_of(quantity: Quantity, unit: str) -> float:
     """Return what one of a quantity's unit is in SI; raises ValueError with what is expected."""
     try:
-        if quantity is Quantity.TEMPERATURE and unit in NEVER_CONVERTED:
+        if quantity is Quantity.TEMPERATURE and LOGGER_NAMES.get(unit, unit) in NEVER_CONVERTED:
             return 1.0
         if quantity is Quantity.TEMPERATURE:
             raise ValueError

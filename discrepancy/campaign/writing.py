@@ -137,6 +137,7 @@ def _campaign_text(
         },
         noise=noise_interval and schema.NoiseFileSection(file=NOISE_FILE, interval=noise_interval),
         loggers=dict(campaign.loggers),
+        accept=campaign.accept,
         channel=tuple(_channel(channel, si) for channel in campaign.channels.values()),
         input=tuple(_input(item) for item in inputs.values()),
         trial=tuple(_trial(campaign, *pair) for pair in zip(campaign.trials, files, strict=True)),

@@ -1,13 +1,14 @@
 """What can be wrong with measured data, as a record."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import log
 from statistics import median
 from typing import NamedTuple
 
+from discrepancy.campaign.protocol import ACCEPTABLE
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.campaign.units import UNITS, conversion_of
 from discrepancy.errors import said
@@ -21,7 +22,7 @@ class FaultKind(StrEnum):
     MOVES_AT_REST = "motion at rest"  # the noise record holds more than noise
     CLIPPED = "clipped"
     DEAD = "dead"  # a channel that shows nothing
-    FROZEN = "frozen"  # a value that is held while all else moves
+    FROZEN = "held"  # a value that is held while all else moves
     COPIED = "copied"  # a channel that is another one
     OUTLIERS = "outliers"  # too many to be left out
     TOO_SHORT = "too short"
@@ -62,23 +63,56 @@ class DataFault:
         What was found, where, and what to do.
     channel, trial : str
         Where; empty where it concerns all.
+    accepted : bool
+        Whether the campaign accepts it by its key `accept`.
     """
 
     kind: FaultKind
     sentence: str
     channel: str = ""
     trial: str = ""
+    accepted: bool = False
 
     @property
     def fatal(self) -> bool:
         """Whether conclusions from these data would be wrong, not only limited."""
-        return self.kind not in HARMLESS
+        return self.kind not in HARMLESS and not self.accepted
 
 
 def fault(kind: FaultKind, channel: str = "", trial: str = "", say: str = "", **values: object) -> DataFault:
     """Return a fault with the sentence of its kind, or with that called `say`, filled in with values."""
     name = say or kind.name.lower()
     return DataFault(kind, said(f"faults.{name}", channel=channel, trial=trial, **values), channel, trial)
+
+
+def with_acceptance(faults: Iterable[DataFault], campaign: Campaign) -> tuple[DataFault, ...]:
+    """Return faults with what the campaign's key `accept` says of them.
+
+    The sentence of an accepted fault says so. That of another one ends with the key that would accept it,
+    where there is one.
+    """
+    found = []
+    for item in faults:
+        word = item.kind.value
+        if word in campaign.accepted(item.channel, item.trial):
+            sentence = f"Accepted by the campaign ({word}): {item.sentence}"
+            item = replace(item, sentence=sentence, accepted=True)
+        elif word in ACCEPTABLE and item.fatal:
+            item = replace(item, sentence=f"{item.sentence.removesuffix('.')}; {_how_to_accept(item)}.")
+        found.append(item)
+    return tuple(found)
+
+
+def _how_to_accept(item: DataFault) -> str:
+    """Return the clause that names the key by which a campaign accepts a fault."""
+    tables = []
+    if item.trial:
+        tables.append(f"the [[trial]] {item.trial!r}")
+    if item.channel:
+        tables.append(f"the [[channel]] {item.channel!r}")
+    place = " or ".join(tables) or "at the top of campaign.toml"
+    where = f"in {place}" if tables else place
+    return f'if the data are right, say accept = ["{item.kind.value}"] {where}'
 
 
 def place_of(channel: Channel, trial: Trial, start: int = 0, stop: int | None = None) -> str:

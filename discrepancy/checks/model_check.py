@@ -19,9 +19,10 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.sampling import digit_of
+from discrepancy.campaign.sampling import quantum_of
 from discrepancy.catalogue.entry import Setting
-from discrepancy.checks.quality import is_still, rest_faults, roughness
+from discrepancy.checks.held import roughness
+from discrepancy.checks.quality import is_still, rest_faults
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit, normal_equations
 from discrepancy.fits.problem import Problem
@@ -30,7 +31,7 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-from .fault import DataFault, FaultKind, fault, unit_slips
+from .fault import DataFault, FaultKind, fault, unit_slips, with_acceptance
 
 LEFT = 0.9
 """A parameter of whose prior deviation the records leave more than this share is not observable in them."""
@@ -111,7 +112,8 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
         faults += _holds(campaign, model, trial)
     if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
         faults += unobservable(campaign, model)
-    return (*faults, *(found for _, found in swaps))
+    faults += (found for _, found in swaps)
+    return with_acceptance(faults, campaign)
 
 
 def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
@@ -180,7 +182,7 @@ def _dead(campaign: Campaign, predictions: dict[str, FloatArray]) -> Iterator[Da
         for column, name in enumerate(trial.channels):
             if trial.is_dynamic or not is_still(trial, name):
                 continue
-            digit = digit_of(np.concatenate([values for _, values, _ in campaign.records(name)]))
+            digit = quantum_of(np.concatenate([values for _, values, _ in campaign.records(name)]))
             least = _ABOVE_NOISE * max(campaign.channels[name].noise_in(trial), digit)
             if digit and np.ptp(predictions[trial.name][:, column]) > least:
                 yield fault(FaultKind.DEAD, name, trial.name)

@@ -11,13 +11,14 @@ from scipy.signal import savgol_coeffs
 
 from discrepancy.campaign.noise import repeated
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
-from discrepancy.campaign.sampling import digit_of, is_even
+from discrepancy.campaign.sampling import is_even, quantum_of
 from discrepancy.errors import said
 
 LARGEST_SHARE = 0.03
 """Largest share of a record in time that may be left out; above it the record is at fault."""
 SIGNIFICANT = 5.0
-"""A sample is an outlier if it is this many robust deviations off what its neighbours say."""
+"""A sample is an outlier if it is this many robust deviations off what its neighbours say, and as many
+deviations of its channel's stated noise."""
 WRONG_END = 8.0
 """The same at the ends of a record, beside what a model predicts."""
 SIGNIFICANT_ROW = 8.0
@@ -36,10 +37,11 @@ def mark_outliers(campaign: Campaign) -> Campaign:
 
     Records in time: a sample is compared with a local polynomial through its neighbours, whose width is the
     one that predicts the record best. It is an outlier if it is five robust deviations off, in the scatter
-    of the whole record and in that of its surroundings, and alone: three of five samples in a row are an
+    of the whole record and in that of its surroundings, five deviations of the channel's noise record, and
+    alone: three of five samples in a row are an
     event, such as an impact, and stay, and so does a sample at a kink or a step. The first and last three
     samples are not judged. Where more than 3 % of a record would go, nothing is left out (`check_data`
-    reports a fault).
+    reports a fault), nor where the campaign accepts outliers.
 
     Static and flight trials: a row of at least three repeats is compared with their median; else, in trials
     of eight or more rows, one row may go if a parabola through the others explains them within twice the
@@ -50,6 +52,8 @@ def mark_outliers(campaign: Campaign) -> Campaign:
     for trial, channel, found in find_outliers(campaign):
         count, total = int(found.sum()), len(found)
         if trial.is_dynamic and count > LARGEST_SHARE * total:
+            continue
+        if "outliers" in campaign.accepted(channel, trial.name):
             continue
         used[trial.name][found, trial.channels.index(channel)] = False
         told = {"channel": channel, "trial": trial.name, "count": count, "total": total}
@@ -67,7 +71,8 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
         by_repeats = _repeat_outliers(campaign, channel)
         for trial, values, used in campaign.records(name):
             if trial.is_dynamic:
-                found = sample_outliers(values, used, weights[trial.name])
+                noise = channel.noise_in(trial)
+                found = sample_outliers(values, used, weights[trial.name], noise=noise)
             elif trial.name in by_repeats:
                 found = by_repeats[trial.name] & used
             else:
@@ -77,7 +82,11 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
 
 
 def sample_outliers(
-    values: FloatArray, used: BoolArray | None = None, weights: Weights | None = None
+    values: FloatArray,
+    used: BoolArray | None = None,
+    weights: Weights | None = None,
+    *,
+    noise: float = 0.0,
 ) -> BoolArray:
     """Return which samples of a record are isolated outliers, (N,); see `mark_outliers`.
 
@@ -89,6 +98,8 @@ def sample_outliers(
         Samples that count; the others are bridged and never reported.
     weights : callable, optional
         What `_weights_at` says of the stamps; those of even ones if left out.
+    noise : float
+        Standard deviation of the channel's noise; 0: not known.
     """
     count, size = len(values), float(np.max(np.abs(values), initial=0.0))
     used = np.ones(count, dtype=bool) if used is None else used
@@ -105,7 +116,7 @@ def sample_outliers(
     around = min(shapes, key=lambda shape: _scatter(shape.rest(clean)))
     width, degree = around.shape
     # what rounding to digits leaves at least, which a record at rest does not show
-    rounding = digit_of(values[used] / size) * 12.0**-0.5 * float(np.linalg.norm(_weights(width, degree)))
+    rounding = quantum_of(values[used] / size) * 12.0**-0.5 * float(np.linalg.norm(_weights(width, degree)))
     edge = _EDGE if degree == _SHAPES[0][1] else width
     for _ in range(_PASSES):
         rest = around.rest(clean)
@@ -113,7 +124,8 @@ def sample_outliers(
         share[:edge] = share[-edge:] = 0.0
         # Only the worst of each neighbourhood: it spoils the prediction of the samples around it.
         peaks = share == maximum_filter1d(share, 2 * width + 1, mode="constant")
-        new = np.flatnonzero((share > SIGNIFICANT) & peaks & ~suspects & ~events)
+        beyond_noise = np.abs(rest) > SIGNIFICANT * noise / size
+        new = np.flatnonzero((share > SIGNIFICANT) & beyond_noise & peaks & ~suspects & ~events)
         if not new.size:
             break
         event = np.array([_is_event(rest, int(index), around.shape) for index in new])
@@ -123,14 +135,15 @@ def sample_outliers(
     # Judge again with clean neighbours, and let events stay: three of five in a row are no single readings.
     rest = around.rest(clean)
     far = np.abs((judged - clean) * around.own(count) + rest)
-    found = used & suspects & (far > SIGNIFICANT * _scale(rest, rounding))
+    beyond_noise = far > SIGNIFICANT * noise / size
+    found = used & suspects & beyond_noise & (far > SIGNIFICANT * _scale(rest, rounding))
     crowded = np.convolve(found, np.ones(5), mode="same") >= 3
     event = np.convolve(crowded, np.ones(5), mode="same") > 0
     result: BoolArray = found & ~event
     return result
 
 
-def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
+def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0) -> BoolArray:
     """Return which samples at the ends of a trial's records are single wrong readings, (N, C).
 
     `sample_outliers` cannot judge the ends; beside a model they can be. What several channels show at once,
@@ -142,8 +155,11 @@ def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
         Measured less predicted; the model need not fit.
     used : (N, C) ndarray of bool
         Samples that count.
+    noise : (C,) ndarray or float
+        Standard deviation of each channel's noise, in the unit of the residual; 0: not known.
     """
     found = np.zeros(residual.shape, dtype=bool)
+    noise = np.broadcast_to(noise, residual.shape[1:])
     for column in range(residual.shape[1]):
         rows = np.flatnonzero(used[:, column])
         if len(rows) < 8 * _EDGE:
@@ -156,7 +172,7 @@ def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
         for end in (slice(0, _EDGE), slice(-_EDGE, None)):
             # beside the roughness near that end, where the motion may be fastest
             near = beside[: 4 * _NEAR] if end.stop else beside[-4 * _NEAR :]
-            scale = max(_NORMAL * float(np.median(np.abs(near))), 1e-300)
+            scale = max(_NORMAL * float(np.median(np.abs(near))), float(noise[column]), 1e-300)
             far = alone[end] & (np.abs(beside[end]) > WRONG_END * scale)
             found[rows[end][far], column] = far.sum() == 1
     for end in (slice(0, _EDGE), slice(-_EDGE, None)):

@@ -18,12 +18,12 @@ from discrepancy.campaign.records import (
     Campaign,
     Channel,
     FloatArray,
-    IntArray,
     NoiseRecord,
     Trial,
 )
-from discrepancy.campaign.sampling import digit_of
-from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
+from discrepancy.campaign.sampling import quantum_of
+from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of, with_acceptance
+from discrepancy.checks.held import held_faults, roughness, runs_of, update_length
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
 
 SHORTEST = 128
@@ -93,111 +93,10 @@ def _freedom(series: FloatArray) -> float:
     return len(series) / times_fewer(*autocorrelation([series]))
 
 
-LEAST_HELD = 8
-"""Fewest equal readings in a row that are looked at."""
-_BESIDE = 4  # a run is judged beside so many times its length before and after it
-_ALIKE = 0.25  # runs of at least this share of its length are its like: pauses, square waves, coarse digits
-_MOST_ALIKE = 1.0 / 3.0  # share of the surroundings that its like may hold
-_JUMP = 3.0  # digits in one sample that no turning point makes
-_PACE = 0.25  # share of the mean step beside a run that is no standstill either
-_MOVING, _RESTING = 0.5, 0.25  # range of another record meanwhile, over its usual one in such a time
-_NOISE_DIGITS = 2.0  # noise of so many digits does not let a reading come twice
 COPIED = 0.01
 """A channel is a copy if another leaves less than this share of its own noise."""
 LEAST_COPIED = 32
 _LAGS = 2**14  # samples in which the shift between two channels is looked for
-
-
-def roughness(values: FloatArray) -> float:
-    """Return the standard deviation of white noise that the sixth differences of a record would show.
-
-    Robust (median absolute deviation); differences of the sixth order take out motions of more than some
-    eight samples per period.
-    """
-    differences = np.diff(values, 6)
-    return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))  # sum of squared binomials
-
-
-def _runs(at: BoolArray) -> IntArray:
-    """Return the first sample (R, 2) of each run of true ones, and the one after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], at, [False])).astype(np.int8)))
-    return np.stack((edges[::2], edges[1::2]), axis=1)
-
-
-# ---------------------------------------------------------------- held
-
-
-def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
-    """Yield a fault for each stretch of a record in time in which a channel stood still and should not have.
-
-    See `held_span` for what is told from a pause, a square wave, a coarse converter or a rest.
-    """
-    series = np.column_stack([trial.values, *(item.values for item in trial.inputs)])
-    for column, name in enumerate(trial.channels):
-        channel = campaign.channels[name]
-        noise = channel.noise_in(trial)
-        others = np.delete(series, column, axis=1)
-        for start, stop in held_spans(trial.values[:, column], trial.used[:, column], others, noise):
-            place = place_of(channel, trial, start, stop)
-            yield fault(FaultKind.FROZEN, name, trial.name, count=stop - start, place=place)
-
-
-def held_spans(
-    values: FloatArray, used: BoolArray, others: FloatArray, noise: float = 0.0
-) -> list[tuple[int, int]]:
-    """Return the runs of equal readings, first sample and the one after the last, that are no rest.
-
-    Noise of more than two digits shows at rest too: any run is at fault. Else, what stands still comes to
-    rest before it and starts from rest: its readings go into the run and out of it by a digit at a time. A
-    run counts where the record goes in and out at speed; where it does so on one side only, another record
-    must go on moving meanwhile, and the run be alone of its kind. Other records that come to rest with it
-    acquit it, and so do a second run at the same value (a dead zone) and a third of the surroundings in runs
-    alike (a square wave, pauses).
-
-    Parameters
-    ----------
-    values : (N,) ndarray
-        A record in time.
-    used : (N,) ndarray of bool
-        Samples that count.
-    others : (N, K) ndarray
-        What else was recorded.
-    noise : float
-        Standard deviation of the channel's noise; 0: not known.
-    """
-    runs = _runs((np.diff(values) == 0.0) & used[1:] & used[:-1]) + np.array([0, 1])
-    lengths = runs[:, 1] - runs[:, 0]
-    long = runs[lengths >= LEAST_HELD].tolist()
-    distinct = np.unique(values)
-    if len(distinct) < 3 or not long:
-        return []
-    bends = np.abs(np.diff(values, 2))  # a record that rises all the way passes over digits, its bends do not
-    digit = min(np.diff(distinct).min(), bends[bends > 1e-9 * np.ptp(values)].min(initial=np.inf))
-    inner = [run for run in long if values[run[0]] not in (distinct[0], distinct[-1])]  # else told as clipped
-    if min(noise, roughness(values)) > _NOISE_DIGITS * digit:
-        return [(start, stop) for start, stop in inner]
-    steps = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))  # into each sample, and the last
-    found = []
-    for start, stop in inner:
-        length = stop - start
-        if max(steps[start], steps[stop]) < _JUMP * digit:
-            continue
-        low, high = max(start - _BESIDE * length, 0), min(stop + _BESIDE * length, len(values))
-        like = lengths >= _ALIKE * length
-        inside = like & (runs[:, 0] >= low) & (runs[:, 1] <= high)
-        dead_zone = np.count_nonzero(values[runs[like, 0]] == values[start]) > 1
-        windows = [*range(start - length, low - 1, -length), *range(stop, high - length + 1, length)]
-        if len(windows) < 2 or dead_zone or lengths[inside].sum() > _MOST_ALIKE * (high - low):
-            continue
-        speed = max(_JUMP * digit, _PACE * float(np.mean(np.r_[steps[low : start + 1], steps[stop:high]])))
-        fast = int(steps[start] >= speed) + int(steps[stop] >= speed)
-        usual = np.median([np.ptp(others[at : at + length], axis=0) for at in windows], axis=0)
-        meanwhile = np.ptp(others[start:stop], axis=0)
-        moving = bool(np.any((meanwhile > _MOVING * usual) & (usual > 0.0)))
-        resting = not moving and bool(np.any(meanwhile < _RESTING * usual))
-        if (fast == 2 and not resting) or (fast and moving and np.count_nonzero(like) == 1):
-            found.append((start, stop))
-    return found
 
 
 # ---------------------------------------------------------------- copied
@@ -293,7 +192,7 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     for trial, name, found in find_outliers(campaign):
         if trial.is_dynamic and (share := found.mean()) > LARGEST_SHARE:
             faults.append(fault(FaultKind.OUTLIERS, name, trial.name, share=share, most=LARGEST_SHARE))
-    return tuple(faults)
+    return with_acceptance(faults, campaign)
 
 
 # ---------------------------------------------------------------- noise
@@ -353,15 +252,17 @@ def _clipped(trial: Trial, name: str, values: FloatArray, used: BoolArray) -> It
 def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:
     """Return the longest run of readings that stand at an extreme where they should not; 0 if there is none.
 
-    A run is clipped where the record would have gone beyond the extreme by more than some digits (the least
-    difference of two readings) and six deviations of its scatter; a record of few digits is flat at its
-    turning points too, but by a digit. Records in time: three digits, by a parabola through three samples on
-    either side of the run, whose error grows with its length. Static readings, in the order of their load:
-    one and a half, by a line through all others; the run must span three loads.
+    A run is clipped where the record would have gone beyond the extreme by more than some quanta of the
+    sensor (`quantum_of`) and six deviations of its scatter; a record of few digits is flat at its turning
+    points too, but by a digit. Records in time: three digits, by a parabola through three samples on either
+    side of the run, whose error grows with its length; the run must span three updates of the sensor. Static
+    readings, in the order of their load: one and a half, by a line through all others; the run must span
+    three loads.
     """
-    digit = digit_of(values)
-    found: list[tuple[int, int]] = _runs(values == extreme).tolist()
-    runs = [(start, stop) for start, stop in found if stop - start >= CLIPPED_RUN]
+    digit = quantum_of(values)
+    least_run = CLIPPED_RUN * (update_length(values) if load is None else 1.0)
+    found: list[tuple[int, int]] = runs_of(values == extreme).tolist()
+    runs = [(start, stop) for start, stop in found if stop - start >= least_run]
     if not runs:
         return 0
 

@@ -40,6 +40,11 @@ GAINS = ("proportional", "derivative", "integral")
 """Gains of a controller; NAME.proportional is what a parameter scales."""
 
 
+def _is_definite(matrix: FloatArray) -> bool:
+    """Return whether a symmetric matrix is positive definite."""
+    return bool(np.linalg.eigvalsh(matrix)[0] > 0.0)
+
+
 def _listed(value: object) -> list[object] | tuple[object, ...]:
     """Return one number as a list: with one unknown nobody needs brackets."""
     return value if isinstance(value, list | tuple) else [value]
@@ -212,7 +217,7 @@ class ScaledParameter(ParameterSection):
 
     terms: Annotated[tuple[Name, ...], BeforeValidator(_listed)]
     mean: Number = 1.0
-    low: Positive
+    low: NotNegative
 
 
 class LumpedDescription(ModelDescription):
@@ -282,12 +287,12 @@ class LumpedDescription(ModelDescription):
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether it is a structure at rest on springs under one force at a time."""
+        """Whether it is a structure on springs under one force at a time."""
         motion = any(item.quantity.moving or item.through for item in self.input)
         parts = self.states or self.free or self.load or self.damping_part or self.controller
         acts = any(item.acts for item in self.port)
         reads = any(item.reaction or item.constant for item in self.output)
-        return not (parts or motion or acts or reads)
+        return bool(self.input) and not (parts or motion or acts or reads)
 
     def given(self, kind: str) -> dict[str, Rows]:
         """Return the matrix of a kind, by that as its name, and its parts by name, those that there are."""
@@ -325,9 +330,8 @@ class LumpedDescription(ModelDescription):
             lacks = wanted and not self.given(kind)
             yield lacks, f"{kind} is missing: give it, or [[{kind}_part]]{more}"
         yield n and not (self.damping or self.free), "'damping' is missing"
-        idle = self.is_plain and not self.input
-        yield idle, "[[input]] is missing: at least one force must be able to act"
         yield from self._wrong_names()
+        yield from self._vanishing_matrices()
         yield from self._wrong_matrices()
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for item in getattr(self, kind):
@@ -359,6 +363,23 @@ class LumpedDescription(ModelDescription):
                 loose, floats = (LOOSE, self.free) if kind == "stiffness" else ("", False)
                 holds = values[0] > 0.0 or (floats and values[0] >= -1e-9 * values[-1])
                 yield not holds, f"{kind} (with its parts) must be positive definite{loose}"
+
+    def _vanishing_matrices(self) -> Iterator[Fault]:
+        """Yield parameters whose `low` of zero leaves no mass, capacity or stiffness that a model needs."""
+        needed = ["mass", "capacity"] if self.free else ["mass", "capacity", "stiffness"]
+        for item in self.parameter:
+            if item.low > 0.0:
+                continue
+            for kind in needed:
+                scaled = kind in item.terms
+                kept = [matrix for name, matrix in self.given(kind).items() if name not in item.terms]
+                loses = scaled or len(kept) < len(self.given(kind))
+                holds = bool(kept) and not scaled and _is_definite(np.sum(kept, axis=0))
+                yield (
+                    loses and not holds,
+                    f"the parameter {item.name!r} has low = 0, which would leave no {kind} at some unknown: "
+                    "give a low above 0",
+                )
 
     def _wrong_vectors(
         self, kind: str, item: NamedVector | OutputSection | ControllerSection

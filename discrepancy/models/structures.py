@@ -45,9 +45,9 @@ Design = WingDesign | None
 class StructureModel(SystemModel):
     """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
 
-    A control in N is a force, and where a load of it meets a displacement output along it there is a port,
-    which has the name of that. Other controls are nominal but for the load factor, which is zero where none
-    is recorded; constant loads always act.
+    A control in N is a force, and where a load of it acts along a displacement output, in either direction,
+    there is a port, which has the name and the sign of that output. Other controls are nominal but for the
+    load factor, which is zero where none is recorded; constant loads always act.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class StructureModel(SystemModel):
             name: self._rows[name]
             for push in along
             for name in model.displacements
-            if np.abs(self._rows[name] - push).max() <= SAME * np.abs(push).max()
+            if _acts_along(push, self._rows[name])
         }
         self.ports = tuple(self.port_rows)
 
@@ -151,6 +151,13 @@ class StructureModel(SystemModel):
             If a value lies outside the validity box of the reduced model.
         """
         return _system(self.model.at(self._at(state, {})), self.model.damping, self.port_rows)
+
+
+def _acts_along(push: FloatArray, row: FloatArray) -> bool:
+    """Return whether a load (n,) acts along the row (n,) of a displacement, or against it."""
+    largest = float(np.abs(push).max())
+    amount = float(push @ row) / (float(row @ row) or 1.0)
+    return largest > 0.0 and float(np.abs(push - amount * row).max()) <= SAME * largest
 
 
 def _system(

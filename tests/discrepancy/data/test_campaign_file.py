@@ -201,6 +201,30 @@ def test_the_documented_campaign_is_read(tmp_path):
 
 # ---------------------------------------------------------------- round trip
 
+ACCEPTING = (
+    ("format = 1", 'format = 1\naccept = ["sign"]'),
+    ('name = "tip"', 'name = "tip"\naccept = ["outliers", "held"]'),
+    ('name = "release"', 'name = "release"\naccept = ["too short"]'),
+)
+
+
+def test_what_a_campaign_accepts_is_read_and_written(tmp_path):
+    changes = [(TOML, old, new) for old, new in ACCEPTING]
+    campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, *changes))
+    again = read_campaign(write_campaign(campaign, tmp_path / "b"))
+    for item in (campaign, again):
+        assert item.accepted("tip", "release") == {"sign", "outliers", "held", "too short"}
+        assert item.accepted("g17") == {"sign"}
+
+
+def test_a_word_that_is_no_fault_cannot_be_accepted(tmp_path):
+    change = (TOML, 'name = "tip"', 'name = "tip"\naccept = ["frozen"]')
+    with refused(
+        CampaignFileError, "'frozen' is no fault that can be accepted; these are clipped, dead, held"
+    ):
+        read_campaign(campaign_folder(tmp_path / "a", PLAIN, change))
+
+
 finite = st.floats(-1e6, 1e6, allow_nan=False).filter(lambda x: x == 0.0 or abs(x) > 1e-200)
 positive = st.floats(1e-9, 1e6)
 names = st.text(

@@ -8,10 +8,12 @@ from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import pre_trigger_record
 from discrepancy.campaign.records import Channel, Hold, NoiseRecord, Quantity, RecordedInput, Start, TrialKind
+from discrepancy.campaign.sampling import quantum_of
 from discrepancy.checks.fault import FaultKind, slip_between
+from discrepancy.checks.held import held_spans
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
-from discrepancy.checks.quality import check_data, held_spans, moves
+from discrepancy.checks.quality import check_data, clipped_run, moves
 from tests.discrepancy.rigs import asked, campaign, model_of
 from tests.refusals import Inputs
 
@@ -129,6 +131,96 @@ def test_what_rests_is_not_frozen(digit, pace):
     motion = clock + 0.1 * clock**2
     for beside, spans in ((np.round(motion, 2), []), (np.round(np.sin(3.0 * TIME), 3), [(600, 801)])):
         assert held_spans(np.round(motion, 3), used, beside[:, np.newaxis]) == spans
+
+
+STEP = 2.0 * np.pi / 1024.0
+"""Of an encoder of ten bits [rad]."""
+
+
+def _swing_with_friction(interval=0.002, seconds=8.0):
+    """Return angles [rad] of a pendulum under dry friction, which sticks for a moment where it turns."""
+    steps_of_each, angle, speed = 10, 0.6, 0.0
+    step, angles = interval / steps_of_each, []
+    for _ in range(round(seconds / interval)):
+        angles.append(angle)
+        for _ in range(steps_of_each):
+            pull = -40.0 * np.sin(angle) - 0.05 * speed
+            if speed == 0.0 and abs(pull) <= 0.35:
+                continue
+            friction = 0.35 * np.sign(speed or pull)
+            next_speed = speed + step * (pull - friction)
+            speed = 0.0 if next_speed * speed < 0.0 else next_speed
+            angle += step * speed
+    return np.array(angles)
+
+
+@pytest.mark.parametrize("noise", [0.0, STEP / 3.0, STEP])
+def test_an_encoder_that_sticks_at_the_end_of_a_swing_is_not_held(noise):
+    """Printed with six decimals: its steps differ by the last of them."""
+    angles = np.round(np.round(_swing_with_friction() / STEP) * STEP, 6)
+    other = np.cos(5.0 * np.arange(len(angles)))[:, np.newaxis]
+    assert held_spans(angles, np.ones(len(angles), bool), other, noise) == []
+
+
+@pytest.mark.parametrize("noise", [0.0, STEP / 3.0, STEP])
+def test_encoder_steps_that_were_resampled_by_straight_lines_are_not_held(noise):
+    time = np.arange(0.0, 4.0, 0.0013)
+    steps = np.round(0.5 * np.exp(-0.3 * time) * np.cos(6.0 * time) / STEP) * STEP
+    resampled = np.round(np.interp(np.arange(0.0, 3.99, 0.001), time, steps), 6)
+    other = np.cos(5.0 * np.arange(len(resampled)))[:, np.newaxis]
+    assert held_spans(resampled, np.ones(len(resampled), bool), other, noise) == []
+
+
+def _logged_faster_than_updated(updates=400, samples_of_each=10):
+    readings = np.sin(0.07 * np.arange(updates)) + 0.02 * np.random.default_rng(1).standard_normal(updates)
+    return np.round(np.repeat(readings, samples_of_each), 4)
+
+
+def test_a_sensor_that_is_slower_than_its_logger_is_neither_held_nor_clipped():
+    values = _logged_faster_than_updated()
+    assert held_spans(values, np.ones(len(values), bool), np.zeros((len(values), 0)), 0.02) == []
+    assert clipped_run(values, values.max()) == 0
+
+
+def test_a_sensor_that_is_slower_than_its_logger_can_be_held():
+    values = _logged_faster_than_updated()
+    values[1000:1100] = values[1000]
+    assert held_spans(values, np.ones(len(values), bool), np.zeros((len(values), 0)), 0.02) == [(1000, 1100)]
+
+
+@pytest.mark.parametrize(
+    ("values", "quantum"),
+    [
+        ([0.0, 1.0, 2.0, 3.0, 3.0, 3.0], 1.0),
+        (np.round(np.repeat(np.arange(20), 2) * STEP, 6), STEP),
+        (np.round(np.arange(0, 60, 3) * STEP, 6), 3.0 * STEP),
+        (np.zeros(9), 0.0),
+    ],
+)
+def test_the_quantum_of_a_sensor_is_what_its_readings_repeat(values, quantum):
+    assert quantum_of(np.array(values)) == pytest.approx(quantum, abs=2e-6)
+
+
+@pytest.mark.parametrize("place", ["top", "channel", "trial"])
+def test_a_campaign_accepts_readings_that_look_held(place):
+    def freeze(values):
+        values[310:410, 0] = values[310, 0]
+
+    campaign = campaign_of(freeze, trials=1)
+    fault = only(check_data(campaign), FaultKind.FROZEN)
+    assert fault.sentence.endswith(
+        """if the data are right, say accept = ["held"] in the [[trial]] 'ring 0' or the [[channel]] 'x'."""
+    )
+    if place == "top":
+        campaign = replace(campaign, accept=("held",))
+    if place == "channel":
+        accepting = replace(campaign.channels["x"], accept=("held",))
+        campaign = replace(campaign, channels={**campaign.channels, "x": accepting})
+    if place == "trial":
+        campaign = replace(campaign, trials=(replace(campaign.trials[0], accept=("held",)),))
+    fault = only(check_data(campaign), FaultKind.FROZEN)
+    assert (fault.accepted, fault.fatal) == (True, False)
+    assert fault.sentence.startswith("Accepted by the campaign (held): The channel 'x' holds one value")
 
 
 # ---------------------------------------------------------------- copied
@@ -260,6 +352,34 @@ def test_sound_samples_of_records_with_gaps_or_few_digits_stay(share, rate, nois
         counts += (~sound.used).sum(), (~other.used[places]).sum(), len(places)
     assert counts[0] <= 1
     assert counts[1] >= 0.65 * counts[2]
+
+
+def _ring_with_two_wrong_readings(noise):
+    """Return a campaign of a smooth ring in which two readings are 1e-3 off, and what is left out of it."""
+    time = np.arange(1000) * 0.002
+    values = np.cos(30.0 * time) + 1e-6 * np.random.default_rng(4).normal(size=1000)
+    values[[300, 700]] += 1e-3
+    trial = asked(TrialKind.RINGDOWN, time, channels=("x",), values=values[:, None])
+    return campaign(trial, x=Channel("x", Quantity.DISPLACEMENT, "x", noise and NoiseRecord(noise)))
+
+
+@pytest.mark.parametrize(("noise", "left_out"), [(None, 2), (1e-4, 2), (2.1e-4, 0), (2e-3, 0)])
+def test_an_outlier_is_also_beyond_five_deviations_of_the_stated_noise(noise, left_out):
+    (trial,) = mark_outliers(_ring_with_two_wrong_readings(noise)).trials
+    assert np.count_nonzero(~trial.used) == left_out
+
+
+def test_outliers_that_a_campaign_accepts_stay():
+    (trial,) = mark_outliers(replace(_ring_with_two_wrong_readings(None), accept=("outliers",))).trials
+    assert trial.used.all()
+
+
+@pytest.mark.parametrize(("noise", "found"), [(0.0, [(0, 0)]), (3.0, [])])
+def test_a_wrong_end_is_also_beyond_the_stated_noise(noise, found):
+    residual = np.random.default_rng(1).standard_normal((200, 1))
+    residual[0] += 20.0
+    wrong = wrong_ends(residual, residual < 1e5, np.array([noise]))
+    assert [tuple(place) for place in np.argwhere(wrong).tolist()] == found
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2])

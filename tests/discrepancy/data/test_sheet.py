@@ -49,6 +49,36 @@ def test_odd_files_are_read_as_they_are_meant(tmp_path, name):
     assert text_of(sheet) == ODD[name]["rows"]
 
 
+@pytest.mark.parametrize(
+    ("stamps", "seconds"),
+    [
+        (["2026-02-01T10:00:00.500Z", "2026-02-01T10:01:00.500Z"], ["0.000", "60.000"]),
+        (["2026-02-01T10:00:00+01:00", "2026-02-01T09:00:30Z"], ["0", "30"]),
+        (["2026-02-01 23:30:00-0530", "2026-02-02 05:00:10+0000"], ["0", "10"]),
+        (["11:59:58 PM", "12:00:01 AM"], ["0", "3"]),
+        (["23:59:58", "00:00:01"], ["0", "3"]),
+        (["10:00:05", "10:00:01"], ["0", "-4"]),  # out of order, and no midnight
+    ],
+)
+def test_stamps_with_zones_halves_of_the_day_and_midnight_are_times(tmp_path, stamps, seconds):
+    rows = "".join(f"{stamp},{row}.5\n" for row, stamp in enumerate(stamps))
+    sheet = sheet_of(tmp_path, f"stamp,w [mm]\n{rows}".encode())
+    assert (sheet.heads, sheet.units) == (("stamp", "w"), ("s", "mm"))
+    assert [*sheet.numbers("stamp", ".")] == seconds
+
+
+def test_true_and_false_are_values(tmp_path):
+    sheet = sheet_of(tmp_path, b"t [s],contact\n0.5,True\n1.5,FALSE\n2.5,\n")
+    assert (sheet.units, sheet.numbers("contact", ".")) == (("s", "1"), ("1", "0", ""))
+
+
+def test_an_output_of_a_driven_trial_may_be_called_force(tmp_path):
+    sheet = sheet_of(tmp_path, b"t [s],force [N]\n" + b"".join(b"%d.5,%d\n" % (k, k) for k in range(9)))
+    outputs = {"force": Quantity.FORCE}
+    campaign = Understanding([sheet], {"kind": {"": "driven"}}, outputs.get).campaign("cell")
+    assert (campaign.channels["force"].output, campaign.trials[0].inputs) == ("force", ())
+
+
 def test_what_is_passed_over_is_told(tmp_path):
     sheet = sheet_of(tmp_path, bytes_of(ODD["title rows, units row, footer with statistics"]))
     assert sheet.remark == "lines 7 to 9, semicolons between cells; what stands from 10 on is left out"
@@ -194,15 +224,16 @@ ROWS = [
         ([["t", "w [mm]"], [clock(10, 0, 0), 1], [clock(10, 0, 2), 2]], ["0 1", "2 2"]),
         ([["t", "w [mm]"], [timedelta(seconds=1.5), 1], [timedelta(hours=30, seconds=2), 2]],
          ["0.000000 1", "108000.500000 2"]),
-        # texts are read like those of a file; true and false are no numbers
+        # texts are read like those of a file; true and false are 1 and 0
         ([["t [s]", "w [mm]"], [0.125, "1,5"], [1.125, "2,5"]], ["0.125 1.5", "1.125 2.5"]),
-        ([["t [s]", "w [mm]", "ok"], [0.125, 1.5, True], [1.125, 2.5, False]], ["0.125 1.5", "1.125 2.5"]),
+        ([["t [s]", "w [mm]", "ok"], [0.125, 1.5, True], [1.125, 2.5, False]],
+         ["0.125 1.5 1", "1.125 2.5 0"]),
     ],
 )  # fmt: skip
 def test_excel_workbooks(tmp_path, rows, text):
     sheet = read_sheet(book_of(tmp_path, rows))
     assert text_of(sheet) == text
-    assert len(sheet.heads) == 2
+    assert len(sheet.heads) == len(text[0].split())
     if rows is ROWS:
         assert (sheet.name, sheet.heads, sheet.units) == ("lab.xlsx", ("Zeit", "Weg"), ("s", "mm"))
         assert "rows 4 to 5" in sheet.remark
@@ -255,6 +286,23 @@ def test_units_mean_what_they_always_did_and_what_laboratories_write():
     assert conversion("ms", "s") == pytest.approx(1e-3, rel=1e-15)
     with pytest.raises(ValueError, match="cannot become s"):
         conversion("mm", "s")
+
+
+@pytest.mark.parametrize(
+    ("unit", "quantity", "in_si"),
+    [
+        ("uE", Quantity.STRAIN, 1e-6),
+        ("1e-6", Quantity.STRAIN, 1e-6),
+        ("G", Quantity.ACCELERATION, 9.80665),
+        ("lbs", Quantity.FORCE, 4.4482216152605),
+        ("RPM", Quantity.ANGULAR_VELOCITY, np.pi / 30.0),
+        ("deg C", Quantity.TEMPERATURE, 1.0),
+    ],
+)
+def test_loggers_names_of_units_are_known(unit, quantity, in_si):
+    assert quantity in quantities_of(unit)
+    assert conversion_of(quantity, unit) == pytest.approx(in_si, rel=1e-12)
+    assert conversion("Sec", "s") == 1.0
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
+from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped import LumpedModel
@@ -273,3 +274,32 @@ def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray,
     assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
     assert fine[0] < 1e-3 * 0.02
     assert np.all(usual < np.array([0.03, 0.08]) * effect + 1e-3 * np.array([0.02, A]))
+
+
+WITHOUT_INPUT = """format = 1
+name = "rings down by itself"
+mass = 1.0
+stiffness = 400.0
+damping = { matrix = 1.0 }
+[[output]]
+name = "x"
+vector = 1.0
+[[parameter]]
+name = "loss"
+terms = "damping"
+mean = 1.0
+deviation = 0.5
+low = 0.0
+high = 4.0
+"""
+
+
+def test_a_rig_without_an_input_and_a_damping_down_to_zero_is_a_model():
+    model = model_of(WITHOUT_INPUT)
+    assert TrialKind.DRIVEN in model.kinds
+    assert model.parameters[0].low == 0.0
+
+
+def test_a_low_of_zero_that_would_leave_no_stiffness_is_refused():
+    with pytest.raises(ModelError, match="low = 0, which would leave no stiffness at some unknown"):
+        model_of(WITHOUT_INPUT.replace('terms = "damping"', 'terms = "stiffness"'))

@@ -236,6 +236,25 @@ def test_what_no_trial_records_acts_always(write_beam, tmp_path: Path) -> None:
     assert abs(held[0, 0]) < 0.5 * abs(found[0, 0])
 
 
+def test_a_force_down_beside_a_displacement_up_makes_the_port_of_that_displacement(
+    write_beam, tmp_path: Path
+) -> None:
+    """A spring at the port stands against both forces alike."""
+    tips = []
+    for direction in ("1", "-1"):
+        folder = tmp_path / direction
+        folder.mkdir()
+        push_at_tip = f"point = [100, 10, 5], force = [0, 0, {direction}]"
+        beam = write_beam(folder, {'set = "end", force = [0, 0, 1]': push_at_tip}, cells=2)
+        model = StructureModel(reduce_structure(load_and_assemble(beam)).model)
+        assert model.ports == ("tip",)
+        push = record(TrialKind.STATIC, 2, 1.0, force=np.array([0.0, 5.0]))
+        stiff = PowerStiffness("tip", 1000.0, 1.0, 0, 1e-3)
+        tips.append(seen(model, push, BEAM, stiff, parameters=model.prior_mean())[1, 0])
+    assert tips[0] > 0.0
+    assert tips[1] == pytest.approx(-tips[0], rel=1e-6)
+
+
 def test_a_structure_without_a_force_is_refused(write_beam, tmp_path: Path) -> None:
     design = load_structure(write_beam(tmp_path, {'unit = "N", ': "", "load_factor": "gee"}, cells=1))
     with pytest.raises(FmuBuildError, match="no control in N and no load_factor"):
