@@ -37,6 +37,12 @@ lint: $(VENV)/.dev ## Check style, docstrings, types and the direction of import
 bench: $(VENV)/.dev ## Measure speed and memory, as ratios within one run
 	$(BIN)/python -m benchmarks
 
+PICTURES ?=
+
+.PHONY: pictures
+pictures: $(VENV)/.dev ## Draw the pictures of README and docs, and say where pages state other numbers (PICTURES="NAME ...": these)
+	$(BIN)/python -m benchmarks.pictures $(PICTURES)
+
 BLIND ?= runs/blind
 
 .PHONY: blind

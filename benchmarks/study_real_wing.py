@@ -1,8 +1,7 @@
 """What the published ring-downs and loading runs of the real wing say about the wing model.
 
-`python -m benchmarks.study_real_wing DATA --pictures DIR` investigates them with several windows of the
-ring-downs, and the loading runs alone, and draws the pictures of docs/real_wing.md. DATA is the authors'
-calibration folder.
+`python -m benchmarks.study_real_wing DATA` investigates them with several windows of the ring-downs, and the
+loading runs alone. DATA is the authors' calibration folder.
 """
 
 import argparse
@@ -11,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import matplotlib as mpl
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -19,13 +17,10 @@ from rich.table import Table
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.models.structures import WingModel
-from discrepancy.report.figures import missing_force_figure
 from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
 from discrepancy.workflow import Investigation, investigate
-from reporting.figures import publication_style
 
 BEGINS = (0.8, 1.0, 1.25)
 
@@ -107,41 +102,9 @@ def held_out_rms(campaign: Campaign, found: Investigation) -> str:
     )
 
 
-def draw(found: Investigation, folder: Path) -> None:
-    """Draw residuals of the first trial before and after, and the missing force."""
-    mpl.use("agg")
-    import matplotlib.pyplot as plt
-
-    problem, search, fit = found.problem, found.search, found.fit
-    if not isinstance(problem, Problem) or search is None or fit is None:
-        return
-    number = next(n for n, data in enumerate(problem.trials) if data.trial.is_dynamic)
-    trial = problem.trials[number].trial
-    time = trial.time + BEGINS[0]
-    figure, axes = plt.subplots(3, 1, figsize=(6.4, 5.2), sharex=True, layout="constrained")
-    axes[0].plot(time, 1e3 * trial.values[:, 0], lw=0.8, color="black")
-    axes[0].set_ylabel("signal, mV")
-    for axis, item, label in (
-        (axes[1], search.none, "wing model, refitted"),
-        (axes[2], fit, "with the effect"),
-    ):
-        prediction = problem.prediction(number, item.point, item.responses[number])
-        axis.plot(time, 1e6 * (trial.values - prediction)[:, 0], lw=0.8)
-        axis.set_ylabel("residual, $\\mu$V")
-        axis.set_title(label, fontsize=9)
-    axes[2].set_ylim(axes[1].get_ylim())
-    axes[2].set_xlabel("time since the release, s")
-    figure.savefig(folder / "real_wing_residuals.png", dpi=90)
-    plt.close(figure)
-    if found.missing is not None:
-        with publication_style():
-            missing_force_figure(found.missing).savefig(folder / "real_wing_force.png", dpi=110)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--pictures", type=Path)
     parser.add_argument("--begin", type=float, nargs="+", default=BEGINS, help="windows of the ring-downs, s")
     given = parser.parse_args()
     model = WingModel.of_design()
@@ -176,9 +139,6 @@ def main() -> int:
             console.print(item)
     for experiment in first.verdict.next_experiments:
         console.print(experiment.description, f"{float(experiment.information):.3f}")
-    if given.pictures is not None:
-        given.pictures.mkdir(parents=True, exist_ok=True)
-        draw(first, given.pictures)
     return 0
 
 

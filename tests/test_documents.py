@@ -1,12 +1,13 @@
 """Pages use the terms of the glossary, their links lead somewhere, the picture is what its script draws."""
 
 import re
-import runpy
 from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+
+from benchmarks.pictures import whole
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -63,6 +64,6 @@ IMAGES = ROOT / "docs" / "images"
 
 
 def test_the_committed_picture_is_what_the_script_draws():
-    drawn = runpy.run_path(str(IMAGES / "draw_whole.py"))["draw"]()
+    drawn = whole.draw()
     ElementTree.fromstring(drawn)
     assert (IMAGES / "whole.svg").read_text(encoding="utf-8") == drawn

@@ -1,4 +1,4 @@
-"""Draw the picture of the whole, `whole.svg`: `python docs/images/draw_whole.py`.
+"""The picture of the whole, `whole.svg`: `python -m benchmarks.pictures whole`.
 
 The picture has a light ground of its own, so that it reads alike on light and dark pages.
 """
@@ -6,9 +6,8 @@ The picture has a light ground of its own, so that it reads alike on light and d
 from __future__ import annotations
 
 from html import escape
-from pathlib import Path
 
-PICTURE = Path(__file__).with_name("whole.svg")
+NAME = "whole"
 WIDTH, HEIGHT = 1100, 600
 INK, QUIET, GROUND = "#1f2933", "#52606d", "#ffffff"
 BLUE, GREEN, ORANGE, PURPLE = "#0072b2", "#007a5a", "#b35900", "#8e4585"
@@ -158,7 +157,3 @@ def draw() -> str:
     fields = [part for part in lanes if 'rx="12"' in part]
     rest = [part for part in lanes if 'rx="12"' not in part]
     return head + "\n".join([*fields, *rest]) + "\n</svg>\n"
-
-
-if __name__ == "__main__":
-    PICTURE.write_text(draw(), encoding="utf-8")
