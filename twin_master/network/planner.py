@@ -295,7 +295,8 @@ class _DecisionProcess:
         for control, discount in enumerate(self.discount):
             chosen = np.flatnonzero(policy[:, control])
             weight = discount * policy[chosen, control]
-            discounted[chosen] += weight[:, None] * self.transition.rows(np.full_like(chosen, control), chosen)
+            following = self.transition.rows(np.full_like(chosen, control), chosen)
+            discounted[chosen] += weight[:, None] * following
         reward = np.sum(policy * self.reward, axis=1)
         return np.asarray(np.linalg.solve(np.eye(states) - discounted, reward))
 

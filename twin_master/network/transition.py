@@ -258,7 +258,8 @@ class TransitionModel:
         result = np.ones((len(state), 1))
         for block, level in zip(self.blocks, levels, strict=True):
             following = block[control, level]
-            result = (result[:, :, None] * following[:, None, :]).reshape(len(state), -1)
+            states = result.shape[1] * following.shape[1]
+            result = (result[:, :, None] * following[:, None, :]).reshape(len(state), states)
         return result
 
     def forward(self, control: int, belief: Float) -> Float:
