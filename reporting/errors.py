@@ -20,6 +20,10 @@ class DamagedFileError(ReportingError):
     """A file is there but cannot be read as what it should be."""
 
 
+class InvalidChoiceError(ValueError):
+    """An argument is none of the few values that are allowed."""
+
+
 class InvalidFigureError(ValueError):
     """Data handed to a page or a figure does not fit it."""
 

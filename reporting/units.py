@@ -24,8 +24,12 @@ _ALIASES = {
 """Names of units that pint does not know, or reads as something else."""
 _LONGEST = 40
 """Letters of a unit: pint takes long over more."""
-_PART = re.compile(r"(\(*)([^\W\d_]+|[%‰°]|1)(?:\^?([+-]?\d))?(\)*)")
+_FACTOR = re.compile(
+    r"(?P<opening>\(*)(?P<name>[^\W\d_]+|[%‰°]|1)(?P<caret>\^?)(?P<power>[+-]?[0-9])?(?P<closing>\)*)"
+)
 """One factor of a unit: a name and its power, and parentheses that begin before and end after it."""
+_SMALLEST_FACTOR, _LARGEST_FACTOR = Fraction(10) ** -150, Fraction(10) ** 150
+"""Between them quotients of two units are numbers, too."""
 _WORDS = {
     "chain", "chains", "dB", "decade", "hand", "hands", "link", "links", "octave", "point", "points", "rod",
     "rods",
@@ -64,17 +68,43 @@ def _known_units() -> "UnitRegistry[Any]":
 def _expression(unit: str, *, gravity: bool) -> str:
     """Return a unit as pint reads it; raises ValueError if it is not made of names and powers."""
     text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST]).replace("**", "^")
-    parts = re.split(r"\s*([*/.·⋅]|\s)\s*", _ALIASES.get(text, text))
+    if len(unit) > _LONGEST or len(text) > _LONGEST:
+        raise ValueError(f"{unit!r} is no unit")
+    text = _ALIASES.get(text, text)
+    if text == "1":
+        return text
+    parts = re.split(r"\s*([*/.·⋅]|\s)\s*", text)
     for at in range(0, len(parts), 2):
-        found = _PART.fullmatch(parts[at])
-        if found is None or found[2] in _WORDS or len(unit) > _LONGEST:
+        factor = _FACTOR.fullmatch(parts[at])
+        is_divided = parts[at + 1 : at + 2] == ["/"]
+        if factor is None or not _is_unit_with_power(factor, is_first=at == 0, is_divided=is_divided):
             raise ValueError(f"{unit!r} is no unit")
-        name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", _ALIASES.get(found[2], found[2]))
-        name = re.sub(r"^([mμ]?)g$", r"\1g_0", name) if gravity else name
-        parts[at] = found[1] + (name if found[3] is None else f"({name})**{found[3]}") + found[4]
+        parts[at] = _factor_for_pint(factor, gravity=gravity)
         if at:
             parts[at - 1] = "/" if parts[at - 1] == "/" else "*"
     return "".join(parts)
+
+
+def _is_unit_with_power(factor: re.Match[str], *, is_first: bool, is_divided: bool) -> bool:
+    """Return whether a factor can be of a unit.
+
+    A digit that makes no other unit of a name is the number of a pin, gauge or channel: `A0`, `N1`. One is a
+    factor only where it is divided by others: `1/s`, `m.(1/s)`; `12` or `m 1` are no units.
+    """
+    name, caret, power = factor["name"], factor["caret"], factor["power"]
+    if name == "1":
+        return not caret and power is None and is_divided and (is_first or bool(factor["opening"]))
+    if name in _WORDS or (caret and power is None):
+        return False
+    return power is None or int(power) not in (0, 1) or (bool(caret) and int(power) == 1)
+
+
+def _factor_for_pint(factor: re.Match[str], *, gravity: bool) -> str:
+    """Return a factor of a unit as pint reads it."""
+    name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", _ALIASES.get(factor["name"], factor["name"]))
+    name = re.sub(r"^([mμ]?)g$", r"\1g_0", name) if gravity else name
+    power = "" if factor["power"] is None else f"({name})**{factor['power']}"
+    return factor["opening"] + (power or name) + factor["closing"]
 
 
 @cache
@@ -82,8 +112,9 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...],
     """Return what a unit means: its exponents, and factor and offset as fractions, see `Meaning`.
 
     Names with SI prefixes are joined by `.`, `*`, `/` or a blank; a power follows its name (`m2`, `m^2`,
-    `s-1`, `m**2`); a `/` divides by the next name or parenthesis only, as in Modelica. An angle is no number
-    here, and a hertz no rad/s.
+    `s-1`, `m**2`) and is not 0, and 1 only behind a caret: `A0` and `N1` are names of pins and gauges. A `/`
+    divides by the next name or parenthesis only, as in Modelica. An angle is no number here, and a hertz no
+    rad/s.
 
     Parameters
     ----------
@@ -95,7 +126,7 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...],
     Raises
     ------
     ValueError
-        If pint does not know it.
+        If it is no unit that pint knows, none of SI, or beyond the numbers of a computer.
     """
     text = _expression(unit, gravity=gravity)
     from pint.errors import PintError
@@ -108,10 +139,14 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...],
     except (PintError, TokenError, AttributeError, TypeError, ArithmeticError) as cause:
         raise ValueError(f"{unit!r} is no unit") from cause
     powers: dict[str, Any] = dict(roots._units)
-    exponents = tuple(int(powers.pop(root, 0)) for root in _ROOTS)
-    if powers:
+    exponents = tuple(powers.pop(root, 0) for root in _ROOTS)
+    if powers or any(exponent != int(exponent) for exponent in exponents):
         raise ValueError(f"{unit!r} is no unit of SI")
-    return exponents, Fraction(str(factor)) / 1000 ** exponents[0], Fraction(offset)
+    kilograms = int(exponents[0])
+    size = Fraction(str(factor)) / Fraction(1000) ** kilograms
+    if not _SMALLEST_FACTOR < abs(size) < _LARGEST_FACTOR:
+        raise ValueError(f"{unit!r} is beyond the numbers of a computer")
+    return tuple(int(exponent) for exponent in exponents), size, Fraction(offset)
 
 
 @lru_cache(maxsize=1024)

@@ -139,8 +139,8 @@ def structure_record(structure: "parts.AffineStructure", modes: int) -> dict[str
         "loads": [
             {
                 "name": name,
-                "control": (control := structure.loads[name]),
-                "value": 1.0 if control is None else structure.controls[control],
+                "control": structure.loads[name],
+                "value": structure.control_value_alone(name),
                 "largest_displacement": found.largest,
                 "strain": dict(zip(structure.gauges, map(float, found.strain), strict=True)),
                 "output": dict(zip(structure.displacements, map(float, found.output), strict=True)),

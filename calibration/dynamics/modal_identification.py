@@ -10,7 +10,7 @@ covariance is that of the least squares, with white noise of its own on each cha
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from scipy.special import chdtri
 
 from calibration.errors import ExperimentDataError, said
 from reporting.arrays import Float
+from reporting.choices import one_of
 
 from .damped_cosine import ComplexArray, DampedCosines, Solution, modal_slopes
 
@@ -97,10 +98,13 @@ def identify_modes(
 
     Raises
     ------
+    InvalidChoiceError
+        If the kind is neither of the two.
     ExperimentDataError
         If the record holds values that are not finite or is too short, a band is none, or above half the
         sampling rate, or overlaps another.
     """
+    one_of(kind, get_args(RecordKind), "kind")
     record, limits = _checked(acceleration, sampling_rate, bands)
     fewest = LARGEST_ORDER // record.shape[1] + 2
     lags = int(np.clip(np.ceil(2.0 * sampling_rate / limits.min()), fewest, _MOST_LAGS))

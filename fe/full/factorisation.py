@@ -160,6 +160,10 @@ class Factorisation:
 
     def __init__(self, stiffness: sparse.sparray) -> None:
         self.stiffness = matrix = stiffness.tocsr()
+        if matrix.shape[0] == 0:
+            raise SolutionError(
+                "The structure has no free unknown: all its nodes are held. Hold fewer of them."
+            )
         if not np.all(matrix.diagonal() > 0.0):
             self._refuse(matrix, "it has a diagonal entry that is not positive")
         places = (part.astype(np.int32).tobytes() for part in (matrix.indptr, matrix.indices))

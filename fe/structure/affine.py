@@ -134,6 +134,16 @@ class AffineStructure:
         """Mass (n, n) [kg]; `masses` [kg] are those free ones that differ from their nominal values."""
         return affine_sum([*_updated(self.masses, masses, "free mass").values()], self.mass_terms)
 
+    def control_value_alone(self, load: str) -> float:
+        """Return the value of its control at which a load is looked at alone.
+
+        That is the nominal value, or one unit where the nominal value is zero, at which there is no load; one
+        for a constant load.
+        """
+        control = self.loads[load]
+        nominal = 1.0 if control is None else self.controls[control]
+        return 1.0 if nominal == 0.0 else nominal
+
     def load(self, name: str, value: float | None = None, masses: Values | None = None) -> FloatArray:
         """Load (n,) [N].
 
@@ -265,7 +275,7 @@ class StaticResponse:
 
 
 def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
-    """Solve for each load alone, its control at the nominal value, the structure undamaged.
+    """Solve for each load alone, the structure undamaged, its control as of `control_value_alone`.
 
     Raises
     ------
@@ -275,7 +285,9 @@ def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
     if not structure.loads:
         return {}
     factors = Factorisation(structure.stiffness())
-    fields = factors.solve(np.column_stack([structure.load(name) for name in structure.loads]))
+    values = {name: structure.control_value_alone(name) for name in structure.loads}
+    loads = np.column_stack([structure.load(name, value) for name, value in values.items()])
+    fields = factors.solve(loads)
     return {name: _response(structure, field) for name, field in zip(structure.loads, fields.T, strict=True)}
 
 

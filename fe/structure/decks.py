@@ -23,6 +23,11 @@ _ABAQUS_COMMENT = re.compile(r"^\s*\*\*.*")
 _ABAQUS_INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
 _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
+_OTHER_STIFFNESS = {
+    "C3D8I": "enhanced by incompatible modes",
+    "C3D8R": "integrated at one point",
+}
+"""Variants of C3D8 that are other elements; meshio writes every hexahedron as C3D8RH, which stays one."""
 _TYPES = {kind.calculix: (kind.file_type, kind.node_count) for kind in KINDS.values()}
 _TYPES |= {name: (kind, FLAT[kind][0]) for name, kind in words_of("abaqus").flat.items()}
 
@@ -124,6 +129,12 @@ def _add_elements(deck: Deck, block: _Block) -> None:
     name = block.name("TYPE").upper()
     variant = _VARIANT.fullmatch(name)
     plain = variant[1] if variant else name
+    if plain == "C3D8" and name in _OTHER_STIFFNESS:
+        fail(
+            block.where,
+            f"elements of type {name} cannot be read: they are {_OTHER_STIFFNESS[name]} and softer in bending"
+            " than C3D8. Mesh with second-order elements (C3D20 or C3D10), or write C3D8 if that is meant.",
+        )
     if plain not in _TYPES:
         readable = ", ".join(kind.calculix for kind in KINDS.values())
         fail(block.where, f"elements of type {shown(name)} cannot be read; {readable} and variants can.")

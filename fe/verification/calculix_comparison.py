@@ -226,8 +226,8 @@ def structure_deck(structure: Structure) -> CalculixDeck:
 
 
 def _load_step(structure: Structure, load: Load) -> Step:
-    """Return the static step of a load of a structure, its control at the nominal value."""
-    factor = 1.0 if load.control is None else structure.controls[load.control]
+    """Return the static step of a load of a structure, its control as of `control_value_alone`."""
+    factor = structure.control_value_alone(load.name)
     lines = ["*DLOAD, OP=NEW"]
     if load.acceleration is not None:
         size = float(np.linalg.norm(load.acceleration))
@@ -239,7 +239,7 @@ def _load_step(structure: Structure, load: Load) -> Step:
             lines.append(f"{cell + 1},P{face + 1},{number_line([factor * load.pressure])}")
     else:
         lines.append("EALL,GRAV,0.,0.,0.,1.")
-    return Step(structure.load(load.name), lines, load.force is not None)
+    return Step(structure.load(load.name, factor), lines, load.force is not None)
 
 
 def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:

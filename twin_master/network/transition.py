@@ -252,6 +252,16 @@ class TransitionModel:
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
         return _kronecker(block[control, level] for block, level in zip(self.blocks, levels, strict=True))
 
+    def rows(self, control: Index, state: Index) -> Float:
+        """Return p(D_t | D_{t-1} = state, control) of N pairs (N,) of control and state: (N, S)."""
+        levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
+        result = np.ones((len(state), 1))
+        for block, level in zip(self.blocks, levels, strict=True):
+            following = block[control, level]
+            states = result.shape[1] * following.shape[1]
+            result = (result[:, :, None] * following[:, None, :]).reshape(len(state), states)
+        return result
+
     def forward(self, control: int, belief: Float) -> Float:
         """Return beliefs (..., S) one step later, in the linear domain."""
         if not self.is_product:

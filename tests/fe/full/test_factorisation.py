@@ -120,3 +120,8 @@ def test_a_basis_bounds_what_it_drops():
         left = np.linalg.norm(block - basis.vectors @ coordinates, axis=0)
     np.testing.assert_allclose(basis.vectors.T @ basis.vectors, np.eye(6), atol=1e-13)
     assert 0.0 < left.max() <= np.sqrt(basis.dropped_square) < 1e-6
+
+
+def test_a_structure_without_free_unknowns_is_refused_in_one_sentence():
+    with pytest.raises(SolutionError, match="all its nodes are held"):
+        Factorisation(sparse.csr_array((0, 0)))

@@ -1,5 +1,7 @@
 """Likelihoods of sensors against integrals; rewards and plans against sums, solvers and enumeration."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -198,11 +200,11 @@ def random_problem(seed, states=7, controls=3):
 
 
 @settings(max_examples=50, deadline=None)
-@given(seed=SEEDS, discount=st.sampled_from([0.0, 0.6, 0.9, 0.99]), product=st.booleans())
-def test_the_value_is_optimal_and_that_of_its_policy(seed, discount, product):
+@given(seed=SEEDS, discount=st.sampled_from([0.0, 0.6, 0.9, 0.99]), of_blocks=st.booleans())
+def test_the_value_is_optimal_and_that_of_its_policy(seed, discount, of_blocks):
     transition, reward = random_problem(seed, 6)
     model = TransitionModel((transition,))
-    if product:
+    if of_blocks:
         model = TransitionModel(tuple(random_problem(seed, states)[0] for states in (2, 3)))
         transition = model.matrix
     plan = value_iteration(model, reward, discount)
@@ -219,6 +221,77 @@ def test_the_value_is_optimal_and_that_of_its_policy(seed, discount, product):
     np.testing.assert_array_equal(plan.policy.argmax(axis=1), plan.control_index)
 
 
+def value_by_enumeration(transition, reward, discount):
+    """The value (S,) of the best of all policies, each by a linear solve."""
+    states, controls = reward.shape
+    values = []
+    for policy in product(range(controls), repeat=states):
+        chosen = np.arange(states), np.array(policy)
+        closed_loop = discount * transition[chosen[1], chosen[0]]
+        values.append(np.linalg.solve(np.eye(states) - closed_loop, reward[chosen]))
+    return np.max(values, axis=0)
+
+
+NEAR_ONE = st.sampled_from([0.6, 0.99, 1.0 - 1e-5, 1.0 - 1e-7, 1.0 - 1e-9])
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=SEEDS, discount=NEAR_ONE, absorbing=st.booleans())
+def test_the_plan_is_as_good_as_the_best_of_all_policies(seed, discount, absorbing):
+    """Also where the discount is nearly one, and where the first state cannot be left."""
+    transition, reward = random_problem(seed, 4)
+    if absorbing:
+        transition[:, 0] = [1.0, 0.0, 0.0, 0.0]
+    plan = value_iteration(transition, reward, discount)
+    best = value_by_enumeration(transition, reward, discount)
+    rounding = 1e-14 / (1.0 - discount) * np.abs(best).max()
+    np.testing.assert_allclose(plan.value, best, rtol=0, atol=rounding)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=SEEDS, discount=NEAR_ONE, tie=st.sampled_from([0.0, 1e-15, 1e-9, 1e-6]))
+def test_the_told_value_is_that_of_the_returned_policy(seed, discount, tie):
+    """Also where controls that are nearly equal stand in the place of one another."""
+    transition, reward = random_problem(seed, 4)
+    transition = np.concatenate([transition, transition])
+    reward = np.concatenate([reward, reward + tie], axis=1)
+    plan = value_iteration(transition, reward, discount)
+    chosen = np.arange(4), plan.control_index
+    closed_loop = discount * transition[chosen[1], chosen[0]]
+    exact = np.linalg.solve(np.eye(4) - closed_loop, reward[chosen])
+    rounding = 1e-14 / (1.0 - discount) * np.abs(exact).max()
+    np.testing.assert_allclose(plan.value, exact, rtol=0, atol=rounding)
+
+
+def test_work_is_planned_where_rest_is_worth_nothing_and_the_discount_is_nearly_one():
+    """Work brings 1 and 0.5 until the part is lost, each state lasting 20 steps: 30 and 10 in all."""
+    rest, work = np.eye(3), np.array([[0.95, 0.05, 0.0], [0.0, 0.95, 0.05], [0.0, 0.0, 1.0]])
+    reward = np.array([[0.0, 1.0], [0.0, 0.5], [0.0, -2.0]])
+    plan = value_iteration(np.stack([rest, work]), reward, 0.999999)
+    np.testing.assert_array_equal(plan.control_index, [1, 1, 0])
+    np.testing.assert_allclose(plan.value, [30.0, 10.0, 0.0], atol=1e-3)
+
+
+def test_a_small_gain_counts_beside_the_large_value_of_a_state_that_is_not_reached():
+    transition = np.stack([np.eye(2), np.eye(2)])
+    reward = np.array([[0.0, 1e-6], [1.0, 1.0]])
+    plan = value_iteration(transition, reward, 1.0 - 1e-9)
+    np.testing.assert_allclose(plan.value, [1e3, 1e9], rtol=1e-6)
+
+
+def test_the_value_of_many_states_is_iterated_and_that_of_the_returned_policy():
+    """A product of two parts of 40 levels: too many states for a dense system."""
+    rest = np.eye(40)
+    work = 0.9 * np.eye(40) + 0.1 * np.eye(40)[np.minimum(np.arange(40) + 1, 39)]
+    model = TransitionModel.from_factors([(rest, rest), (work, work)])
+    level = np.add.outer(np.arange(40.0), np.arange(40.0)).ravel()
+    reward = np.column_stack([np.zeros(1600), 1.0 - level / 30.0])
+    plan = value_iteration(model, reward, 0.99)
+    closed_loop = np.array([model.row(control, state) for state, control in enumerate(plan.control_index)])
+    exact = np.linalg.solve(np.eye(1600) - 0.99 * closed_loop, reward[np.arange(1600), plan.control_index])
+    np.testing.assert_allclose(plan.value, exact, rtol=0, atol=1e-11)
+
+
 def test_ties_go_to_the_first_control():
     transition, reward = random_problem(0)
     doubled = TransitionModel((np.concatenate([transition, transition]),))
@@ -229,6 +302,7 @@ def test_ties_go_to_the_first_control():
 
 TABLE, REWARD = random_problem(0)
 MOVES = TransitionModel((TABLE,))
+MANY = TransitionModel((random_problem(1, 50)[0], random_problem(2, 40)[0]))
 VALUES, WEIGHT, JOINT = random_values(0)
 HOLED = np.where(np.arange(VALUES.size).reshape(VALUES.shape) == 12, np.nan, VALUES)  # at (0, 1, 0, 2)
 QUANTITY = QuantityModel(VALUES, WEIGHT)
@@ -257,7 +331,8 @@ REFUSED = [
     (lambda: value_iteration(MOVES, REWARD.T, 0.6), "rewards of shape"),
     *((lambda bad=bad: value_iteration(MOVES, REWARD, bad), r"discount factor in \[0, 1\)")
       for bad in (1.0, -0.1, np.nan)),
-    (lambda: value_iteration(MOVES, REWARD, 0.9, max_iterations=3), "after 3 sweeps"),
+    (lambda: value_iteration(MOVES, REWARD, 1.0 - 1e-15), "so close to 1 that rounding decides"),
+    (lambda: value_iteration(MANY, np.ones((2000, 3)), 0.9, max_iterations=3), "after 3 sweeps"),
     (lambda: value_iteration(TABLE * 0.95, REWARD, 0.6), "does not sum to one"),
     (lambda: value_iteration(MOVES, np.full((7, 3), np.nan), 0.6), r"\(0, 0\) is nan"),
 ]  # fmt: skip

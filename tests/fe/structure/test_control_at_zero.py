@@ -1,0 +1,93 @@
+"""A bar of one hexahedron: loads whose control is nominally zero, and elements that are not built."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.runtime.errors import MeshError, SolutionError
+from fe.structure.affine import static_responses
+from fe.structure.operators import load_and_assemble
+from fe.verification.calculix_comparison import agreement, structure_deck
+from tests.calculix_decks import needs_calculix
+
+DECK = """*NODE
+1, 0., 0., 0.
+2, 1., 0., 0.
+3, 1., 1., 0.
+4, 0., 1., 0.
+5, 0., 0., 2.
+6, 1., 0., 2.
+7, 1., 1., 2.
+8, 0., 1., 2.
+*ELEMENT, TYPE=KIND, ELSET=ALL
+1, 1, 2, 3, 4, 5, 6, 7, 8
+*NSET, NSET=FOOT
+1, 2, 3, 4
+*NSET, NSET=EVERY
+1, 2, 3, 4, 5, 6, 7, 8
+*NSET, NSET=TOP
+5, 6, 7, 8
+"""
+STRUCTURE = """name = "bar"
+mesh = "bar.inp"
+length_unit = "m"
+[[control]]
+name = "n"
+nominal = NOMINAL
+minimum = -2.0
+maximum = 2.0
+[[material]]
+name = "steel"
+set = "ALL"
+density = 7800
+young_modulus = 2e11
+poisson_ratio = 0.0
+[[support]]
+set = "HELD"
+hold = ["x", "y", "z"]
+[[load]]
+name = "push"
+control = "n"
+set = "TOP"
+force = [0, 0, 100]
+[[displacement]]
+name = "top"
+point = [1, 1, 2]
+direction = [0, 0, 1]
+"""
+
+
+def bar(folder: Path, nominal: float = 0.0, held: str = "FOOT", kind: str = "C3D8") -> Path:
+    (folder / "bar.inp").write_text(DECK.replace("KIND", kind))
+    file = folder / "bar.toml"
+    file.write_text(STRUCTURE.replace("NOMINAL", str(nominal)).replace("HELD", held))
+    return file
+
+
+@pytest.mark.parametrize(("nominal", "factor"), [(0.0, 1.0), (2.0, 2.0), (-1.0, -1.0)])
+def test_a_load_whose_control_is_nominally_zero_is_answered_for_one_unit(tmp_path, nominal, factor):
+    """The bar is 2 m long, and its section 1 m^2: F L / (E A)."""
+    response = static_responses(load_and_assemble(bar(tmp_path, nominal)))["push"]
+    np.testing.assert_allclose(response.output, factor * 100.0 * 2.0 / 2e11, rtol=1e-9)
+
+
+@needs_calculix
+def test_calculix_agrees_about_a_load_whose_control_is_nominally_zero(tmp_path):
+    structure = load_and_assemble(bar(tmp_path), mass_as_stiffness=True)
+    differences = agreement(structure_deck(structure), tmp_path, 2).loads["push"]
+    assert differences
+    assert max(differences.values()) < 1e-5
+
+
+def test_a_structure_with_all_nodes_held_is_refused_in_one_sentence(tmp_path):
+    with pytest.raises(SolutionError, match="all its nodes are held"):
+        static_responses(load_and_assemble(bar(tmp_path, held="EVERY")))
+
+
+@pytest.mark.parametrize("kind", ["C3D8I", "C3D8R"])
+def test_hexahedra_that_are_not_those_of_this_project_are_refused(tmp_path, kind):
+    with pytest.raises(
+        MeshError, match=f"line 10: elements of type {kind} cannot be read: .* softer in bending"
+    ):
+        load_and_assemble(bar(tmp_path, kind=kind))
