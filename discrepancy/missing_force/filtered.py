@@ -67,7 +67,7 @@ class Filtered:
     processes: Sequence[tuple[int, Process]]
 
     @cached_property
-    def _scale(self) -> FloatArray:
+    def units(self) -> FloatArray:
         """Units (n,) of the state: those of a force of `size` at the frequencies of the system."""
         system = self.trial.system
         n = len(system.generator)
@@ -80,7 +80,7 @@ class Filtered:
         return units
 
     @cached_property
-    def _places(self) -> list[int]:
+    def places(self) -> list[int]:
         """Where each force stands in the whole state."""
         counts = [len(one.generator) for _, one in self.processes]
         begin = len(self.trial.system.generator)
@@ -98,14 +98,14 @@ class Filtered:
     def system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
         trial = self.trial
-        n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
+        n, units, noises = len(trial.system.generator), self.units, len(trial.coloured)
         begin = n + sum(len(one.generator) for _, one in self.processes)
         whole = begin + noises
         generator, intensity, start = np.zeros((3, whole, whole))
         generator[:n, :n] = trial.system.generator * units / units[:, None]
         rows = np.zeros((len(trial.deviation), whole))
         rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
-        for (port, one), at in zip(self.processes, self._places, strict=True):
+        for (port, one), at in zip(self.processes, self.places, strict=True):
             force = slice(at, at + len(one.generator))
             generator[:n, at] = -trial.system.actions[port] * one.size / units
             generator[force, force] = one.generator
@@ -170,14 +170,14 @@ class Filtered:
             state, noise = moves @ state, fine @ noise @ fine.mT + more
         states = np.concatenate((np.stack(found, axis=1).reshape(-1, len(mean)), means[-1:, :, 0]))
         sizes_of = np.array([one.size for _, one in self.processes])
-        n, count = len(self._scale), len(self.processes)
+        n, count = len(self.units), len(self.processes)
         shown = np.zeros((2 * count, len(mean)))
         for number, (port, one) in enumerate(self.processes):
-            shown[number, self._places[number]] = one.size
-            shown[count + number, :n] = self.trial.system.speeds[port] * self._scale
+            shown[number, self.places[number]] = one.size
+            shown[count + number, :n] = self.trial.system.speeds[port] * self.units
         squares = np.sum((shown @ (covers - covers @ knows @ covers)) * shown, axis=-1)
-        forces = states[:, self._places].T * sizes_of[:, None]
-        return states[:, :n] * self._scale, forces, np.sqrt(np.maximum(squares, 0.0)).T
+        forces = states[:, self.places].T * sizes_of[:, None]
+        return states[:, :n] * self.units, forces, np.sqrt(np.maximum(squares, 0.0)).T
 
 
 ROUNDING = 1e-12

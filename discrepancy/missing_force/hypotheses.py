@@ -182,16 +182,17 @@ class Columns:
         """Return what a patch does, None where it cannot be."""
         try:
             parts = [
-                self._part(trial, motion, number, patch.in_trial(trial.name), acts_on)
+                self.part(trial, motion, number, patch.in_trial(trial.name), acts_on)
                 for trial, motion, number in zip(view.trials, motions, self.numbers, strict=True)
             ]
         except (DiscrepancyError, InvalidPatchError):
             return None
         return parts if all(np.all(np.isfinite(part.readings)) for part in parts) else None
 
-    def _part(
+    def part(
         self, trial: SeenTrial, motion: Motion, number: int, patch: ModelPatch, acts_on: frozenset[TrialKind]
     ) -> Part:
+        """Return what a patch does in a trial along a motion."""
         kind = self.problem.trials[number].trial.kind
         if kind not in acts_on or not len(patch):
             return Part(np.zeros_like(trial.residual))

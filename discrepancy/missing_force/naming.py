@@ -18,6 +18,8 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Key, Point, Term
 from discrepancy.fits.fitting import LARGEST_EFFECT
 from discrepancy.fits.problem import Problem
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.patch import ModelPatch
 
 from .filtered import Process, Solution
 from .hypotheses import Columns, log_prior, scaled, variants
@@ -148,6 +150,7 @@ class ForceSearch:
     def __init__(self, problem: Problem) -> None:
         linear, self.laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
+        self.model = problem.model
         self.problem = problem.with_trials(trials, linear)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear.ports)
@@ -193,6 +196,16 @@ class ForceSearch:
             pace = scale.angular_frequency or 1.0 / self.problem.setting.scales.duration
             found[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
         return found
+
+    def own_laws(self, shared: FloatArray) -> ModelPatch:
+        """Return the laws that the model has itself, at values (K,) of the shared unknowns."""
+        model = self.model
+        return model.own_laws(self.problem.shared.parameters(shared)) + model.patch.of(PortForce)
+
+    def whole_size(self, port: int) -> float:
+        """Return the deviation of the missing force at a port beside no effect [N or N m]."""
+        beside = self.whole.processes.get(port)
+        return self.about((port,))[port].size if beside is None else beside.size
 
     def _view(self) -> View:
         """Return the trials as they are seen about the point, where columns are from then on, too."""

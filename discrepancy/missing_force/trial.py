@@ -177,7 +177,7 @@ class SeenTrial:
             start = -np.linalg.lstsq(self.system.generator, pushes[0], rcond=1e-12)[0]
         rows = np.flatnonzero(np.any(pushes, axis=0))
         state = self._moved(start, np.eye(len(start))[:, rows], pushes[:, rows])
-        return Part(self.readings(state) + self.over_noise(self._shown(slope, added, forces)), state)
+        return Part(self.readings(state) + self.over_noise(self.shown(slope, added, forces)), state)
 
     def _moved(
         self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
@@ -190,11 +190,10 @@ class SeenTrial:
 
     def readings(self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES) -> FloatArray:
         """Return what readings (N, C) show of an added state (F, n), and at once of forces (F,) at ports."""
-        return self.over_noise(self._shown(self.system, states, forces))
+        return self.over_noise(self.shown(self.system, states, forces))
 
-    def _shown(
-        self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
-    ) -> FloatArray:
+    def shown(self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]) -> FloatArray:
+        """Return what readings (N, C) show of an added state (F, n) and of forces (F,) at ports."""
         shown = states[:: self.parts] @ system.outputs.T
         for port, force in forces.items():
             shown -= np.outer(force[:: self.parts], system.through[port])
@@ -208,7 +207,7 @@ class SeenTrial:
         which = np.ascontiguousarray(self.steps[1][begin:end])
         pushes = np.array([*acting.values()]).T
         states = self._moved(np.zeros(len(directions)), directions, pushes, which)
-        shown = self._shown(self.system, states, acting)
+        shown = self.shown(self.system, states, acting)
         return np.asarray(shown / self.deviation * self.used[begin:end])
 
     def over_noise(self, columns: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from scipy.special import logsumexp
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
+from discrepancy.estimation.refinement import refined
 from discrepancy.fits.candidate import Candidate, Key
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
@@ -248,7 +249,8 @@ class Search:
 
     def by_force(self, force: ForceSearch) -> None:
         """Compare the sets of effects that follow the missing force best, in place of what was fitted."""
-        self.exact, self.rough, self.forces = {(): self.none}, {}, force.name(self.effects)
+        self.exact, self.rough = {(): self.none}, {}
+        self.forces = refined(force, force.name(self.effects), len(self.effects), self.tell)
         able = [
             one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
             if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)

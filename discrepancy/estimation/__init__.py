@@ -1,0 +1,1 @@
+"""Trajectory, missing force and parameters of a hypothesis, estimated together."""

@@ -1,0 +1,424 @@
+"""A trial, linear along a trajectory: the laws of a hypothesis in it, missing forces beside them.
+
+The state of a trial is what forces at ports add to the answer of the linear model. With the laws G of the
+hypothesis, the missing forces f (Gaussian processes in time) and the unknowns w,
+
+    s' = A(w) s - sum_p b_p (G_p(x, v; w) + f_p),
+    reading = r(w) + C(w) s - sum_p e_p (G_p(x, v; w) + f_p) + noise,
+
+where x and v are the position and the speed of a port. All of it is linearised along a trajectory.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import expm
+
+from discrepancy.campaign.records import FloatArray, IntArray
+from discrepancy.missing_force.filtered import Filtered, Process
+from discrepancy.missing_force.kalman import discretised
+from discrepancy.missing_force.trial import SeenTrial
+
+from .kernel import filter_record, smooth_record, step_matrices
+from .laws import ForceAlong
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """The motion of a trial along which it is linearised, at its fine stamps.
+
+    Attributes
+    ----------
+    added : (F, n) ndarray
+        State that forces at ports add to the answer of the linear model.
+    positions, speeds : (F, P) ndarray
+        Of the ports [m or rad, and per s].
+    forces : mapping of int to (F,) ndarray
+        All that acts at a port beside the linear model, by its number [N or N m].
+    """
+
+    added: FloatArray
+    positions: FloatArray
+    speeds: FloatArray
+    forces: Mapping[int, FloatArray]
+
+    def toward(self, other: "Trajectory", share: float) -> "Trajectory":
+        """Return the trajectory a share of the way to another one."""
+        ports = {*self.forces, *other.forces}
+        forces = {
+            port: (1.0 - share) * self.forces.get(port, 0.0) + share * other.forces.get(port, 0.0)
+            for port in ports
+        }
+        return Trajectory(
+            self.added + share * (other.added - self.added),
+            self.positions + share * (other.positions - self.positions),
+            self.speeds + share * (other.speeds - self.speeds),
+            {port: np.asarray(force) for port, force in forces.items()},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """What the laws of a hypothesis do at a port along a trajectory.
+
+    Attributes
+    ----------
+    along : ForceAlong
+        Force and tangents of all laws at the port.
+    by_unknown : mapping of int to (F,) ndarray
+        Derivative of the force by an unknown, by its number.
+    """
+
+    along: ForceAlong
+    by_unknown: Mapping[int, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What an effect of sensors does to the readings of a trial, over the deviations of their noise.
+
+    Attributes
+    ----------
+    known : (N, C) ndarray
+        At the values of the unknowns.
+    by_unknown : mapping of int to (N, C) ndarray
+        Derivative by an unknown, by its number.
+    """
+
+    known: FloatArray
+    by_unknown: Mapping[int, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearisedTrial:
+    """A trial, linear along a trajectory.
+
+    The unknowns are the shared ones, those of the hypothesis' effects, and the trial's own, in this order.
+
+    Attributes
+    ----------
+    trial : SeenTrial
+        Readings less the linear model, and how ports move.
+    processes : mapping of int to Process
+        Missing forces, by the numbers of their ports.
+    trajectory : Trajectory
+        Along which it is linear.
+    forces : mapping of int to Forces
+        Of the hypothesis' laws, by port.
+    sensors : Readings
+        Of the hypothesis' sensors.
+    effect : (E,) ndarray
+        Values of the effects' unknowns at which laws and sensors are linearised.
+    shared : (K,) ndarray
+        Values of the shared unknowns there.
+    """
+
+    trial: SeenTrial
+    processes: Mapping[int, Process]
+    trajectory: Trajectory
+    forces: Mapping[int, Forces]
+    sensors: Readings
+    effect: FloatArray
+    shared: FloatArray
+
+    # ------------------------------------------------------------ layout
+
+    @cached_property
+    def filtered(self) -> Filtered:
+        """The linear system with its missing forces, in units in which all states are of size one."""
+        return Filtered(self.trial, tuple(self.processes.items()))
+
+    @property
+    def moving(self) -> int:
+        """States of the structure; those of missing forces and of coloured noise follow."""
+        return len(self.trial.system.generator)
+
+    @property
+    def width(self) -> int:
+        """Number W of weights: one for what is known, and one for each unknown."""
+        return 1 + len(self.shared) + len(self.effect) + len(self.trial.local)
+
+    def weight_of(self, unknown: int) -> int:
+        """Return the weight of a shared unknown, or of one of the trial's own, numbered after these."""
+        count = len(self.shared)
+        return 1 + unknown + (len(self.effect) if unknown >= count else 0)
+
+    @cached_property
+    def ports(self) -> tuple[int, ...]:
+        """Ports at which a law of the hypothesis acts."""
+        return tuple(self.forces)
+
+    # ------------------------------------------------------------ forces of the laws
+
+    @cached_property
+    def tangents(self) -> FloatArray:
+        """Change (F, L, n) of the laws' force at each of their ports by the state."""
+        generator, _, _, _ = self.filtered.system
+        found = np.zeros((len(self.trial.fine_time), len(self.ports), len(generator)))
+        system, units = self.trial.system, self.filtered.units
+        for at, port in enumerate(self.ports):
+            along = self.forces[port].along
+            found[:, at, : self.moving] = (
+                along.by_position[:, None] * system.positions[port] * units
+                + along.by_speed[:, None] * system.speeds[port] * units
+            )
+        return found
+
+    @cached_property
+    def pushes(self) -> FloatArray:
+        """Force (F, L, W) of the laws at each of their ports at state zero, by weight."""
+        trial, trajectory = self.trial, self.trajectory
+        found = np.zeros((len(trial.fine_time), len(self.ports), self.width))
+        for at, port in enumerate(self.ports):
+            along = self.forces[port].along
+            position = trial.positions[:, port] - trajectory.positions[:, port]
+            speed = trial.speeds[:, port] - trajectory.speeds[:, port]
+            for unknown, moves in trial.by_unknowns.items():
+                position = position - trial.about[unknown] * moves[0][:, port]
+                speed = speed - trial.about[unknown] * moves[1][:, port]
+                found[:, at, self.weight_of(unknown)] += (
+                    along.by_position * moves[0][:, port] + along.by_speed * moves[1][:, port]
+                )
+            found[:, at, 0] = along.force + along.by_position * position + along.by_speed * speed
+            for unknown, slope in self.forces[port].by_unknown.items():
+                found[:, at, 1 + unknown] += slope
+                found[:, at, 0] -= self._value(unknown) * slope
+        return found
+
+    def _value(self, unknown: int) -> float:
+        """Return the value at which a law is linear by a shared unknown or by one of an effect."""
+        return float(np.concatenate((self.shared, self.effect))[unknown])
+
+    @cached_property
+    def directions(self) -> FloatArray:
+        """State (n, L) that a unit force at each of the laws' ports pushes."""
+        generator, _, _, _ = self.filtered.system
+        found = np.zeros((len(generator), len(self.ports)))
+        for at, port in enumerate(self.ports):
+            found[: self.moving, at] = -self.trial.system.actions[port] / self.filtered.units
+        return found
+
+    # ------------------------------------------------------------ steps
+
+    def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return transition, noise and drift of each fine step."""
+        generator, intensity, _, _ = self.filtered.system
+        lengths, kind = self.trial.steps
+        fine = lengths / self.trial.parts
+        free_transition, free_noise = discretised(generator, intensity, fine)
+        begin, end = push_matrices(generator, fine)
+        drift = self._drift_by_parameters(begin, end, kind)
+        transition, noise = step_matrices(
+            self.trial.parts,
+            kind,
+            free_transition,
+            free_noise,
+            np.ascontiguousarray(begin @ self.directions),
+            np.ascontiguousarray(end @ self.directions),
+            self.tangents,
+            self.pushes,
+            drift,
+        )
+        return transition, noise, drift
+
+    def _drift_by_parameters(self, begin: FloatArray, end: FloatArray, kind: IntArray) -> FloatArray:
+        """Return the drift (F - 1, n, W) by what parameters change in the system itself."""
+        trial, moving = self.trial, self.moving
+        steps = len(trial.fine_time) - 1
+        drift = np.zeros((steps, len(begin[0]), self.width))
+        of_step = kind[np.arange(steps) // trial.parts + 1]
+        for unknown, slope in enumerate(trial.slopes):
+            if slope is None:
+                continue
+            push = self.trajectory.added @ slope.generator.T
+            for port, force in self.trajectory.forces.items():
+                push = push - np.outer(force, slope.actions[port])
+            push = push / self.filtered.units
+            added = np.einsum("jab,jb->ja", begin[of_step, :, :moving], push[:-1])
+            added += np.einsum("jab,jb->ja", end[of_step, :, :moving], push[1:])
+            drift[:, :, 1 + unknown] += added
+            drift[:, :, 0] -= trial.about[unknown] * added
+        return drift
+
+    def _start(self) -> tuple[FloatArray, FloatArray]:
+        """Return covariance (n, n) and mean (n, W) of the state before the first reading."""
+        generator, _, _, covariance = self.filtered.system
+        mean = np.zeros((len(generator), self.width))
+        if not self.trial.settled:
+            return covariance, mean
+        # at rest under the laws and under the missing forces, whose first values are not known
+        moving = self.moving
+        directions = self.directions[:moving]
+        stiffness = generator[:moving, :moving] + directions @ self.tangents[0][:, :moving]
+        mean[:moving] = np.linalg.lstsq(stiffness, -directions @ self.pushes[0], rcond=1e-12)[0]
+        covariance = covariance.copy()
+        covariance[:moving, :moving] = 0.0
+        for place in self.filtered.places:
+            rest = np.linalg.lstsq(stiffness, -generator[:moving, place], rcond=1e-12)[0]
+            covariance[:moving, :moving] += np.outer(rest, rest)
+            covariance[:moving, place] = covariance[place, :moving] = rest
+        return covariance, mean
+
+    # ------------------------------------------------------------ readings
+
+    def _readings(self) -> tuple[FloatArray, FloatArray]:
+        """Return rows (N, C, n) and columns (N, C, W) of the readings."""
+        trial, parts = self.trial, self.trial.parts
+        samples, channels = trial.residual.shape
+        _, _, state_rows, _ = self.filtered.system
+        rows = np.repeat(state_rows[None], samples, axis=0)
+        columns = np.zeros((samples, channels, self.width))
+        columns[:, :, 0] = trial.residual - self.sensors.known
+        for unknown, slope in self.sensors.by_unknown.items():
+            columns[:, :, 1 + unknown] -= slope
+            columns[:, :, 0] += self._value(unknown) * slope
+        own = np.concatenate((trial.shared, trial.local))
+        for unknown, column in enumerate(own):
+            columns[:, :, self.weight_of(unknown)] -= column
+        for unknown, column in self._by_parameters().items():
+            columns[:, :, 1 + unknown] -= column
+            columns[:, :, 0] += trial.about[unknown] * column
+        columns *= self.filtered.white[:, None]
+        for at, port in enumerate(self.ports):
+            through = trial.system.through[port] / trial.deviation * self.filtered.white
+            if not np.any(through):
+                continue
+            rows = rows - through[:, None] * self.tangents[::parts, at][:, None, :]
+            columns += self.pushes[::parts, at, None, :] * through[:, None]
+        return np.ascontiguousarray(rows), columns * trial.used[:, :, None]
+
+    def _by_parameters(self) -> dict[int, FloatArray]:
+        """Return what a unit of shared unknowns (by number) does to readings along the trajectory."""
+        trial, trajectory = self.trial, self.trajectory
+        found: dict[int, FloatArray] = {}
+        for unknown, slope in enumerate(trial.slopes):
+            if slope is not None:
+                found[unknown] = trial.over_noise(trial.shown(slope, trajectory.added, trajectory.forces))
+        shown = trial.readings(trajectory.added, trajectory.forces)
+        for unknown, channel, scale in trial.gains:
+            found[unknown] = shown * scale * np.eye(shown.shape[1])[channel]
+        return found
+
+    # ------------------------------------------------------------ filter and smoother
+
+    @cached_property
+    def record(self) -> "FilteredRecord":
+        """What one pass of the filter tells."""
+        transition, noise, drift = self._steps()
+        rows, columns = self._readings()
+        covariance, mean = self._start()
+        means, covariances, innovations, gains, variances = filter_record(
+            self.trial.parts, transition, noise, drift, rows, columns, self.trial.used, covariance, mean
+        )
+        return FilteredRecord(transition, rows, means, covariances, innovations, gains, variances)
+
+    @cached_property
+    def products(self) -> tuple[FloatArray, float]:
+        """Products (W, W) of residual and unknowns, whitened, and what they take from the evidence [nat].
+
+        The second is half the sum of the logarithms of the readings' variances given those before.
+        """
+        record = self.record
+        white = record.innovations / np.sqrt(record.variances)[:, :, None]
+        white = white.reshape(-1, self.width)
+        white[:, 1:] *= -1.0  # what an unknown explains of the residual
+        used = self.trial.used
+        half = 0.5 * float(np.sum(np.log(record.variances)[used]))
+        half -= float(np.sum(np.log(self.filtered.white) * used))
+        return white.T @ white, half
+
+    def smoothed(self, unknowns: FloatArray) -> "SmoothedTrial":
+        """Return the trajectory, and what no law is of the missing forces, given all readings.
+
+        Parameters
+        ----------
+        unknowns : (W - 1,) ndarray
+            Values of all unknowns.
+        """
+        record, trial = self.record, self.trial
+        weights = np.concatenate(([1.0], unknowns))
+        smoothed, variance = smooth_record(
+            trial.parts,
+            record.transition,
+            record.rows,
+            trial.used,
+            record.means @ weights,
+            record.covariances,
+            record.innovations @ weights,
+            record.gains,
+            record.variances,
+        )
+        added = smoothed[:, : self.moving] * self.filtered.units
+        missing: dict[int, FloatArray] = {}
+        deviations: dict[int, FloatArray] = {}
+        for (port, process), place in zip(self.processes.items(), self.filtered.places, strict=True):
+            missing[port] = smoothed[:, place] * process.size
+            deviations[port] = np.sqrt(variance[:, place]) * process.size
+        forces = dict(missing)
+        laws: dict[int, FloatArray] = {}
+        for at, port in enumerate(self.ports):
+            law = self.pushes[:, at] @ weights + np.einsum("fn,fn->f", self.tangents[:, at], smoothed)
+            laws[port] = law
+            forces[port] = forces.get(port, 0.0) + law
+        shared = unknowns[: len(self.shared)]
+        local = unknowns[len(self.shared) + len(self.effect) :]
+        positions, speeds = trial.port_motion(np.concatenate((shared, local)), added)
+        trajectory = Trajectory(added, positions, speeds, forces)
+        state_deviation = np.sqrt(variance[:, : self.moving]) * self.filtered.units
+        return SmoothedTrial(trajectory, missing, laws, deviations, state_deviation)
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredRecord:
+    """What one pass of the filter tells of a trial; shapes as of `kernel.filter_record`."""
+
+    transition: FloatArray
+    rows: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+    innovations: FloatArray
+    gains: FloatArray
+    variances: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedTrial:
+    """A trial given all of its readings.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+        The smoothed motion, and all forces at ports.
+    missing : mapping of int to (F,) ndarray
+        What no law is of the force at a port, by its number [N or N m].
+    laws : mapping of int to (F,) ndarray
+        Force of the laws at a port, linear about the trajectory before.
+    deviations : mapping of int to (F,) ndarray
+        Standard deviation of `missing`.
+    state_deviation : (F, n) ndarray
+        Standard deviation of the added state.
+    """
+
+    trajectory: Trajectory
+    missing: Mapping[int, FloatArray]
+    laws: Mapping[int, FloatArray]
+    deviations: Mapping[int, FloatArray]
+    state_deviation: FloatArray
+
+
+def push_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the state (K, n, n) that a unit push adds over steps of some lengths (K,) [s].
+
+    The push is linear over the step: the first matrix is for its value at the begin, the second for that at
+    the end (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
+    """
+    n = len(generator)
+    blocks = np.zeros((len(lengths), 3 * n, 3 * n))
+    blocks[:, :n, :n] = generator * lengths[:, None, None]
+    blocks[:, :n, n : 2 * n] = np.eye(n) * lengths[:, None, None]
+    blocks[:, n : 2 * n, 2 * n :] = np.eye(n)
+    exponential = expm(blocks)[:, :n]
+    constant, rising = exponential[:, :, n : 2 * n], exponential[:, :, 2 * n :]
+    return constant - rising, rising

@@ -1,0 +1,44 @@
+"""Hypotheses estimated with their laws inside the smoother, on simulated rigs."""
+
+import numpy as np
+import pytest
+
+from discrepancy.estimation.effects import EffectLaws
+from discrepancy.estimation.estimator import Estimator, Start
+from discrepancy.estimation.linearised import Trajectory
+from discrepancy.estimation.refinement import adjustable_laws, refined
+from discrepancy.fits.candidate import Candidate
+from discrepancy.missing_force.naming import ForceSearch
+from tests.discrepancy.missing_force.test_force import CART, CART_IN_AIR, available, blind
+
+
+@pytest.fixture(scope="module")
+def friction(tmp_path_factory):
+    """Return the search for the force of a cart that dry friction brings to rest, and its effects."""
+    problem = blind(tmp_path_factory.mktemp("friction"), CART)
+    return ForceSearch(problem), available(problem)
+
+
+def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):
+    search = ForceSearch(blind(tmp_path, CART_IN_AIR))
+    seen = search.whole
+    trials = tuple(seen.view.trials)
+    nothing = EffectLaws(search.columns, trials, Candidate(), search.own_laws, adjustable_laws(search))
+    trajectories = tuple(
+        Trajectory(motion.added, motion.positions, motion.speeds, motion.forces) for motion in seen.motions
+    )
+    estimator = Estimator(trials, search.problem.shared.precision, search.about(seen.processes))
+    start = Start(np.zeros(0), seen.shared, trajectories, ({},) * len(trials), seen.processes)
+    found = estimator.estimate(nothing, start)
+    assert found.log_evidence == pytest.approx(seen.log_evidence, abs=0.05)
+    for one, motion in zip(found.trials, seen.motions, strict=True):
+        scale = np.abs(motion.forces[0]).max()
+        np.testing.assert_allclose(one.missing[0], motion.forces[0], atol=0.02 * scale)
+
+
+def test_friction_that_ends_a_motion_leads_over_a_free_exponent(friction):
+    search, effects = friction
+    followed = search.name(effects)
+    assert followed[0].candidate.identifiers != ("coulomb_friction",)  # along a motion taken as known
+    ranked = refined(search, followed, len(effects))
+    assert ranked[0].candidate.identifiers == ("coulomb_friction",)

@@ -1,0 +1,100 @@
+"""The filter and the smoother of the estimator beside the joint Gaussian of all states and readings."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, expm
+
+from discrepancy.estimation.kernel import filter_record, smooth_record, step_matrices
+from discrepancy.estimation.linearised import push_matrices
+
+PARTS, SAMPLES, STATES, CHANNELS, WIDTH = 2, 6, 3, 2, 3
+STAMPS = PARTS * (SAMPLES - 1) + 1
+
+
+@pytest.fixture
+def record():
+    """Return a random record: transition, noise, drift, rows, columns, used, covariance and mean."""
+    random = np.random.default_rng(5)
+    transition = 0.5 * random.standard_normal((STAMPS - 1, STATES, STATES))
+    roots = random.standard_normal((STAMPS - 1, STATES, STATES))
+    drift = random.standard_normal((STAMPS - 1, STATES, WIDTH))
+    rows = random.standard_normal((SAMPLES, CHANNELS, STATES))
+    columns = random.standard_normal((SAMPLES, CHANNELS, WIDTH))
+    used = np.ones((SAMPLES, CHANNELS), dtype=bool)
+    used[2, 1] = used[4, 0] = False
+    root = random.standard_normal((STATES, STATES))
+    mean = random.standard_normal((STATES, WIDTH))
+    return transition, roots @ roots.mT, drift, rows, columns, used, root @ root.T, mean
+
+
+def joint(record):
+    """Return mean (F n, W) and covariance of all states, matrix (R, F n) and columns of the readings."""
+    transition, noise, drift, rows, columns, used, covariance, mean = record
+    size = STAMPS * STATES
+    carried = np.eye(size)
+    forcing = np.zeros((size, WIDTH))
+    forcing[:STATES] = mean
+    for j in range(STAMPS - 1):
+        here, there = slice(j * STATES, (j + 1) * STATES), slice((j + 1) * STATES, (j + 2) * STATES)
+        carried[there] += transition[j] @ carried[here]
+        forcing[there] = drift[j] + transition[j] @ forcing[here]
+    whole = carried @ block_diag(covariance, *noise) @ carried.T
+    matrix, left = [], []
+    for k, c in np.argwhere(used):
+        row = np.zeros(size)
+        row[k * PARTS * STATES : (k * PARTS + 1) * STATES] = rows[k, c]
+        matrix.append(row)
+        left.append(columns[k, c])
+    return forcing, whole, np.array(matrix), np.array(left)
+
+
+def test_innovations_give_the_density_of_all_readings(record):
+    *steps, rows, columns, used, covariance, mean = record
+    _, _, innovations, _, variances = filter_record(PARTS, *steps, rows, columns, used, covariance, mean)
+    forcing, whole, matrix, left = joint(record)
+    readings = matrix @ whole @ matrix.T + np.eye(len(matrix))
+    residual = left - matrix @ forcing
+    expected = residual.T @ np.linalg.solve(readings, residual)
+    white = (innovations / np.sqrt(variances)[:, :, None])[used]
+    np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9)
+    assert np.sum(np.log(variances[used])) == pytest.approx(np.linalg.slogdet(readings)[1], rel=1e-9)
+
+
+def test_the_smoother_gives_mean_and_variance_of_all_states(record):
+    *steps, rows, columns, used, covariance, mean = record
+    weights = np.array([1.0, -0.4, 0.7])
+    means, covariances, innovations, gains, variances = filter_record(
+        PARTS, *steps, rows, columns, used, covariance, mean
+    )
+    smoothed, variance = smooth_record(
+        PARTS, steps[0], rows, used, means @ weights, covariances, innovations @ weights, gains, variances
+    )
+    forcing, whole, matrix, left = joint(record)
+    gain = whole @ matrix.T @ np.linalg.inv(matrix @ whole @ matrix.T + np.eye(len(matrix)))
+    expected = forcing @ weights + gain @ (left - matrix @ forcing) @ weights
+    np.testing.assert_allclose(smoothed.ravel(), expected, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(variance.ravel(), np.diag(whole - gain @ matrix @ whole), rtol=1e-7, atol=1e-9)
+
+
+def test_a_linear_law_in_the_steps_is_of_second_order_in_their_length():
+    """A spring and a damper at a port, as a law: the exact answer has them in the generator."""
+    generator = np.array([[0.0, 1.0], [-4.0, -0.1]])
+    direction, tangent = np.array([[0.0], [-1.0]]), np.array([[1.5, 0.3]])
+    exact = expm(generator + direction @ tangent)
+    errors = []
+    for count in (8, 16):
+        length = np.array([1.0 / count])
+        begin, end = push_matrices(generator, length)
+        transition, _ = step_matrices(
+            count,
+            np.zeros(2, dtype=np.int64),
+            expm(generator * length)[None],
+            np.zeros((1, 2, 2)),
+            begin @ direction,
+            end @ direction,
+            np.repeat(tangent[None], count + 1, axis=0),
+            np.zeros((count + 1, 1, 1)),
+            np.zeros((count, 2, 1)),
+        )
+        errors.append(np.abs(np.linalg.multi_dot(transition[::-1]) - exact).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)

@@ -1,0 +1,48 @@
+"""The tangents of laws along a motion."""
+
+import numpy as np
+import pytest
+
+from discrepancy.estimation.laws import force_along
+from fe.runtime.patch import PowerDamping, PowerStiffness
+
+TIME = np.linspace(0.0, 2.0, 401)
+POSITIONS, SPEEDS = np.cos(7.0 * TIME), -7.0 * np.sin(7.0 * TIME)
+CUBIC = PowerStiffness(port="p", coefficient=3.0, exponent=3.0, side=0, reference_displacement=0.8)
+
+
+def damping(velocity_exponent, displacement_exponent=0.0):
+    return PowerDamping(
+        port="p",
+        coefficient=2.0,
+        velocity_exponent=velocity_exponent,
+        displacement_exponent=displacement_exponent,
+        reference_velocity=5.0,
+        reference_displacement=0.6,
+    )
+
+
+@pytest.mark.parametrize("law", [CUBIC, damping(2.0), damping(1.0, 1.0)], ids=["cubic", "drag", "by both"])
+def test_tangents_are_the_derivatives_of_the_force(law):
+    step = 1e-6
+    along = force_along(law, TIME, POSITIONS, SPEEDS, 1e-4)
+    changes = []
+    for by_position, by_speed in ((1.0, 0.0), (0.0, 1.0)):
+        ends = [
+            force_along(
+                law, TIME, POSITIONS + side * step * by_position, SPEEDS + side * step * by_speed, 1e-4
+            )
+            for side in (1.0, -1.0)
+        ]
+        changes.append((ends[0].force - ends[1].force) / (2.0 * step))
+    moving = (np.abs(SPEEDS) > 0.1) & (np.abs(POSITIONS) > 0.01)
+    np.testing.assert_allclose(along.by_position[moving], changes[0][moving], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(along.by_speed[moving], changes[1][moving], rtol=1e-3, atol=1e-3)
+
+
+def test_dry_friction_has_a_tangent_where_the_motion_turns():
+    half_window = 0.05 * float(np.sqrt(np.mean(SPEEDS**2)))
+    along = force_along(damping(0.0), TIME, POSITIONS, SPEEDS, 0.05)
+    turning = np.abs(SPEEDS) < 0.5 * half_window
+    np.testing.assert_allclose(along.by_speed[turning], 2.0 / half_window)
+    assert np.all(along.by_speed[np.abs(SPEEDS) > half_window] == 0.0)
