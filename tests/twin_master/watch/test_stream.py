@@ -13,9 +13,11 @@ import pytest
 from tests.command_line import command
 from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import begun
+from twin_master.errors import ImpossibleObservation
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.feeds import CsvFeed, json_lines
 from twin_master.watch.folder import Watch
+from twin_master.watch.intake import Intake
 
 pytestmark = pytest.mark.xdist_group("watches")
 
@@ -28,10 +30,10 @@ def with_section(watch: Watch, **keys: Any) -> Watch:
     return watch
 
 
-def line(mission: Any, turn: int, **others: Any) -> dict[str, Any]:
-    """Return the message of a turn of a mission, without saying which."""
-    control = ("2g", "3g")[mission.control_index[turn]]
-    return {"control": control, "strain": mission.observed[turn].tolist(), **others}
+def line(mission: Any, row: int, **others: Any) -> dict[str, Any]:
+    """Return the message of a row of a mission, without saying which turn it is."""
+    control = ("2g", "3g")[mission.control_index[row]]
+    return {"control": control, "strain": mission.observed[row].tolist(), **others}
 
 
 def decisions_of(watch: Watch, messages: list[Mapping[str, Any]], turns: int | None = None) -> list[Any]:
@@ -127,13 +129,18 @@ def test_a_counter_that_begins_again_is_told_as_that(watch, mission):
     )
 
 
-def test_observations_that_no_state_shows_are_refusals(watch, mission):
-    """The turns go on, as their messages have come."""
-    impossible = [line(mission, turn, turn=turn) | {"strain": [0.4] * 24} for turn in range(1, 6)]
-    decisions = decisions_of(watch, [line(mission, 0, turn=0), *impossible])
-    assert [decision["turn"] for decision in decisions if "told_again" not in decision] == [*range(6)]
-    assert (3, "refused") in kinds(decisions)
-    assert "probability zero" in sentence(decisions, "refused")
+def test_observations_that_no_state_shows_are_refusals(base, mission):
+    """They are refused once their turn is assimilated, so that turns go on."""
+    text = "".join(json.dumps(line(mission, turn, turn=turn)) + "\n" for turn in range(3))
+    intake = Intake(base.scenario, json_lines(base.scenario, io.BytesIO(text.encode())))
+    twin = base.models[0].knowledge.twin(lag=12)
+    for turn in range(3):
+        reading = intake.read(twin)
+        assert reading is not None
+        predicted = intake.impossible(reading, ImpossibleObservation("wing", turn))
+        twin.turn(predicted.observed, predicted.control)
+    assert "probability zero" in intake.stream.refusals(twin.turns).sentence
+    assert intake.complaint().startswith("The watch ended while messages were refused: the last 3 of 3")
 
 
 @pytest.mark.parametrize("name", ["fields", "strian"])
