@@ -310,7 +310,7 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_pat
         process.stdout.close()  # as head does
         process.stdin.write("".join(lines[2:]))
         process.stdin.flush()
-        assert process.wait(60) == 0
+        assert process.wait(300) == 0
         complaint = process.stderr.read()
     assert "Traceback" not in complaint
     assert "Broken" not in complaint
