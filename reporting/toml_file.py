@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from reporting.sentences import said
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
@@ -175,6 +176,22 @@ class Section(BaseModel):
         return self
 
 
+MISSING_KEY = "missing_key"
+
+
+def missing_keys(keys: list[str], sentence: str) -> PydanticCustomError:
+    """Return the error of a validator that keys are missing; several are named at once, with those of others.
+
+    Parameters
+    ----------
+    keys : list of str
+        The keys, as the file would have them in the table that is validated.
+    sentence : str
+        What is said where only one key is missing.
+    """
+    return PydanticCustomError(MISSING_KEY, "{sentence}", {"keys": keys, "sentence": sentence})
+
+
 _Description = TypeVar("_Description")
 _reader: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
 
@@ -228,17 +245,22 @@ def shown(value: object) -> str:
 def _sentence(error: ValidationError, what: str, first_index: int) -> str:
     found = error.errors(include_url=False)
     # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
-    for kinds, one, several in (
-        (("extra_forbidden", "unexpected_keyword_argument"),
-         f"is not a key of {what}; remove it or correct its spelling",
-         f"are not keys of {what}; remove them or correct their spelling"),
-        (("missing", "missing_argument"), "is missing", "are missing"),
-    ):  # fmt: skip
-        if places := [shown(_written(item["loc"], first_index)) for item in found if item["type"] in kinds]:
-            return f"{listing(places)} {several if places[1:] else one}"
+    unknown = [item for item in found if item["type"] in ("extra_forbidden", "unexpected_keyword_argument")]
+    if unknown:
+        places = [shown(_written(item["loc"], first_index)) for item in unknown]
+        are = "are not keys" if len(places) > 1 else "is not a key"
+        them = "them or correct their" if len(places) > 1 else "it or correct its"
+        return f"{listing(places)} {are} of {what}; remove {them} spelling"
+    missing = [item for item in found if item["type"] in ("missing", "missing_argument", MISSING_KEY)]
+    places = [shown(place) for item in missing for place in _missing_places(item, first_index)]
+    if len(places) > 1 or (missing and missing[0]["type"] != MISSING_KEY):
+        return f"{listing(places)} {'are' if len(places) > 1 else 'is'} missing"
+    found = missing or found
     first = found[0]
     place = _written(first["loc"], first_index)
     before = f"{place}: " if place else ""
+    if first["type"] == MISSING_KEY:
+        return f"{before}{first['ctx']['sentence']}"
     if first["type"] == "value_error":
         return f"{before}{first['ctx']['error']}"
     if first["type"] == "tuple_type" and isinstance(first["input"], dict):
@@ -251,6 +273,14 @@ def _sentence(error: ValidationError, what: str, first_index: int) -> str:
     else:
         message = first["msg"][0].lower() + first["msg"][1:]
     return f"{before}{message}, but {shown(first['input'])} came"
+
+
+def _missing_places(item: ErrorDetails, first_index: int) -> list[str]:
+    """Return the places of the keys that are missing by one error of pydantic."""
+    place = _written(item["loc"], first_index)
+    if item["type"] != MISSING_KEY:
+        return [place]
+    return [f"{place}.{key}".lstrip(".") for key in item["ctx"]["keys"]]
 
 
 def _written(location: tuple[int | str, ...], first_index: int) -> str:

@@ -207,14 +207,23 @@ def watch(
             last=last, report=not no_report, otherwise="-", begun=opened, progress=terminal.progress(),
         )  # fmt: skip
         _write("", flush=True)
-        if terminal.loudness.quiet:
-            return
-        counts = watches[0].intake.counts
+        if not terminal.loudness.quiet:
+            _say_where(folder, watches[0], report=not no_report)
+    complaint = watches[0].intake.complaint()
+    if complaint:
+        typer.secho(complaint, fg="red", err=True)
+        raise typer.Exit(1)
+
+
+def _say_where(folder: Path, watched: "parts.Watch", *, report: bool) -> None:
+    """Print how many messages a watch has had, and where its folder and its report are."""
+    counts = watched.intake.counts
+    refused = ""
+    if counts.rejected:
         refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
-        refused *= counts.rejected > 0
-        typer.echo(f"Watch: {folder}, {counted(counts.received, 'message')}{refused}.", err=True)
-        if not no_report and (folder / parts.REPORT_NAME).is_file():
-            typer.echo(f"Report: {folder / parts.REPORT_NAME}", err=True)
+    typer.echo(f"Watch: {folder}, {counted(counts.received, 'message')}{refused}.", err=True)
+    if report and (folder / parts.REPORT_NAME).is_file():
+        typer.echo(f"Report: {folder / parts.REPORT_NAME}", err=True)
 
 
 def _say(watched: "parts.Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:

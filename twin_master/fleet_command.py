@@ -58,7 +58,9 @@ def watch(
         error.add_note("What was observed is kept: repeat the command to go on.")
         raise
     console.say(f"{_heading(watched.standing)}: {folder}.")
-    if watched.failures and not watched.assets:
+    for name, complaint in watched.complaints.items():
+        console.say(f"{name}: {complaint}")
+    if watched.failures or watched.complaints:
         raise typer.Exit(1)
 
 

@@ -209,10 +209,8 @@ def test_no_end_a_crash_and_a_full_memory_are_one_sentence(path, monkeypatch, ca
     monkeypatch.setattr(netcdf, "SECONDS", 1)
     monkeypatch.setattr(netcdf, "WAITING", 2)
     monkeypatch.setattr(netcdf, "_groups", reading)
-    begin = time.perf_counter()
     with refused(DamagedFileError, "HDF5 breaks down over it"):
         read_groups(path)
-    assert time.perf_counter() - begin < 30.0
     assert capfd.readouterr() == ("", "")
     with pytest.raises(ProcessLookupError):
         os.kill(readers[0], 0)

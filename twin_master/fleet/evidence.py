@@ -10,7 +10,7 @@ import numpy as np
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
-from twin_master.errors import FleetError
+from twin_master.fleet.posterior import POINTS
 from twin_master.network.kernels import Lists, apply_blocks
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
@@ -48,9 +48,28 @@ def _on_points(
                     belief[state] /= total
 
 
+def why_transitions_are_kept(scenario: Scenario) -> str:
+    """Return why a fleet cannot learn the transitions of a scenario, in words; empty where it can."""
+    if scenario.transition.kind != "independent_worsening":
+        return f"transitions of the kind `{scenario.transition.kind}` have no probability to worsen"
+    entries = scenario.transition.probability.values()
+    count = sum(len(entry) if isinstance(entry, dict) else 1 for entry in entries)
+    if count > max(POINTS):
+        return f"they have {count} probabilities to worsen, and {max(POINTS)} are learnt together at most"
+    return ""
+
+
+def _predecessors(scenario: Scenario) -> Lists:
+    """Return the predecessors of the levels of each factor of the state of a scenario."""
+    tables = factor_tables(scenario).values()
+    return predecessor_lists([np.stack([rows[name] for rows in tables]) for name in scenario.state_names])
+
+
 @dataclass(frozen=True)
 class Worsening:
-    """The K probabilities to worsen of a scenario, and what its transitions make of them.
+    """The K probabilities to worsen that are learnt of a scenario, and what its transitions make of them.
+
+    K is 0 where its transitions stay as they are assumed; `kept_because` says why.
 
     Attributes
     ----------
@@ -66,6 +85,8 @@ class Worsening:
         The entry where its probability is 0, and 1.
     prior : (S,)
         p(D_0).
+    kept_because : str
+        Why the transitions are not learnt, in words; empty where they are.
     """
 
     names: tuple[str, ...]
@@ -74,18 +95,19 @@ class Worsening:
     place: Index
     ends: Float
     prior: Float
+    kept_because: str = ""
+
+    @classmethod
+    def kept(cls, scenario: Scenario, reason: str) -> "Worsening":
+        """Return none for a scenario whose transitions stay as assumed, for a reason."""
+        lists = _predecessors(scenario)
+        ends = np.stack([lists[4], lists[4]])
+        place = np.zeros(len(lists[4]), dtype=np.int64)
+        return cls((), np.empty(0), lists, place, ends, build_graphical_model(scenario).prior, reason)
 
     @classmethod
     def of(cls, scenario: Scenario) -> "Worsening":
-        """Return those of a scenario.
-
-        Raises
-        ------
-        FleetError
-            Its transitions are tables.
-        """
-        if scenario.transition.kind != "independent_worsening":
-            raise FleetError("probabilities are learnt of transitions of the kind `independent_worsening`.")
+        """Return those of a scenario whose transitions are of the kind `independent_worsening`."""
         given = scenario.transition.probability
         each = {c: entry if isinstance(entry, dict) else {"": entry} for c, entry in given.items()}
         assumed = {(c, name): value for c in scenario.control_names for name, value in each[c].items()}
@@ -93,10 +115,7 @@ class Worsening:
         def lists_at(probability: float) -> Lists:
             same = {"probability": dict.fromkeys(scenario.control_names, probability)}
             transition = scenario.transition.model_copy(update=same)
-            tables = factor_tables(scenario.model_copy(update={"transition": transition}))
-            return predecessor_lists(
-                [np.stack([rows[name] for rows in tables.values()]) for name in scenario.state_names]
-            )
+            return _predecessors(scenario.model_copy(update={"transition": transition}))
 
         lists, other, keys = lists_at(0.25), lists_at(0.75), [*assumed]
         rows = np.array(
@@ -117,6 +136,8 @@ class Worsening:
 
     def probability(self, points: Float) -> Float:
         """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""
+        if not self.names:
+            return np.tile(self.ends[0], (len(points), 1))
         share = points.take(self.place, axis=1)
         return np.asarray((1.0 - share) * self.ends[0] + share * self.ends[1])
 

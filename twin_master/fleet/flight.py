@@ -25,6 +25,7 @@ from twin_master import run_folder
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderError, said
+from twin_master.fleet.evidence import why_transitions_are_kept
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
 from twin_master.fleet.shard import Engine, Piece, ShardResult, flown, unflown, with_parameters
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store, sizes_of
@@ -114,6 +115,9 @@ def fly_fleet(
     with held_fleet(folder, KIND, fleet.record(), replace_old=replace_old, ready=ready) as config:
         if not (folder / JOURNAL_NAME).is_file():
             create_store(folder, fleet)
+        for group in fleet.groups:
+            if reason := why_transitions_are_kept(group.scenarios[0]):
+                progress.note(f"{group.name}: `fleet learn` leaves the transitions as assumed: {reason}.")
         with JournalFile(folder, hash_record(config)) as journal:
             shards, flown = _fly(fleet, folder, engine, journal, progress)
         told = told_of(folder)

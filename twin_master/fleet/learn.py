@@ -17,9 +17,15 @@ from reporting.toml_file import toml_text
 from reporting.words import counted
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError, said
-from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
+from twin_master.fleet.evidence import (
+    Worsening,
+    node_evidence,
+    scaled_likelihood,
+    transition_evidence,
+    why_transitions_are_kept,
+)
 from twin_master.fleet.flight import fleet_config, source_of
-from twin_master.fleet.posterior import POINTS, Grid, Line, masses, narrowed, population, refined, shared
+from twin_master.fleet.posterior import Grid, Line, masses, narrowed, population, refined, shared
 from twin_master.fleet.reading import Known, known_twins, noticed
 from twin_master.fleet.store import open_group
 from twin_master.mission.preparation import Knowledge
@@ -46,8 +52,8 @@ class _Lessons:
     ----------
     worsening : Worsening
         The probabilities and what was assumed of them.
-    grid : Grid
-        Their likelihood.
+    grid : Grid or None
+        Their likelihood; None where the transitions are not learnt.
     flown : set of str
         The controls under which a turn was followed by another.
     record : dict
@@ -55,9 +61,14 @@ class _Lessons:
     """
 
     worsening: Worsening
-    grid: Grid
+    grid: Grid | None
     flown: set[str]
     record: dict[str, Any]
+
+    @property
+    def marginals(self) -> tuple[Line, ...]:
+        """Posterior of each probability under a uniform prior."""
+        return () if self.grid is None else self.grid.marginals
 
     def told(self, lines: Sequence[Line], flown: set[str]) -> dict[str, Any]:
         """Return the record, with the posteriors of the probabilities, and the controls that have flown."""
@@ -78,7 +89,7 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     Raises
     ------
     RunFolderError, FleetError
-        There is no fleet, nothing has flown, or its transitions cannot be learnt.
+        There is no fleet, nothing has flown, or no state of its twins explains what was observed.
     """
     folder, progress = Path(folder), progress or SilentProgress()
     config = fleet_config(folder)
@@ -92,9 +103,11 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     if not found:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
     names, told = next(iter(found.values())).worsening.names, dict[str, Any]()
-    lines, everywhere = [lessons.grid.marginals for lessons in found.values()], set[str]()
-    if len(found) > 1 and len(names) <= 2 and {each.worsening.names for each in found.values()} == {names}:
-        figures, lines = shared([lessons.grid for lessons in found.values()])
+    lines, everywhere = [lessons.marginals for lessons in found.values()], set[str]()
+    grids = [lessons.grid for lessons in found.values() if lessons.grid is not None]
+    are_alike = {each.worsening.names for each in found.values()} == {names}
+    if len(grids) > 1 and len(names) <= 2 and are_alike:
+        figures, lines = shared(grids)
         everywhere = set().union(*(lessons.flown for lessons in found.values()))
         told = {"shared": dict(zip(names, figures, strict=True))}
     groups = {
@@ -118,9 +131,9 @@ Seen = tuple[Knowledge, Float, Index]
 def _lessons(record: dict[str, Any], group: "xr.Dataset", parts: Sequence[Known]) -> _Lessons:
     """Learn the noise first, for what else is learnt rests on it, then the rates, then the population."""
     _, home, known = parts[0]
-    worsening, controls = Worsening.of(known.scenario), known.scenario.control_names
-    if (count := len(worsening.names)) > max(POINTS):
-        raise FleetError(said("fleet.probabilities", group=record["name"], count=count, most=max(POINTS)))
+    reason = why_transitions_are_kept(known.scenario)
+    worsening = Worsening.kept(known.scenario, reason) if reason else Worsening.of(known.scenario)
+    controls = known.scenario.control_names
     given = group["control_index"].values.astype(np.int64)
     # Behind the end of a recording nothing is observed, so that any control says the same.
     observed, control = group["observed"].values.astype(np.float64), np.maximum(given, 0)
@@ -140,11 +153,14 @@ def _lessons(record: dict[str, Any], group: "xr.Dataset", parts: Sequence[Known]
     def log_likelihood(points: Float) -> Float:
         return np.asarray(sum(transition_evidence(worsening, points, *some).sum(axis=0) for some in likely))
 
-    grid, rows = refined(log_likelihood, count), np.concatenate([rows for rows, *_ in parts])
+    grid = refined(log_likelihood, len(worsening.names)) if worsening.names else None
+    rows = np.concatenate([rows for rows, *_ in parts])
     alarmed = int(np.sum(noticed(group, "alarm")[rows] > 0))
     told = {"twins": twins, "left_out": len(rows) - twins, "alarmed": alarmed, "noise_factor": noise.figures}
+    if worsening.kept_because:
+        told["transitions_kept_because"] = worsening.kept_because
     if nodes is not None:
-        learnt = np.array([marginal.mean for marginal in grid.marginals])
+        learnt = np.array([marginal.mean for marginal in grid.marginals]) if grid else worsening.assumed
         each = node_evidence(worsening, learnt, _noisier(known.sensor_model, noise.mean, nodes), *seen[0][1:])
         mean, spread = population(nodes.values, each, known.draws.standard_deviation)
         told["population"] = {"parameter": known.draws.name, "mean": mean.figures, "spread": spread.figures}
@@ -252,12 +268,13 @@ def learn_from_fleet(
     -------
     record : dict
         What was learnt beside what was assumed: `groups`, by the name of each, with `probability` (by
-        control), `noise_factor` and `population`; `shared` over several groups; `source`.
+        control; else `transitions_kept_because`), `noise_factor` and `population`; `shared` over several
+        groups; `source`.
 
     Raises
     ------
     RunFolderError, FleetError
-        There is no fleet, nothing has flown, or its transitions cannot be learnt.
+        There is no fleet, nothing has flown, or no state of its twins explains what was observed.
     """
     record = learn_fleet(folder, progress=progress)
     write_learnt(Path(out), Path(folder), record)
@@ -296,10 +313,8 @@ def _tables(
         else:
             probability[control] = mean
     noise = np.asarray(scenario["observation"]["standard_deviation"]) * group["noise_factor"]["mean"]
-    tables: dict[str, Any] = {
-        "transition": {"probability": probability},
-        "observation": {"standard_deviation": noise.tolist()},
-    }
+    tables: dict[str, Any] = {"transition": {"probability": probability}} if probability else {}
+    tables["observation"] = {"standard_deviation": noise.tolist()}
     if learnt := group.get("population"):
         middle, spread = learnt["mean"], learnt["spread"]
         total = np.linalg.norm([spread["mean"], spread["standard_deviation"], middle["standard_deviation"]])
@@ -324,6 +339,8 @@ def lesson_rows(record: dict[str, Any]) -> list[tuple[str, ...]]:
             title = f"probability to worsen, {control}"
             rows.append((heading, title, f"{rate['assumed']:.4f}{off}", mean, interval))
             heading = ""
+        if "transitions_kept_because" in group:
+            rows.append((heading, "transitions", "as assumed", "not learnt", ""))
         lines = [("noise over the assumed", "1", group["noise_factor"])]
         if told := group.get("population"):
             lines += [(f"{told['parameter']}, {moment}", "", told[moment]) for moment in ("mean", "spread")]

@@ -203,6 +203,12 @@ class FleetWatch:
         """What ended the watch of an asset, until it is taken up again; the others go on."""
         return {name: lost.sentence for name, lost in self._lost.items() if name not in self.assets}
 
+    @property
+    def complaints(self) -> dict[str, str]:
+        """Why the messages of an asset that is watched were of no use, see `Intake.complaint`."""
+        complaints = {name: asset.watch.intake.complaint() for name, asset in sorted(self.assets.items())}
+        return {name: complaint for name, complaint in complaints.items() if complaint}
+
     def run(self, looked: Callable[[], None] = lambda: None) -> None:
         """Watch until all files are read to their end, or until it is asked to end.
 

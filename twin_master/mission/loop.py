@@ -51,8 +51,9 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
 
     Nothing where it tells no decision.
     """
-    if "quiet" in line:
-        return dict(line["quiet"])
+    for reason in ("quiet", "refused"):  # the last decision was told again
+        if reason in line:
+            return dict(line[reason])
     if "filtered" not in line:
         return {}
     filtered = array_of(line["filtered"])

@@ -302,6 +302,7 @@ class Scenario(Section):
             told = said("scenario.inputs", first=controls[0], roles=inputs, control=control)
             yield {*control.values} != {*inputs}, told
         yield unknown(self.mission.first_control, controls, "mission.first_control", "control")
+        yield self._incomplete_tables(controls)
         yield incomplete(rewards.control, controls, "rewards.control", "control")
         yield unknown(self.planner.safest or controls[0], controls, "planner.safest", "control")
         if norm is not None:
@@ -320,6 +321,17 @@ class Scenario(Section):
             yield free, said("scenario.free_action", name=action.name)
             for state in (*action.inspects, *action.repairs):
                 yield unknown(state, states, f"action.{action.name}", "state")
+
+    def _incomplete_tables(self, controls: tuple[str, ...]) -> Fault:
+        """Return the fault that several tables have not one entry for each control."""
+        tables: list[tuple[str, Mapping[str, object]]] = [("rewards.control", self.rewards.control)]
+        key = "probability" if self.transition.kind == "independent_worsening" else "tables"
+        tables.append((f"transition.{key}", getattr(self.transition, key)))
+        if self.truth.probability:
+            tables.append(("truth.probability", self.truth.probability))
+        faults = [incomplete(table, controls, name, "control") for name, table in tables]
+        sentences = [sentence for is_incomplete, sentence in faults if is_incomplete]
+        return len(sentences) > 1, "; ".join(sentences)
 
     def _faults_of_truth(self) -> Iterator[Fault]:
         truth, states, asset = self.truth, self.state_names, self.asset

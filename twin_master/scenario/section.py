@@ -19,7 +19,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandle
 
 from reporting import toml_file
 from reporting.arrays import Float, Index
-from reporting.toml_file import Fault, NotNegative, Positive, shown
+from reporting.toml_file import Fault, NotNegative, Positive, missing_keys, shown
 from scenarios import asset_scripts, binding_files, recording_files, structure_files
 from twin_master.errors import said
 
@@ -97,9 +97,10 @@ class Section(toml_file.Section):
                 if unit == "percent" and number and not -100 <= item <= 100:
                     raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
             converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
-        for name in cls.units:
-            if cls.model_fields[name].is_required() and name not in converted:
-                raise ValueError(f"`{known[name]}` is missing")
+        required = [name for name, field in cls.model_fields.items() if field.is_required()]
+        missing = [known[name] for name in required if name not in converted]
+        if {*required} & {*cls.units} - {*converted}:  # only here the units of their names are known
+            raise missing_keys(missing, f"`{missing[0]}` is missing")
         return converted
 
     @classmethod
@@ -398,8 +399,10 @@ class KindSection(FileSection):
             return handler(table)
         kinds, kind = cls.kinds(), table.get("kind")
         if not isinstance(kind, str) or kind not in kinds:
-            came = f"{shown(kind)} came" if "kind" in table else "it is missing"
-            raise ValueError(f"`kind` must be one of {short(sorted(kinds))}, and {came}")
+            expected = f"`kind` must be one of {short(sorted(kinds))}"
+            if "kind" not in table:
+                raise missing_keys(["kind"], f"{expected}, and it is missing")
+            raise ValueError(f"{expected}, and {shown(kind)} came")
         return kinds[kind].model_validate(table)
 
 

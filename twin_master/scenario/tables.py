@@ -334,6 +334,8 @@ class WatchSection(FileSection):
     """Turns that a message may be ahead of the next one; those between are predicted through."""
     seconds_per_turn: Positive | None = None
     """Of messages that have a time in the place of a turn."""
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+    """Of the times of messages."""
     allow_unknown: bool = False
     """Keys and columns that are no sensor are passed over, and not refused."""
     quiet_after_seconds: Positive | None = None

@@ -24,20 +24,8 @@ from twin_master.errors import MissionInputError, said
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.intake import GIVEN, MISSING, Feed
-from twin_master.watch.message import (
-    LARGEST_MESSAGE,
-    Fed,
-    GrowingFile,
-    Message,
-    MessageReader,
-    Pipe,
-    Place,
-    Refused,
-    first_line,
-    found,
-    holds,
-    rotated,
-)
+from twin_master.watch.lines import GrowingFile, Pipe, Place, first_line, found, holds, rotated
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 Observations = Iterable[Mapping[str, Any]] | str | Path
 STANDARD_INPUT = "-"
@@ -140,32 +128,72 @@ class CsvFeed(RecordedFeed):
 
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
         super().__init__(path, scenario, follow=follow)
-        # A file that was begun a moment ago may have no header yet.
-        files = [path, *(reversed(rotated(path)) if follow else ())]
+        self._take_columns(self._header(follow=follow))
+
+    def _header(self, *, follow: bool) -> list[str]:
+        """Return the names of the columns.
+
+        A file that was begun a moment ago has no header yet, and one that was copied and cut has lost it:
+        where the file is followed, the header of the newest rotated file that has one holds for it.
+        """
+        files = [self.path, *(reversed(rotated(self.path)) if follow else ())]
         try:
-            headers = [first_line(file) for file in files]
-            names = _cells(next((line for line in headers if line.endswith(b"\n")), headers[0]))
+            lines = [first_line(file) for file in files]
+            whole_lines = [line for line in lines if line.endswith(b"\n")] or lines[:1]
+            rows = [_cells(line) for line in whole_lines]
         except (OSError, ValueError) as error:
             reason = str(error).rstrip(".")
             raise MissionInputError(f"{self.path} cannot be read as CSV: {reason}.") from None
-        self._take_columns(names)
+        for names in rows:
+            if not self._is_reading(names):
+                return names
+        where = (
+            "and no rotated file beside it has that line"
+            if follow
+            else ("which a rotated file beside it may have: that one is found with --follow")
+        )
+        raise MissionInputError(
+            f"{self.path} begins with `{','.join(rows[0])[:60]}`, which is a row of readings: a CSV file "
+            f"begins with a line of its columns, {where}."
+        )
+
+    def _is_reading(self, cells: list[str]) -> bool:
+        """Return whether the cells of a line are readings, and no names of columns."""
+        if not any(map(_is_number, cells)):
+            return False
+        try:  # sensors may be called by numbers
+            return not all(cell in _OTHERS or self.reader.column(cell) is not None for cell in cells)
+        except Refused:  # a known name with a wrong unit
+            return False
 
     def _take_columns(self, names: list[str]) -> None:
+        """Take the names of columns for those of the rows that follow.
+
+        Raises
+        ------
+        MissionInputError
+            There are none, or one is no column, or two say the same.
+        """
         path = self.path
         if not any(names):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
             raise MissionInputError(said("watch.json_lines", path=path))
-        called = ["turn" if name in _NAMES_OF_TURN else name for name in names]
-        sensors = [name for name in called if name not in _OTHERS and name[:1] != "_"]
+        columns = ["turn" if name in _NAMES_OF_TURN else name for name in names]
+        candidates = [name for name in columns if name not in _OTHERS and name[:1] != "_"]
         try:
-            columns = [column for column in map(self.reader.column, sensors) if column is not None]
+            sensors = [found[0] for found in map(self.reader.column, candidates) if found is not None]
+            unknown = [name for name in candidates if self.reader.column(name) is None]
+            is_any_known = len(unknown) < len(columns)
+            if unknown and not (self.reader.allows_unknown and is_any_known):
+                raise Refused(self.reader.unknown(unknown, is_any_known=bool(sensors)))
         except Refused as refusal:
-            raise MissionInputError(said("watch.column", path=path, refusal=refusal)) from None
-        once = {sensor for sensor, _ in columns}
-        if len(once) < len(columns) or any(called.count(name) > 1 for name in _OTHERS):
+            raise MissionInputError(
+                f"{path}: the columns cannot be read, {refusal}; others are `turn`, `time` and `control`."
+            ) from None
+        if len({*sensors}) < len(sensors) or any(columns.count(name) > 1 for name in _OTHERS):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
-        self._names = called
+        self._names = columns
 
     def opened(self, place: Place | None) -> BinaryIO:
         """Return the file that a place is in, after its columns were taken."""
@@ -179,7 +207,7 @@ class CsvFeed(RecordedFeed):
             cells = _cells(line)
         except ValueError as error:
             return Refused(f"it is no line of CSV: {str(error)[:80]}")
-        if not begin:
+        if not begin and not self._is_reading(cells):
             with suppress(MissionInputError):
                 self._take_columns(cells)
                 return None
@@ -193,6 +221,14 @@ class CsvFeed(RecordedFeed):
             }
         except (ValueError, OverflowError) as error:
             return Refused(f"a cell is no number: {str(error)[:80]}")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _cells(line: bytes) -> list[str]:

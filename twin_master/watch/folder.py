@@ -161,6 +161,7 @@ class Watch:
     def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[None]:
         """Open the journal, and take up the twin as it stands after it; see `run`."""
         intake = Intake(self.scenario, feed, self.folder / REJECTED_NAME)
+        intake.stops_at_refusals = True
         seconds = FLUSH_SECONDS if feed.replayable else 0.0
         with JournalFile(self.folder, self._hash, seconds) as self.journal:
             self._take_up()
@@ -181,14 +182,20 @@ class Watch:
                     self.write()
 
     def decisions(self) -> Iterator[dict[str, Any]]:
-        """Yield what the operator is told of each turn, once it is written down, until no more comes."""
-        twin: Twin | None = None
-        while twin is not self.twin:  # where it was taught meanwhile, another one goes on
+        """Yield what the operator is told of each turn, once it is written down, until no more comes.
+
+        Also the last decision again, with a notice, where the messages behind it are refused.
+        """
+        while True:
             twin = self.twin
             for turn in operate(twin, self.intake):
                 yield self.decision_of(self._kept(turn))
-                if twin is not self.twin:
+                if twin is not self.twin:  # it was taught meanwhile: another one goes on
                     break
+            if self.intake.stream.refusals_are_untold:
+                yield self._refusals()
+            elif twin is self.twin:
+                return
 
     def decision_of(self, line: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the operator is told with a line of the journal; nothing where it tells no decision."""
@@ -239,11 +246,20 @@ class Watch:
             return
         since = f"since {step} {self.twin.turns - 1}" if self.twin.turns else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
-        notices = [Notice("quiet", sentence).as_record()]
-        decision = {**(self.last_decision() or {"turn": -1}), "notices": notices}
-        self.write(notices=notices, quiet=decision)
+        decision = self._last_decision_with(Notice("quiet", sentence))
+        self.write(notices=decision["notices"], quiet=decision)
         self.is_quiet = True
         decide(decision)
+
+    def _refusals(self) -> dict[str, Any]:
+        """Write down that messages are refused; return the last decision with the notice that says so."""
+        decision = self._last_decision_with(self.intake.stream.refusals(self.twin.turns))
+        self.write(notices=decision["notices"], refused=decision)
+        return decision
+
+    def _last_decision_with(self, notice: Notice) -> dict[str, Any]:
+        """Return the last decision, or what stands for it before the first one, with a notice alone."""
+        return {**(self.last_decision() or {"turn": -1}), "notices": [notice.as_record()]}
 
     def trial(self, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
         """Return what tells what comes of a patch from a turn on, after all lines of the journal so far."""

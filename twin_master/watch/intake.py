@@ -1,7 +1,6 @@
 """From messages to readings: turns in order, gaps predicted through, late ones in their place."""
 
 import json
-import math
 import signal
 import threading
 import time
@@ -16,13 +15,17 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, written
+from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError, said
 from twin_master.mission.journal import state_text, turn_record
 from twin_master.mission.turns import Reading, Turn
 from twin_master.network.estimator import Notice, Words
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.message import Fed, Message, Place, Refused
+from twin_master.watch.clock import Clock
+from twin_master.watch.lines import Place
+from twin_master.watch.message import Fed, Message, Refused
+from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices, unit_advice
 
 POLL_SECONDS = 0.05
 """Between two looks at a feed that may go on."""
@@ -112,7 +115,12 @@ class Intake:
     observation_turn : int
         The turn of the last reading.
     notices : list of Notice
-        Of sensors of which no number came with the last reading, and before it did, or the other way round.
+        Of the last reading: sensors of which no number came any more, or came again; what is wrong with the
+        stream of messages, see `StreamNotices`.
+    stream : StreamNotices
+        What the operator was told of the stream.
+    stops_at_refusals : bool
+        Whether `read` returns None once where the operator is to be told that messages are refused.
     ended : bool
         Whether the feed has ended; if not, more may come after `read` has returned None.
     look : callable or None
@@ -133,11 +141,14 @@ class Intake:
         self._before_last: Place | None = None
         self._pending: deque[tuple[int, Reading, int]] = deque()
         self._given: deque[int] = deque(maxlen=scenario.watch.lag + 1)
-        self._origin: float | None = None
-        self._first: int | None = None  # the only turn that was told a time so far, if there is but one
+        self._clock = Clock(scenario.watch)
         self._text = ""
         self._unreadable = self._known = set[int]()  # after the last reading, and before it
         self.notices: list[Notice] = []
+        self.stream = StreamNotices(self._words)
+        self._stream_before: dict[str, Any] = {}  # its state before the last reading
+        self.stops_at_refusals = False
+        self._came = self._useful = 0  # messages in this process, and those that told something of a sensor
         self._before: Float = np.empty(0)
         self.counts = Counts()
         self.observation_turn = -1
@@ -155,13 +166,15 @@ class Intake:
         # The message behind a gap is read again, until its own turn is written down.
         waiting = bool(self._pending)
         counts = vars(self.counts) | {"received": self.counts.received - waiting}
+        stream = self.stream.state(waiting=waiting)
         return {
             "counts": counts,
             "given": "".join(map(str, self._given)),
-            "origin": self._origin,
+            "origin": self._clock.origin,
             "source": self._before_last if waiting else self._place,
-            **({} if self._first is None else {"first_timed": self._first}),
+            **({} if self._clock.only_turn is None else {"first_timed": self._clock.only_turn}),
             **({"unreadable": sorted(self._unreadable)} if self._unreadable else {}),
+            **({"stream": stream} if stream else {}),
         }
 
     def line(self, turn: Turn, twin: Twin) -> dict[str, Any]:
@@ -189,9 +202,11 @@ class Intake:
         again = self._feed.replayable
         if state is not None:
             self.counts = Counts(**state["counts"])
-            self._origin, self._first = state["origin"], state.get("first_timed")
+            self._clock.origin = state["origin"]
+            self._clock.only_turn = state.get("first_timed")
             self._given.extend(map(int, state["given"]))
             self._unreadable = set(state.get("unreadable", ()))
+            self.stream.restore(state.get("stream", {}))
             again &= state["source"] is not None and self._feed.holds(state["source"])
             self._place = state["source"] if again else None
         if self._rejected is not None and self._rejected.exists():
@@ -215,6 +230,8 @@ class Intake:
         """Return the next reading, see `Source.read`; None also where the end was asked for."""
         with suppress(_Asked):
             while not self.asked and (self.turns is None or twin.turns < self.turns):
+                if self.stops_at_refusals and self.stream.refusals_are_untold:  # also as no state could show
+                    return None
                 begin = time.monotonic()
                 came = bool(self._pending) or self._took(twin)
                 if self._pending:
@@ -241,13 +258,16 @@ class Intake:
         if message is None:
             return False
         self.counts.received += 1
+        self._came += 1
         self._before_last, self._place = self._place, self._feed.place
+        turn: int | None = None
         try:
             if isinstance(message, Refused):
                 raise message
-            self._sort(twin, message)
+            turn = self._turn_of(twin, message)
+            self._sort(twin, message, turn)
         except Refused as refusal:
-            self._refuse(str(refusal))
+            self._refuse(str(refusal), turn)
         return True
 
     def _next(self, twin: Twin) -> Reading:
@@ -255,7 +275,12 @@ class Intake:
         turn, reading, given = self._pending.popleft()
         self.observation_turn = turn
         self._known = self._unreadable
+        self._stream_before = self.stream.state(waiting=False)
         self.notices = [*self._noticed(reading)]
+        if given == MISSING:
+            self.notices += self.stream.coming()
+        else:
+            self.notices += self._taken(turn, reading)
         if reading.revises is None:
             self._given.append(given)
             self.counts.missing += given == MISSING
@@ -265,6 +290,33 @@ class Intake:
             self.counts.late += 1
             self._given[place] = max(given, self._given[place])
         return reading
+
+    def _taken(self, turn: int, reading: Reading) -> list[Notice]:
+        """Take in that a message is assimilated; return what is to be told of the stream of messages."""
+        is_blind = bool(np.isnan(reading.observed).all())
+        self._useful += not is_blind
+        passed_over = reading.passed_over if isinstance(reading, Message) else {}
+        if reading.revises is not None:  # it says nothing of how the sensors are now
+            is_blind = self.stream.is_blind
+        return self.stream.take(turn, is_blind=is_blind, passed_over=passed_over)
+
+    def complaint(self) -> str:
+        """Return why the messages of this process were of no use, in a sentence; empty where they were.
+
+        That is so where no message told the reading of a sensor, or those at the end were all refused.
+        """
+        refused = self.stream.refused_in_a_row
+        if self._came and refused and (refused >= REFUSALS_IN_A_ROW or not self._useful):
+            return (
+                f"The watch ended while messages were refused: the last {refused} of "
+                f"{counted(self._came, 'message')}, the last one because {self.stream.last_reason}."
+            )
+        if self._came and not self._useful:
+            return (
+                f"None of {counted(self._came, 'message')} has a reading of any {self._words.sensor}: what "
+                "is told rests on the transitions alone."
+            )
+        return ""
 
     def _noticed(self, reading: Reading) -> Iterator[Notice]:
         """Say of each sensor once that it is unreadable, and once that it is back."""
@@ -283,14 +335,18 @@ class Intake:
 
     def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Refuse an observation that no state allows; its turn is predicted through, or stays as it was."""
-        self._refuse(str(error))
-        self.notices, self._unreadable = [], self._known
+        self.stream.restore(self._stream_before)
+        self._useful -= 1
+        self._refuse(str(error), self.observation_turn)
+        self.notices = [notice for notice in self.notices if notice.kind == "clock"]
+        self._unreadable = self._known
         if reading.revises is not None:
             return Reading(self._before, None, reading.revises)
         return Reading(np.full(self._width, np.nan), reading.control)
 
-    def _refuse(self, reason: str) -> None:
+    def _refuse(self, reason: str, turn: int | None) -> None:
         self.counts.rejected += 1
+        self.stream.refuse(turn, one_line(reason))
         if self._rejected is None or self._kept >= REJECTED_KEPT:
             return
         self._kept += 1
@@ -300,35 +356,27 @@ class Intake:
 
     def _turn_of(self, twin: Twin, message: Message) -> int:
         """Return the turn that a message names, or that of its time, or the next one."""
-        step, gap = self._section.seconds_per_turn, self._section.longest_gap
-        if message.turn is not None or message.time is None:
-            return twin.turns if message.turn is None else message.turn
-        if step is None:
-            raise Refused("it has a time and no turn, and the scenario has no `watch.seconds_per_turn`")
-        turn = math.nan if self._origin is None else (message.time - self._origin) / step
-        alone = self._origin is None or self._first is not None
-        if alone and not -gap <= turn <= twin.turns + gap:
-            # The first time, or two that do not go together, and none that bears either out: a clock that was
-            # set in between. The turns seen so far stay, and time is counted from this message on.
-            turn = self._first = twin.turns
-            self._origin = message.time - step * turn
-        elif self._first is not None and round(turn) != self._first:
-            self._first = None  # two turns agree about the time
-        if not math.isfinite(turn):
-            raise Refused("its time lies too far from the first")
-        if turn < -0.5:
-            raise Refused(f"its time lies {-round(turn)} turns before the first")
-        return round(turn)
+        if message.turn is not None:
+            return message.turn
+        if message.time is None:
+            return twin.turns
+        return self._clock.turn_of(message.time, twin.turns, self.stream)
 
-    def _sort(self, twin: Twin, message: Message) -> None:
+    def _sort(self, twin: Twin, message: Message, turn: int) -> None:
         """Take in a message: the next turn, one ahead with the gap before it, or one that was before."""
-        turn, most = self._turn_of(twin, message), self._section.longest_gap
+        most = self._section.longest_gap
         ahead, told = turn - twin.turns, message.control is not None and not message.assumed
         given = GIVEN if told else _ASSUMED
+        unit = ""
+        if message.turn is None and message.time is not None:
+            unit = self._clock.slipped_unit(message.time, twin.turns)
         if ahead > most:
-            raise Refused(said("watch.ahead", turn=turn, ahead=ahead, next=twin.turns, most=most))
+            far = f"turn {turn} is {ahead} turns ahead of the next one, {twin.turns}"
+            raise Refused(f"{far}, and `watch.longest_gap` is {most}{unit_advice(unit)}")
         if turn < twin.first_kept and ahead < 0:
             raise Refused(said("watch.late", turn=turn, late=-1 - ahead, lag=self._section.lag))
+        if ahead > 0:
+            self.stream.gap(twin.turns, turn, unit)
         if ahead >= 0:
             lost = Reading(np.full(self._width, np.nan))
             self._pending += [(twin.turns + gap, lost, MISSING) for gap in range(ahead)]
@@ -344,6 +392,7 @@ class Intake:
         merged = np.where(np.isnan(before), message.observed, before)
         if not another and np.array_equal(merged, before, equal_nan=True):
             self.counts.duplicates += 1
+            self._useful += 1
             return
         self._before = before
         self._pending.append((turn, replace(message, observed=merged, revises=turn), given))

@@ -23,7 +23,8 @@ from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, shown
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
-from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Place, Refused
+from twin_master.watch.lines import Place
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 CLIENT_SUFFIX, PUBLISHED_NAME = ".mqtt", "published"
 """Of the file with the name of the client, and of that which says how far decisions were published."""

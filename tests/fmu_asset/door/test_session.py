@@ -71,12 +71,12 @@ def test_a_step_that_goes_wrong_ends_a_run_there(
 
 
 def test_a_step_that_hangs_in_a_run_ends_the_worker(spring_mass) -> None:
-    with FmiAsset(spring_mass, SPRING_BINDING, step_timeout=0.4) as asset:
+    with FmiAsset(spring_mass, SPRING_BINDING, step_timeout=4.0) as asset:
         # The limit is that of a step: thousands in one message take longer than one may.
         assert asset.simulate({"push": 1.0}, steps=20_000).extra["steps"][-1] == 20_000
         misbehaviour = np.where(np.arange(500) == 300, SLEEP, 0)
         asset.reset()
-        words = r"step \d+ from .* took longer than 0\.4 s for a step"
+        words = r"step \d+ from .* took longer than 4 s for a step"
         with pytest.raises(errors.FmuTimeoutError, match=words):
             asset.simulate(load={"misbehaviour": misbehaviour})
         assert asset.step_index <= 300

@@ -85,6 +85,7 @@ def test_another_tool_has_no_complaint(ours, name, tmp_path) -> None:
 @pytest.mark.parametrize("name", EQUAL)
 def test_equal_input_gives_equal_bytes(ours, name, tmp_path, monkeypatch) -> None:
     """Also in another folder."""
+    expected = ours(name).read_bytes()  # skips without a C compiler, where one is needed
     elsewhere = tmp_path / "else where"
     elsewhere.mkdir()
     monkeypatch.setenv("TMPDIR", str(elsewhere))
@@ -94,7 +95,7 @@ def test_equal_input_gives_equal_bytes(ours, name, tmp_path, monkeypatch) -> Non
         ).path
     else:
         again = ours.write(name, tmp_path / "again.fmu")
-    assert again.read_bytes() == ours(name).read_bytes()
+    assert again.read_bytes() == expected
 
 
 def test_the_environment_does_not_show_and_other_content_does(ours, model, tmp_path) -> None:

@@ -64,7 +64,7 @@ def processes(of: Path) -> list[str]:
     return found
 
 
-def wait_until(done: Callable[[], Any], limit: float = 20.0) -> None:
+def wait_until(done: Callable[[], Any], limit: float = 120.0) -> None:
     """Wait: who is killed does not die in the same moment."""
     deadline = time.monotonic() + limit
     while not done():
@@ -72,7 +72,7 @@ def wait_until(done: Callable[[], Any], limit: float = 20.0) -> None:
         time.sleep(0.02)
 
 
-def await_nothing(scratch: Path, limit: float = 20.0) -> None:
+def await_nothing(scratch: Path, limit: float = 120.0) -> None:
     """Wait until nothing is left behind, neither processes nor files."""
     wait_until(lambda: not processes(scratch) and not list(scratch.iterdir()), limit)
 
@@ -259,7 +259,7 @@ def test_nothing_is_left_when_the_twin_is_killed_during_a_step(foreign_fmu, scra
         if what == "START_PROCESS":
             assert process.stdout.readline() == b"fourth\n"
             assert len(processes(scratch)) == 3  # with the keeper
-    await_nothing(scratch, 30.0)
+    await_nothing(scratch)
 
 
 # ---------------------------------------------------------------------- an FMU in Python
@@ -285,7 +285,7 @@ def test_an_fmu_in_python_that_loops(spring_mass, scratch, misbehaviour) -> None
     lines = "asset.step()", "print('loops', flush=True)", f"asset.step(load={load})"
     with twin(spring_mass, SPRING_BINDING, *lines) as process:
         assert process.stdout.readline() == b"loops\n"
-    await_nothing(scratch, 30.0)
+    await_nothing(scratch)
 
 
 # ---------------------------------------------------------------------- a process of its own

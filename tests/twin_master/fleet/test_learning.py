@@ -10,11 +10,18 @@ import pytest
 from scipy.special import expit, logit
 from scipy.stats import beta, betabinom, norm, t
 
+from reporting.progress import Progress
 from tests.twin_master.network.decision_oracles import precise_forward_backward
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import FleetError, MissionInputError
-from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
+from twin_master.errors import MissionInputError
+from twin_master.fleet.evidence import (
+    Worsening,
+    node_evidence,
+    scaled_likelihood,
+    transition_evidence,
+    why_transitions_are_kept,
+)
 from twin_master.fleet.flight import group_folder
 from twin_master.fleet.learn import _noisier
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
@@ -225,13 +232,69 @@ def test_what_was_learnt_must_fit(tmp_path):
     assert (found.source, found.mean, found.standard_deviation, found.draws) == ("normal", 1.0, 0.1, 100)
 
 
-def test_tables_are_not_learnt():
-    table = tiny({"2g": 0.1, "3g": 0.1}).to_dict()
-    rows = [[0.9, 0.1, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 1.0]]
-    tables = {control: {"z1": rows, "z2": rows} for control in ("2g", "3g")}
+def as_tables(scenario: Scenario) -> Scenario:
+    """Return a scenario whose probabilities to worsen are written as tables."""
+    table = scenario.to_dict()
+    size = len(table["state"][0]["levels"])
+    tables = {}
+    for control, worsens in table["transition"]["probability"].items():
+        rows = np.diag([1.0 - worsens] * (size - 1) + [1.0]) + np.diag([worsens] * (size - 1), 1)
+        tables[control] = {state["name"]: rows.tolist() for state in table["state"]}
     table["transition"] = {"kind": "independent_tables", "tables": tables}
-    with pytest.raises(FleetError, match="independent_worsening"):
-        Worsening.of(parse_scenario(table, "tables"))
+    return parse_scenario(table, "tables")
+
+
+def test_the_evidence_of_table_transitions_is_that_of_the_tables():
+    assumed = tiny(EACH)
+    generator = np.random.default_rng(4)
+    likelihood = generator.random((2, 4, 9))
+    control = generator.integers(0, 2, (2, 4))
+    tables = as_tables(assumed)
+    free, fixed = Worsening.of(assumed), Worsening.kept(tables, why_transitions_are_kept(tables))
+    assert (fixed.names, fixed.kept_because) == (
+        (),
+        "transitions of the kind `independent_tables` have no probability to worsen",
+    )
+    expected = transition_evidence(free, free.assumed[None], likelihood, control)
+    found = transition_evidence(fixed, fixed.assumed[None], likelihood, control)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_five_probabilities_are_too_many_to_be_learnt_and_stay_as_assumed():
+    table = tiny({"2g": 0.1, "3g": 0.1}).to_dict()
+    names = [f"c{number}" for number in range(5)]
+    table["control"] = [table["control"][0] | {"name": name} for name in names]
+    table["transition"]["probability"] = dict.fromkeys(names, 0.1)
+    table["rewards"]["control"] = dict.fromkeys(names, 0.0)
+    table["mission"]["first_control"] = names[0]
+    table["planner"]["safest"] = None
+    found = why_transitions_are_kept(parse_scenario(table, "five"))
+    assert "they have 5 probabilities to worsen, and 4 are learnt together" in found
+
+
+class Notes(Progress):
+    """Keeps what a user is told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+
+def test_a_fleet_of_table_transitions_teaches_its_noise_and_says_so_before_it_flies(grown, tmp_path):
+    fleet, folder = grown
+    (group,) = fleet.groups
+    tables = replace(group, scenarios=tuple(map(as_tables, group.scenarios)))
+    progress = Notes()
+    fly_fleet(replace(fleet, groups=(tables,)), tmp_path / "fleet", progress=progress)
+    assert any("`fleet learn` leaves the transitions as assumed" in note for note in progress.notes)
+    learnt = learn_from_fleet(tmp_path / "fleet", tmp_path / "learnt.toml")["groups"][group.name]
+    usual = learn_from_fleet(folder, tmp_path / "usual.toml")["groups"][group.name]
+    assert learnt["probability"] == {}
+    assert learnt["noise_factor"]["mean"] == pytest.approx(usual["noise_factor"]["mean"], rel=1e-6)
+    resolved = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=tmp_path / "learnt.toml"))
+    assert resolved.transition.probability == {"2g": 0.05, "3g": 0.1}
 
 
 def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(grown, tmp_path):

@@ -234,6 +234,12 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
     heard, notes, told = list[dict[str, Any]](), list[str](), list[tuple[str, int, bool]]()
+
+    def silence(watch: Watch) -> float:
+        """Return seconds that pass with the decisions, and not with the clock of a machine that is busy."""
+        return 1.0 if watch.folder.name == "two" and len(told) > 5 else 0.0
+
+    monkeypatch.setattr(Watch, "silence", property(silence))
     client, turns, further = broker.client("client", heard), iter(range(1000)), list[int]()
     client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
 
@@ -330,6 +336,22 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     assert few == {"north/wing-1": long, "north/wing-2": long, "north/wing-9": none}
 
 
+def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_file, tmp_path):
+    log_of(tmp_path, 0).write_text("turn,colour\n0,red\n")
+    done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "north/wing-0 is not watched: " in done.stderr
+    assert "`colour` is no sensor" in done.stderr
+
+
+def test_a_fleet_with_an_asset_whose_messages_are_refused_ends_with_exit_code_1(fleet_file, tmp_path):
+    header = log_of(tmp_path, 0).read_text().splitlines()[0]
+    log_of(tmp_path, 0).write_text(f"{header}\n" + "what\n" * 4)
+    done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "north/wing-0: The watch ended while messages were refused: the last 4 of 4" in done.stderr
+
+
 def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, alone, tmp_path):
     for name, text in {
         "wing-0": "turn,colour\n0,red\n", "not a name!": "turn\n", "void": "", "wing-9": "turn,control\n"
@@ -348,7 +370,7 @@ def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, al
     given = (tmp_path / "out", 0, address.put, lambda: not ended.is_set())
     serving = Thread(target=serve_fleet, args=given)
     serving.start()
-    port = int(address.get(timeout=20).rstrip("/").rpartition(":")[2])
+    port = int(address.get(timeout=300).rstrip("/").rpartition(":")[2])
 
     try:
         status, page = served(port)

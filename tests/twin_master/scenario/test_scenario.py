@@ -330,3 +330,29 @@ def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario
     with pytest.raises(MissionInputError, match=words):
         fly(load_scenario(scenario), tmp_path / "run", given, report=False)
     assert not (tmp_path / "run").exists()
+
+
+def missing_in(table: dict[str, Any]) -> str:
+    """Return why a table is no scenario."""
+    with pytest.raises(ScenarioError) as caught:
+        parse_scenario(table, "mine.toml")
+    return str(caught.value)
+
+
+def test_several_missing_keys_are_named_at_once():
+    """Also a key with a unit in its name, and the kind of an asset."""
+    table = load_scenario("level_turns").scenario.to_dict()
+    del table["mission"]["name"], table["state"][0]["levels"], table["state"][0]["prior"], table["planner"]
+    table["asset"] = {}
+    found = missing_in(table)
+    for place in ("mission.name", "state[1].levels[_percent]", "state[1].prior", "planner", "asset.kind"):
+        assert f"'{place}'" in found
+    assert found.endswith("are missing.")
+
+
+def test_a_control_that_several_tables_lack_is_told_of_all():
+    table = load_scenario("level_turns").scenario.to_dict()
+    del table["rewards"]["control"]["2g"], table["transition"]["probability"]["2g"]
+    found = missing_in(table)
+    assert "`rewards.control` must have one entry for each control (2g, 3g), and has 3g" in found
+    assert "`transition.probability` must have one entry for each control (2g, 3g), and has 3g" in found

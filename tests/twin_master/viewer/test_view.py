@@ -191,13 +191,13 @@ def opened(folder: Path) -> Iterator[str]:
         [sys.executable, "-m", "uav_twin", "view", str(folder)], stdout=subprocess.PIPE, text=True
     )
     try:
-        assert select.select([process.stdout], [], [], 120.0)[0]
+        assert select.select([process.stdout], [], [], 300.0)[0]
         found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
         assert found
         yield found.group()
     finally:
         process.send_signal(signal.SIGINT)
-        assert process.wait(90.0) == 130
+        assert process.wait(300.0) == 130
         process.stdout.close()
 
 
@@ -288,6 +288,6 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_pat
         assert line, said
         said += line
     os.killpg(process.pid, signal.SIGINT)
-    assert process.wait(90.0) == 0, process.stderr.read()
+    assert process.wait(300.0) == 0, process.stderr.read()
     process.stderr.close()
     check_same(tmp_path / "run", run, "run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json")

@@ -9,12 +9,14 @@ from itertools import takewhile
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import ran
+from twin_master.errors import MissionInputError
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.message import Message, Refused
@@ -22,7 +24,7 @@ from twin_master.watch.message import Message, Refused
 pytestmark = pytest.mark.xdist_group("watches")
 
 HEADER = "turn,strain_1,strain_2\n"
-LOGROTATE = shutil.which("logrotate", path="/usr/sbin:" + os.environ["PATH"])
+LOGROTATE = shutil.which("logrotate")
 Rotation = Callable[[Path], None]
 
 
@@ -39,8 +41,7 @@ def logrotate(directive: str) -> Rotation:
     """Return what rotates a log by the real logrotate."""
 
     def rotate(path: Path) -> None:
-        if LOGROTATE is None:
-            pytest.skip("logrotate is not installed")
+        assert LOGROTATE is not None
         config, state = path.with_name("logrotate.conf"), path.with_name("logrotate.state")
         config.write_text(f"{path} {{\nrotate 9\nnomail\n{directive}\n}}\n")
         config.chmod(0o644)
@@ -69,14 +70,32 @@ def moved(path: Path) -> None:
     path.rename(path.parent / "old" / "log")
 
 
+def copied(path: Path) -> None:
+    """Copy a log and cut it, as logrotate does with `copytruncate`; its writer has it open."""
+    older = sorted(path.parent.glob("log.csv.*"), key=lambda file: -int(file.suffix[1:]))
+    for file in older:
+        file.rename(path.with_name(f"log.csv.{int(file.suffix[1:]) + 1}"))
+    shutil.copy(path, path.with_name("log.csv.1"))
+    os.truncate(path, 0)
+
+
 ROTATIONS: dict[str, Rotation] = {
     "create": logrotate("create"),
     "absent": logrotate("nocreate"),
     "copytruncate": logrotate("copytruncate"),
+    "copied": copied,
     "dated": dated,
     "python": renamed,
     "moved": moved,
 }
+BY_LOGROTATE = "create", "absent", "copytruncate"
+CUT = "copytruncate", "copied"
+
+
+def rotations(*names: str) -> list[Any]:
+    """Return ways to rotate a log as parameters of a test; those of logrotate are skipped without it."""
+    without = pytest.mark.skipif(LOGROTATE is None, reason="logrotate is not installed")
+    return [pytest.param(name, marks=without if name in BY_LOGROTATE else ()) for name in names]
 
 
 Feeding = Iterator[tuple[Message | Refused | None, str]]
@@ -104,9 +123,9 @@ def begun_log(base: Watch, tmp_path: Path) -> Begun:
 
 
 @pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "no header"])
-@pytest.mark.parametrize("rotation", ROTATIONS)
+@pytest.mark.parametrize("rotation", rotations(*ROTATIONS))
 def test_no_row_is_lost_in_a_rotation(begun_log, rotation, header):
-    rotate, cut = ROTATIONS[rotation], rotation == "copytruncate"
+    rotate, cut = ROTATIONS[rotation], rotation in CUT
     path, messages = begun_log(0, 1)
     append(path, row(2) + row(3)[:4])  # not read before it is rotated
     if cut:
@@ -126,7 +145,7 @@ def test_no_row_is_lost_in_a_rotation(begun_log, rotation, header):
         assert new(messages) == [turn, turn + 1]
 
 
-@pytest.mark.parametrize("way", ["logging", "copytruncate"])
+@pytest.mark.parametrize("way", ["logging", *rotations("copytruncate")])
 def test_a_writer_that_does_not_wait_for_its_reader(begun_log, way):
     (path, messages), turns = begun_log(), 4000
     handler = RotatingFileHandler(path, maxBytes=2000 if way == "logging" else 0, backupCount=1000)
@@ -193,17 +212,42 @@ def test_a_cut_without_a_copy_is_told(begun_log, turns, left):
     assert new(messages) == left
 
 
-@pytest.mark.parametrize("rotation", ["create", "copytruncate"])
-def test_a_watch_that_was_down_takes_up_a_rotated_log(watch, mission, plain, tmp_path, rotation):
+@pytest.mark.parametrize("has_header", [True, False], ids=["header", "no header"])
+@pytest.mark.parametrize("rotation", rotations("create", *CUT))
+def test_a_watch_that_was_down_takes_up_a_rotated_log(watch, mission, plain, tmp_path, rotation, has_header):
+    """Where a log is cut, its writer has it open, and writes no header again."""
     header, *rows = plain.read_text().splitlines(keepends=True)
     path = tmp_path / "log.csv"
     path.write_text(header)
     for turn, text in enumerate(rows):
         if turn in (15, 30, 33):
             ROTATIONS[rotation](path)
-            append(path, header)
+            append(path, header if has_header else "")
         append(path, text)
         if turn in (13, 17, 20, 29, 49):  # else it is down
             counts = ran(watch, CsvFeed(path, watch.scenario, follow=True), turn + 1 - turn % 4)
     assert (counts.received, counts.missing, counts.duplicates, counts.rejected) == (49, 0, 0, 0)
     assert [line["filtered"] for line in journal(watch.folder)] == mission.filtered[:49].tolist()
+
+
+@pytest.mark.parametrize("allows_unknown", [False, True])
+def test_a_row_in_the_place_of_the_header_is_no_header(base, tmp_path, allows_unknown):
+    """Also where names that are no sensor are passed over."""
+    scenario = base.scenario.having("watch", allow_unknown=allows_unknown)
+    path = tmp_path / "log.csv"
+    path.write_text(row(2))
+    with pytest.raises(MissionInputError, match=r"begins with `2,3e-5,1e-4`, .* found with --follow"):
+        CsvFeed(path, scenario)
+    with pytest.raises(MissionInputError, match="no rotated file beside it has that line"):
+        CsvFeed(path, scenario, follow=True)
+    path.with_name("log.csv.2").write_text(HEADER + row(0))
+    path.with_name("log.csv.1").write_text(row(1))
+    (message, *_) = new(CsvFeed(path, scenario, follow=True).messages(None))
+    assert message == 2
+
+
+def test_columns_of_which_none_is_known_are_refused_also_where_names_are_passed_over(base, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("strian_1,battery\n1e-4,3.3\n")
+    with pytest.raises(MissionInputError, match="`strian_1` and `battery` are no sensors"):
+        CsvFeed(path, base.scenario.having("watch", allow_unknown=True))
