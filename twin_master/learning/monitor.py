@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from reporting.arrays import Float
 from twin_master.errors import InvalidModelError, said
 from twin_master.learning import rivals
+from twin_master.learning.rivals import Shares
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion, Words
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -91,7 +92,7 @@ class WatchfulEstimator:
             parts = states, len(places), sensors * len(_GAINS), _LARGEST
             raise InvalidModelError(said("learning.faults", parts=parts))
         # A model that takes the place of another, as one that was taught, begins without suspicion.
-        digest = sha256(b"2" + np.ascontiguousarray(table).tobytes()).digest()
+        digest = sha256(b"3" + np.ascontiguousarray(table).tobytes()).digest()
         self._key = np.frombuffer(digest[:8], dtype=np.uint64)
         controls = range(sensor_model.control_count)
         self._value = [np.ascontiguousarray(table[:, :, u]) for u in controls]
@@ -133,18 +134,22 @@ class WatchfulEstimator:
         given = np.append(used, observation[len(used) :])
         estimate = self._inner.turn(before, given, control_index, turn)
         followed = before is not None and before.arrays.get(_PREFIX + "model_key") == self._key
-        own = self._advanced(before) if before is not None and followed else self._start(estimate.forecast)
-        self._assimilate(own, used, told, control_index)
+        if before is not None and followed:
+            own, shares = self._advanced(before, control_index)
+        else:
+            own, shares = self._start(estimate.forecast), self._first_shares(control_index)
+        self._assimilate(own, shares, used, told, control_index)
         notices = self._left_out(own["left_out"] > 0.0, absurd, seen, control_index, turn)
         # A gauge that is left out stays so while it is silent.
         own["left_out"] = (absurd | ((own["left_out"] > 0.0) & np.isnan(seen))).astype(np.float64)
-        suspicion = self._suspicion(own)
+        suspicion = self._suspicion(own, shares)
         notices += self._alarms(own, suspicion, turn)
-        believed = own["share"], estimate.filtered, own["mended"], own["gauge"]
+        believed = shares, estimate.filtered, own["mended"], own["gauge"]
         found = rivals.hypotheses(*believed, self._names)
         notices += self._leading(own, found, turn)
         own["belief"], own["rivals"], right = rivals.beliefs_of(*believed)
         own["right"] = np.array([right])
+        own |= {"share": shares.current, "hidden": shares.hidden, "shows": shares.shows}
         return replace(
             estimate,
             filtered=own["belief"],
@@ -177,7 +182,6 @@ class WatchfulEstimator:
             "gauge": np.broadcast_to(model, self._shape).astype(np.float32, order="C"),
             "none": model[None].astype(np.float32),
             "mended": model.copy(),
-            "share": rivals.at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
             "leading": np.zeros(1),
             "log_gauge": np.full((sensors, gains), weight - np.log(gains)),
             "log_none": np.full(1, weight),
@@ -194,9 +198,23 @@ class WatchfulEstimator:
             "left_out": np.zeros(sensors),
         }
 
-    def _advanced(self, before: Carried) -> Arrays:
-        """Return what was carried, one transition later, with the rivals that begin in this turn."""
+    def _first_shares(self, control_index: int) -> Shares:
+        """Return the shares of the hypotheses before the first observation of this model."""
+        begun = 2.0 * self._settings.prior * _FROM_THE_START
+        return Shares.at_first(begun, self._begins, control_index, len(self._value))
+
+    def _advanced(self, before: Carried, control_index: int) -> tuple[Arrays, Shares]:
+        """Return what was carried, one transition later, with the rivals that begin in this turn.
+
+        Parameters
+        ----------
+        before : Carried
+            Of the turn before.
+        control_index : int
+            Control in force in this turn.
+        """
         own = self._unpacked(before.arrays)
+        shares = Shares(own["share"], own["hidden"], own["shows"])
         for name in ("model", "gauge", "none", "mended"):
             rows = own[name].reshape(-1, self._shape[-1])
             held = rows.any(axis=1)
@@ -215,21 +233,44 @@ class WatchfulEstimator:
         statistics[:, 0] += fresh * (_FREE - statistics[:, 0])
         statistics[:, [1, 4]] += fresh * (own["model_squares"][:, None] - statistics[:, [1, 4]])
         statistics[:, 2:4] *= fading * kept[0]
-        self._switch(own, inflow, turn)
-        return own
+        self._switch(own, shares, inflow, turn, (before.control_index, control_index))
+        return own, shares
 
-    def _switch(self, own: Arrays, inflow: float, turn: float) -> None:
-        """Let faults begin and end; "mended" takes over beliefs and sums of squares of those that ended."""
+    def _switch(
+        self, own: Arrays, shares: Shares, inflow: float, turn: float, controls: tuple[int, int]
+    ) -> None:
+        """Let faults begin, end and be hidden.
+
+        "Mended" takes over beliefs and sums of squares of those that ended or are hidden now.
+
+        Parameters
+        ----------
+        own : dict of str to array
+            What is carried.
+        shares : Shares
+            Of the turn before; brought up to date.
+        inflow : float
+            Log prior share of the faults that begin in the turn.
+        turn : float
+            Turns since the start of this model.
+        controls : tuple of int
+            Control of the turn before, and of this turn.
+        """
         twice = 2.0 * self._settings.prior
         hazard = np.log(twice) + inflow - np.log1p(twice * (self._to_begin(turn - 1.0) - 1.0))
-        before = own["share"][rivals.MENDED]
-        own["share"], ended = rivals.one_turn_later(own["share"], hazard, self._begins)
-        fresh = max(0.0, -np.expm1(before + np.log1p(-rivals.ENDS) - own["share"][rivals.MENDED]))
-        weight = np.exp(ended)
+        gone = np.zeros_like(shares.hidden)
+        if controls[0] != controls[1]:
+            gone += shares.change_control(*controls)
+        gone += shares.advance(hazard, self._begins)
+        came = gone.sum()
+        if came == 0.0:
+            return
+        fresh = min(came * np.exp(-shares.log_mended_or_hidden), 1.0)
+        weight = gone / came
         of_gauge = weight[1:].reshape(self._shape[:2])
         belief = weight[1:].astype(np.float32) @ own["gauge"].reshape(len(weight) - 1, -1)
-        came = belief.reshape(self._shape[2:]) + weight[0] * own["none"][0]
-        own["mended"] += fresh * (came / came.sum() - own["mended"])
+        coming = belief.reshape(self._shape[2:]) + weight[0] * own["none"][0]
+        own["mended"] += fresh * (coming / coming.sum() - own["mended"])
         statistics, squares = own["none_statistics"], own["model_squares"].copy()
         squares += np.sum(of_gauge * (own["gauge_squares"] - squares[:, None]), axis=1)
         free = statistics[:, 0]
@@ -259,7 +300,7 @@ class WatchfulEstimator:
         """Return the prior share of faults that begin after a turn."""
         return (1.0 - _FROM_THE_START) / (1.0 + turn / self._settings.onset_turns)
 
-    def _assimilate(self, own: Arrays, seen: Float, told: Float, control_index: int) -> None:
+    def _assimilate(self, own: Arrays, shares: Shares, seen: Float, told: Float, control_index: int) -> None:
         """Correct all hypotheses by the sensors, and by what else is told of each state (S,)."""
         degrees, count = self._settings.noise_degrees, own["count"]
         # By the noise that is learnt: else a gauge that is off would pull the place, and with it all others.
@@ -290,23 +331,21 @@ class WatchfulEstimator:
             )
         own["log_gauge"] += log_gauges - log_model
         own["log_none"] += log_none - log_model
-        ratio = np.zeros_like(own["share"])
+        ratio = np.zeros_like(shares.current)
         ratio[rivals.MENDED], ratio[rivals.NONE] = log_mended - log_model, log_none - log_model
         ratio[rivals.GAUGES :] = (log_gauges - log_model).ravel()
-        own["share"] += ratio
-        own["share"] -= np.logaddexp.reduce(own["share"])
+        shares.weigh(ratio)
         count += ~np.isnan(seen)
         own["turns"] += 1.0
 
-    def _suspicion(self, own: Arrays) -> Suspicion:
+    def _suspicion(self, own: Arrays, shares: Shares) -> Suspicion:
         to_begin = np.log(self._to_begin(float(own["turns"][0]) - 1.0))
         begun = np.logaddexp.reduce(own["log_gauge"], axis=1)
         log_gauge = np.logaddexp(begun, to_begin)
         none = float(own["log_none"][0])
-        share = np.exp(own["share"])
         return Suspicion(
-            none_of_these=float(share[rivals.NONE]),
-            gauge_off=float(share[rivals.GAUGES :].sum()),
+            none_of_these=shares.none_of_these,
+            gauge_off=float(shares.of_gauges.sum()),
             log_evidence_none=float(np.logaddexp(none, to_begin)),
             log_evidence_any_gauge=float(np.logaddexp.reduce(log_gauge + self._log_prior)),
             log_evidence_gauge=log_gauge,

@@ -11,8 +11,15 @@ when a fault has ended: each turn one ends with a small probability, and its sha
 about the state to the hypothesis "mended", under which the sensors are right again. The shares of all are the
 posterior of this switching process, given the predictive density of each hypothesis; the belief of a fault
 stays that of its first beginning (compare Blom and Bar-Shalom 1988).
+
+A fault may show under one control and be hidden under another: a gauge that saturates in sharp turns reads
+right in gentle ones. Where it is hidden the sensors are right, so that it predicts what "mended" predicts:
+readings there speak neither for the one nor for the other, and a hidden fault neither ends nor fades. Each
+fault has for each control a probability that it shows there: one under the control in force when it begins,
+`SHOWS_ELSEWHERE` under the others, and from then on what the readings under that control say.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -185,86 +192,177 @@ def weigh_none(shown: Shown, model: OfModel, gain: float, belief: Single, statis
 
 
 MODEL, MENDED, NONE, GAUGES = 0, 1, 2, 3
-"""Places in the log shares; from the last on the sensors and their gains."""
+"""Places in the log shares; from the last on the sensors and their gains. Those of faults hold what shows."""
 ENDS = 0.02
-"""Probability that a fault ends in a turn, and that what is mended is as if nothing had been."""
+"""Probability that a fault that shows ends in a turn, and that what is mended is as if nothing had been."""
+SHOWS_ELSEWHERE = 0.5
+"""Prior probability that a fault shows under another control than that in force when it began."""
+LEAST_SHOWS = 1e-3
+"""It is never less probable that a fault shows under a control: one that grows is seen there in the end."""
 _TOLD = 0.01
 
 
-def at_first(begun: float, begins: Float) -> Float:
-    """Return the log shares (3 + G K,) before the first observation.
+@dataclass
+class Shares:
+    """Log shares of the hypotheses before or after an observation.
 
-    Parameters
+    Attributes
     ----------
-    begun : float
-        Prior probability of a fault from the start.
-    begins : (3 + G K,)
-        Log probability of each fault where one begins.
+    current : (3 + G K,)
+        Of the model, of "mended", and of the faults as far as they show under the control in force.
+    hidden : (1 + G K,)
+        Of the faults, none of these first, as far as they do not show under it.
+    shows : (1 + G K, U)
+        Probability that a fault shows under each control; that of the control in force stands in the shares.
     """
-    share: Float = np.log(begun) + begins
-    share[MODEL] = np.log1p(-begun)
-    return share
+
+    current: Float
+    hidden: Float
+    shows: Float
+
+    @classmethod
+    def at_first(cls, begun: float, begins: Float, control_index: int, controls: int) -> "Shares":
+        """Return the shares before the first observation.
+
+        Parameters
+        ----------
+        begun : float
+            Prior probability of a fault from the start.
+        begins : (3 + G K,)
+            Log probability of each fault where one begins.
+        control_index, controls : int
+            Control in force, and the number of controls.
+        """
+        current = np.log(begun) + begins
+        current[MODEL] = np.log1p(-begun)
+        faults = len(begins) - NONE
+        shows = np.full((faults, controls), SHOWS_ELSEWHERE)
+        shows[:, control_index] = 1.0
+        return cls(current, np.full(faults, -np.inf), shows)
+
+    def change_control(self, before: int, now: int) -> Float:
+        """Divide each fault into what shows under the control that comes into force and what is hidden.
+
+        Parameters
+        ----------
+        before, now : int
+            Control of the turn before, and of this turn.
+
+        Returns
+        -------
+        (1 + G K,)
+            Probability of each fault that was shown before and is hidden now.
+        """
+        showing, hidden_before = self.current[NONE:], np.exp(self.hidden)
+        fault = np.logaddexp(showing, self.hidden)
+        self.shows[:, before] = np.clip(np.exp(showing - fault), LEAST_SHOWS, 1.0)
+        self.current[NONE:] = fault + np.log(self.shows[:, now])
+        self.hidden = fault + np.log1p(-self.shows[:, now])
+        return np.maximum(np.exp(self.hidden) - hidden_before, 0.0)
+
+    def advance(self, log_hazard: float, begins: Float) -> Float:
+        """Let faults begin and end in a turn.
+
+        Parameters
+        ----------
+        log_hazard : float
+            Log probability that a fault begins in the turn.
+        begins : (3 + G K,)
+            Log probability of each fault where one begins.
+
+        Returns
+        -------
+        (1 + G K,)
+            Probability of each fault that it has ended in the turn.
+        """
+        share = self.current
+        ended = np.log(ENDS) + share
+        # Beliefs of single gauges are stale behind a fault that has ended or is hidden: what is wrong then is
+        # none of these.
+        log_another = log_hazard + begins[NONE]
+        right_now = np.logaddexp(share[MENDED], np.logaddexp.reduce(self.hidden))
+        begun = share[MODEL] + log_hazard + begins[NONE:]
+        begun[0] = np.logaddexp(begun[0], right_now + log_another)
+
+        stays = np.full_like(share, np.log1p(-ENDS))
+        stays[MODEL] = np.log1p(-np.exp(log_hazard))
+        stays[MENDED] = np.log1p(-ENDS - np.exp(log_another))
+        comes = np.append([ended[MENDED], np.logaddexp.reduce(ended[NONE:])], begun)
+        self.current = np.logaddexp(share + stays, comes)
+        self.hidden = self.hidden + np.log1p(-np.exp(log_another))
+
+        # A fault that began in this turn is not known under the other controls.
+        fresh = np.exp(begun - np.logaddexp(self.current[NONE:], self.hidden))
+        self.shows += fresh[:, None] * (SHOWS_ELSEWHERE - self.shows)
+        return np.exp(ended[NONE:])
+
+    def weigh(self, log_ratio: Float) -> None:
+        """Correct the shares by the log evidence of each hypothesis over that of the model (3 + G K,)."""
+        self.current = self.current + log_ratio
+        self.hidden = self.hidden + log_ratio[MENDED]
+        total = np.logaddexp(np.logaddexp.reduce(self.current), np.logaddexp.reduce(self.hidden))
+        self.current -= total
+        self.hidden -= total
+
+    @property
+    def log_mended_or_hidden(self) -> float:
+        """Log probability that there was a fault, and the sensors are right under the control in force."""
+        return float(np.logaddexp(self.current[MENDED], np.logaddexp.reduce(self.hidden)))
+
+    @property
+    def none_of_these(self) -> float:
+        """Probability that some gauges have gains of their own, whether it shows or not."""
+        return float(np.exp(np.logaddexp(self.current[NONE], self.hidden[0])))
+
+    @property
+    def of_gauges(self) -> Float:
+        """Probability of each single gauge and gain (G K,), whether it shows or not."""
+        return np.asarray(np.exp(np.logaddexp(self.current[GAUGES:], self.hidden[1:])))
 
 
-def one_turn_later(share: Float, log_hazard: float, begins: Float) -> tuple[Float, Float]:
-    """Return the log shares one turn later, and those that went from each fault to "mended" (1 + G K,).
-
-    Parameters
-    ----------
-    share : (3 + G K,)
-        Log shares.
-    log_hazard : float
-        Log probability that a fault begins in the turn.
-    begins : (3 + G K,)
-        Log probability of each fault where one begins.
-    """
-    ended = np.log(ENDS) + share
-    left = np.full_like(share, np.log1p(-ENDS))
-    left[MODEL] = np.log1p(-np.exp(log_hazard))
-    left[MENDED] = np.log1p(-ENDS - np.exp(log_hazard + begins[NONE]))
-    come = share[MODEL] + log_hazard + begins
-    come[MODEL], come[MENDED] = ended[MENDED], np.logaddexp.reduce(ended[NONE:])
-    # Beliefs of single gauges are stale behind a fault that has ended: what is wrong then is none of these.
-    come[NONE] = np.logaddexp(come[NONE], share[MENDED] + log_hazard + begins[NONE])
-    return np.logaddexp(share + left, come), ended[NONE:] - come[MENDED]
-
-
-def beliefs_of(share: Float, filtered: Float, mended: Float, gauge: Single) -> tuple[Float, Float, float]:
+def beliefs_of(shares: Shares, filtered: Float, mended: Float, gauge: Single) -> tuple[Float, Float, float]:
     """Return the belief (S,) wherever a state is believed, that of all but the model, and the model's weight.
 
     Parameters
     ----------
-    share : (3 + G K,)
-        Log shares.
+    shares : Shares
     filtered : (S,)
         Belief under the model.
     mended : (E, S)
+        The same of "mended", and of each gauge where its fault is hidden.
     gauge : (G, K, E, S)
+        The same of each gauge where its fault shows.
     """
-    weight = np.exp(share - np.logaddexp.reduce(np.delete(share, NONE)))
-    own = weight[GAUGES:].astype(np.float32) @ gauge.reshape(len(weight) - GAUGES, -1)
-    rivals = own.reshape(mended.shape).sum(axis=0) + weight[MENDED] * mended.sum(axis=0)
-    total = rivals.sum()
-    rivals = filtered if total == 0.0 else rivals / total
+    believing = np.append(np.delete(shares.current, NONE), shares.hidden[1:])
+    total = np.logaddexp.reduce(believing)
+    weight = np.exp(shares.current - total)
     right = float(weight[MODEL])
+    right_now = weight[MENDED] + np.exp(shares.hidden[1:] - total).sum()
+    of_gauges = weight[GAUGES:].astype(np.float32) @ gauge.reshape(len(weight) - GAUGES, -1)
+    rivals = of_gauges.reshape(mended.shape).sum(axis=0) + right_now * mended.sum(axis=0)
+    sum_of_rivals = rivals.sum()
+    rivals = filtered if sum_of_rivals == 0.0 else rivals / sum_of_rivals
     return right * filtered + (1.0 - right) * rivals, rivals, right
 
 
 def hypotheses(
-    share: Float, filtered: Float, mended: Float, gauge: Single, names: tuple[str, ...]
+    shares: Shares, filtered: Float, mended: Float, gauge: Single, names: tuple[str, ...]
 ) -> tuple[Hypothesis, ...]:
     """Return the model, each gauge that may well be off, and none of these, with what each believes.
 
     Parameters are those of `beliefs_of`; `names` are those of "gauge g is off".
     """
-    probability = np.exp(share - np.logaddexp.reduce(share))
-    of_gauge = probability[GAUGES:].reshape(gauge.shape[:2])
+    probability = np.exp(shares.current)
+    showing, hidden = (
+        of.reshape(gauge.shape[:2]) for of in (probability[GAUGES:], np.exp(shares.hidden[1:]))
+    )
+    either = (showing + hidden).sum(axis=1)
     right = probability[: MENDED + 1].sum()
     belief = filtered
     if probability[MENDED] > 0.0:
         belief = (probability[MODEL] * filtered + probability[MENDED] * mended.sum(axis=0)) / right
-    found = [Hypothesis("model", float(right), belief)]
-    for g in np.flatnonzero(of_gauge.sum(axis=1) >= _TOLD).tolist():
-        own = np.einsum("k,kes->s", of_gauge[g], gauge[g])
-        found.append(Hypothesis(names[g], float(of_gauge[g].sum()), own / own.sum()))
-    return (*found, Hypothesis("none of these", float(probability[NONE]), None))
+    result = [Hypothesis("model", float(right), belief)]
+    for g in np.flatnonzero(either >= _TOLD).tolist():
+        own = np.einsum("k,kes->s", showing[g], gauge[g]) + hidden[g].sum() * mended.sum(axis=0)
+        result.append(Hypothesis(names[g], float(either[g]), own / own.sum()))
+    return (*result, Hypothesis("none of these", shares.none_of_these, None))

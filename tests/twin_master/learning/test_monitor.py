@@ -15,7 +15,7 @@ from tests.twin_master.runs import changed_scenario, estimates_of
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.rivals import at_first, one_turn_later
+from twin_master.learning.rivals import Shares
 from twin_master.mission.journal import line_of, turn_record
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import Reading, Turn
@@ -98,21 +98,59 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
 
 def test_shares_of_hypotheses_switch_as_their_chain_says():
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
-    share = at_first(0.01, begins)
-    np.testing.assert_allclose(np.exp(share), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
+    shares = Shares.at_first(0.01, begins, 0, 1)
+    np.testing.assert_allclose(np.exp(shares.current), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
     hazard, ends, chain = 0.03, rivals.ENDS, np.zeros((7, 7))
     chain[0] = hazard * np.array([0.0, 0.0, 0.5, *[0.125] * 4])
     chain[0, 0] = 1.0 - hazard
     chain[1, [0, 2]], chain[1, 1] = (ends, 0.5 * hazard), 1.0 - ends - 0.5 * hazard
     chain[2:, 1], chain[range(2, 7), range(2, 7)] = ends, 1.0 - ends
-    expected = np.exp(share)
+    expected = np.exp(shares.current)
     for _ in range(40):
         went = ends * expected[2:]
         expected = expected @ chain
-        share, ended = one_turn_later(share, np.log(hazard), begins)
-        np.testing.assert_allclose(np.exp(share), expected, rtol=1e-3)
-        np.testing.assert_allclose(np.exp(ended), went / went.sum(), rtol=1e-3)
-    assert np.exp(share).sum() == pytest.approx(1.0, abs=1e-12)
+        ended = shares.advance(np.log(hazard), begins)
+        np.testing.assert_allclose(np.exp(shares.current), expected, rtol=1e-3)
+        np.testing.assert_allclose(ended / ended.sum(), went / went.sum(), rtol=1e-3)
+    assert np.exp(shares.current).sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def two_controls() -> tuple[Shares, Float]:
+    """Return shares under the second of two controls, where a fault is nearly sure, and where faults begin."""
+    begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
+    shares = Shares.at_first(0.5, begins, 1, 2)
+    shares.weigh(np.array([0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 0.0]))
+    return shares, begins
+
+
+def test_a_change_of_control_neither_makes_nor_mends_a_fault():
+    shares, _ = two_controls()
+    before = shares.none_of_these
+    shares.change_control(1, 0)
+    assert shares.none_of_these == pytest.approx(before, abs=1e-12)
+    assert np.exp(shares.hidden[0]) == pytest.approx(rivals.SHOWS_ELSEWHERE * before, abs=1e-12)
+
+
+def test_a_fault_does_not_fade_under_a_control_that_cannot_show_it():
+    shares, begins = two_controls()
+    shares.change_control(1, 0)
+    right_now = np.array([0.0, 0.0, -3.0, -3.0, -3.0, -3.0, -3.0])  # what shows predicts worse
+    for _ in range(200):
+        shares.advance(np.log(1e-4), begins)
+        shares.weigh(right_now)
+    assert shares.none_of_these > 0.9
+    shares.change_control(0, 1)
+    assert np.exp(shares.current[rivals.NONE]) > 0.9
+
+
+def test_a_fault_that_showed_under_a_control_is_mended_by_that_control():
+    shares, begins = two_controls()
+    shares.change_control(1, 0)
+    for log_ratio in (5.0, -5.0):  # it shows there for a while, then no more
+        for _ in range(20):
+            shares.advance(np.log(1e-4), begins)
+            shares.weigh(np.array([0.0, 0.0, log_ratio, 0.0, 0.0, 0.0, 0.0]))
+    assert shares.none_of_these < 0.01
 
 
 def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch):
@@ -332,3 +370,24 @@ def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_na
     turn = turns[-1]
     assert turn.suspicion.none_of_these > 0.5
     np.testing.assert_allclose(turn.decision_probability, [1.0])  # the policy decides where nothing is safest
+
+
+@pytest.fixture(scope="module")
+def level_turns() -> Knowledge:
+    wing = at_levels("paper_level_turns", between=False)
+    return replace(wing, scenario=wing.scenario.model_copy(update={"notice": Noticing()}))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_control_does_not_chatter_where_a_fault_shows_in_sharp_turns_alone(level_turns, seed):
+    """Half of the gauges show a third too little at 3g, and what they should at 2g; nothing is damaged."""
+    twin, random, control, controls = level_turns.twin(lag=1), np.random.default_rng(seed), 1, []
+    wrong = random.permutation(24) < 12
+    for _ in range(50):
+        gain = np.where(wrong, 0.67, 1.0) if control == 1 else 1.0
+        row = level_turns.sensor_model.mean[0, control] * gain + 150e-6 * random.normal(size=24)
+        found = twin.turn(row, control)
+        controls.append(control)
+        control = found.next_control
+    assert np.count_nonzero(np.diff(controls)) <= 3
+    assert found.suspicion.none_of_these > 0.5
