@@ -203,8 +203,10 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     campaign = simulated(choice.model, "ringdown", 4, hidden, tmp_path / "campaign")
     found = verdict_of(choice, campaign, chosen("stiffness_drift"), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
-    assert gives(found.verdict)
-    assert not gives(replace(found.verdict, hypotheses=found.verdict.hypotheses[1:]))  # the model as it is
+    assert gives(found.verdict, found.proof)
+    assert not gives(found.verdict, None)
+    larger = replace(found.proof.closed, value=-0.3)
+    assert not gives(found.verdict, replace(found.proof, closed=larger))
     applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
     assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
     stored = read_patch(applied.path)
