@@ -13,7 +13,8 @@ from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
-from discrepancy.verdict import Hypothesis, Proof, Verdict, VerdictKind
+from discrepancy.proof_record import Proof
+from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState
 from fmu_asset.errors import PatchFileError

@@ -20,6 +20,7 @@ from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError, said
+from discrepancy.fits.beginnings import refitted_from_beginnings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
@@ -43,19 +44,12 @@ from discrepancy.missing_force.windows import gap_windows, residual_windows, siz
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.proof_record import Proof
 from discrepancy.search.starts import Tell
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
-from discrepancy.verdict import (
-    Experiment,
-    GapWindow,
-    NotFitted,
-    Proof,
-    Verdict,
-    VerdictKind,
-    effect_label,
-)
+from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
 from reporting.words import be, brief, listing
@@ -275,7 +269,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     The model as it is need not fit: see `outliers.wrong_ends`.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    none = fit_to(problem, Candidate(), problem.start(Candidate()))
+    none = refitted_from_beginnings(problem, fit_to(problem, Candidate(), problem.start(Candidate())))
     fits = [(problem, none)]
     if problem.campaign.held_out:
         fits.append(held_out_fit(problem, none))

@@ -15,7 +15,8 @@ from discrepancy.document import PRIMITIVE_UNITS, Number, Origin, read_document,
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.verdict import CalibratedParameter, NamedEffect, Proof, Verdict, VerdictKind
+from discrepancy.proof_record import Proof
+from discrepancy.verdict import CalibratedParameter, NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
 from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA

@@ -13,7 +13,7 @@ import numpy as np
 from discrepancy.campaign.records import Channel, FloatArray
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
-from discrepancy.verdict import ClosedShare
+from discrepancy.proof_record import ClosedShare
 from reporting.words import counted
 
 BLOCKS_OF_TRIAL = 12

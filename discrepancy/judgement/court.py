@@ -23,11 +23,12 @@ from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate
 from discrepancy.fits.predictive import residual_set
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share, missing_force
+from discrepancy.proof_record import ClosedShare
 from discrepancy.search.honest_evidence import noise_levels, refitted
 from discrepancy.search.starts import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import ClosedShare, Gate
+from discrepancy.verdict import Gate
 
 from .closed_share import closed_text
 from .conclusion import Hypothetic

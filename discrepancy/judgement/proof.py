@@ -18,7 +18,8 @@ from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError
 from discrepancy.location.residuals import FittedTrial, ResidualSet, mean_square, of_channel
-from discrepancy.verdict import ClosedShare, Gate, Proof, Scores
+from discrepancy.proof_record import ClosedShare, Proof, Scores
+from discrepancy.verdict import Gate
 
 from .closed_share import closed_share, over_noise_of, rms_by_channel
 

@@ -18,8 +18,8 @@ from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce
+from discrepancy.proof_record import Scores
 from discrepancy.self_calibration import SelfCalibration
-from discrepancy.verdict import Scores
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
 from reporting import figures as style

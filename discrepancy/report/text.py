@@ -19,14 +19,13 @@ from discrepancy.judgement.closed_share import closed_text, share_text
 from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.models.interface import EITHER, MOVES, TURNS, Model
+from discrepancy.proof_record import Proof, Scores
 from discrepancy.verdict import (
     Estimate,
     ForceAtPort,
     ForceLeft,
     Hypothesis,
     NamedEffect,
-    Proof,
-    Scores,
     Verdict,
     VerdictKind,
 )
