@@ -78,8 +78,8 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
         "parameters": {},
     }
     if proof is not None and proof.held_out_after is not None:
-        row["held_out_chi_square_per_dof_after"] = _finite(proof.held_out_after.chi_square_per_dof)
-        row["gap_closed"] = _finite(proof.gap_closed)
+        row["held_out_chi_square_per_sample_after"] = _finite(proof.held_out_after.chi_square_per_sample)
+        row["share_closed"] = None if proof.closed is None else _finite(proof.closed.value)
     if verdict.kind in NAMING:
         row["parameters"] = {
             effect.identifier: {item.name: [item.low, item.value, item.high] for item in effect.parameters}

@@ -35,7 +35,7 @@ def report(found: Investigation, table: Table, label: str) -> None:
     proof = found.proof
     scores = [] if proof is None else [item for item in (proof.held_out_before, proof.held_out_after) if item]
     rms = " to ".join(f"{1e3 * score.rms[SIGNAL]:.3f}" for score in scores if SIGNAL in score.rms)
-    chi = " to ".join(f"{score.chi_square_per_dof:.2f}" for score in scores)
+    chi = " to ".join(f"{score.chi_square_per_sample:.2f}" for score in scores)
     table.add_row(label, found.verdict.kind.value, found.verdict.sentence, rms, chi)
 
 

@@ -13,6 +13,7 @@ from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
+from discrepancy.proof_record import Proof
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState
@@ -122,10 +123,12 @@ def apply_verdict(
     return Applied(path, sentence, _again(stored.origin.command, path))
 
 
-def gives(verdict: Verdict) -> bool:
-    """Return whether a verdict gives something to apply."""
+def gives(verdict: Verdict, proof: Proof | None) -> bool:
+    """Return whether a verdict gives something to apply: never that with which the error grows."""
+    if proof is not None and proof.grew:
+        return False
     open_gap = verdict.kind is VerdictKind.UNEXPLAINED
-    return verdict.kind in files.PATCHED or (open_gap and _hypothesis(verdict, None) is not None)
+    return verdict.kind in files.PATCHED or (open_gap and _proved_hypothesis(verdict, proof) is not None)
 
 
 def _found(stored: files.StoredVerdict, file: Path, member: str | None) -> files.StoredPatch:
@@ -134,10 +137,18 @@ def _found(stored: files.StoredVerdict, file: Path, member: str | None) -> files
     if member is not None and (verdict.kind is not VerdictKind.GROUP or member not in verdict.group):
         known = ", ".join(map(repr, verdict.group)) if verdict.kind is VerdictKind.GROUP else "no group"
         raise DiscrepancyError(f"--member {member!r} is none of {file}, which has {known}: leave it out.")
+    if stored.proof is not None and stored.proof.grew:
+        raise DiscrepancyError(
+            f"{file} gives nothing to apply: its proof says that the error grows with what was found."
+        )
     beside = file.parent / files.PATCH_NAME
     if member is None and verdict.kind in files.PATCHED and beside.is_file():
         return files.read_patch(beside)
-    best = _hypothesis(verdict, member) if verdict.kind in files.APPLIED else None
+    best = None
+    if verdict.kind is VerdictKind.UNEXPLAINED:
+        best = _proved_hypothesis(verdict, stored.proof)
+    elif verdict.kind in files.APPLIED:
+        best = _hypothesis(verdict, member)
     if best is None:
         key = f"nothing_as_{verdict.kind.name.lower()}"
         why = said(f"applied.{key}" if key in SENTENCES.tables["applied"] else "applied.nothing_there")
@@ -153,13 +164,14 @@ def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
     wanted = tuple(effect.identifier for effect in verdict.effects)
     if verdict.kind is VerdictKind.GROUP:
         wanted = tuple((member or verdict.group[0]).split(" + "))
-    if verdict.kind is not VerdictKind.UNEXPLAINED:
-        return next((item for item in verdict.hypotheses if set(item.identifiers) == set(wanted)), None)
-    none = max((item.log_evidence for item in verdict.hypotheses if not item.effects), default=0.0)
-    better = [item for item in verdict.hypotheses if item.effects and item.log_evidence > none]
-    known = better if verdict.explained is None else verdict.hypotheses  # beside a remainder it may be less
-    told = [item for item in known if item.effects and set(item.identifiers) == set(verdict.resembles)]
-    return next(iter((*told, *better)), None)
+    return next((item for item in verdict.hypotheses if set(item.identifiers) == set(wanted)), None)
+
+
+def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | None:
+    """Return the best hypothesis for an unexplained gap: that of the proof, if the error is less with it."""
+    if proof is None or not proof.effects or proof.closed is None or proof.closed.value <= 0.0:
+        return None
+    return next((item for item in verdict.hypotheses if item.labels == proof.effects), None)
 
 
 def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:

@@ -6,7 +6,7 @@ The records themselves (`verdict`) say what a file holds; pydantic checks it aga
 
 import json
 import shlex
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from importlib import resources
 from math import inf, isfinite, isnan, nan
@@ -175,9 +175,29 @@ def write_document(path: Path, schema: str, record: object) -> Path:
 
 
 def read_document(
-    path: Path, schema: str, kind: type[_Record], older: Collection[str] = (), **absent: Any
+    path: Path,
+    schema: str,
+    kind: type[_Record],
+    older: Collection[str] = (),
+    upgrade: Callable[[dict[str, Any]], None] | None = None,
+    **absent: Any,
 ) -> _Record:
-    """Return the record of a document; `absent` is what one of an older schema may lack.
+    """Return the record of a document.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    schema : str
+        That of this version.
+    kind : type
+        Of the record.
+    older : collection of str
+        Schemas that are read too.
+    upgrade : callable, optional
+        Makes the content of an older file that of this version, in place.
+    **absent
+        What an older file may lack.
 
     Raises
     ------
@@ -193,6 +213,11 @@ def read_document(
         which = f"of the schema {came!r}" if came else "no file of this kind"
         raise VerdictFileError(f"{path} is {which}, but {schema!r} is needed.")
     content = {**({} if came == schema else absent), **content}
+    if upgrade is not None and came != schema:
+        try:
+            upgrade(content)
+        except (AttributeError, KeyError, TypeError) as cause:
+            raise VerdictFileError(f"{path} does not fit its schema {came!r}; write it again.") from cause
     origin = {item.name: content.pop(item.name) for item in fields(Origin) if item.name in content}
     before, after = f"{path} does not fit its schema: ", "; write it again."
     return _checked(kind, {**content, "origin": origin}, before, after)

@@ -1,4 +1,4 @@
-"""The verdict and what it rests on, as records."""
+"""The verdict and what it rests on, as records; its proof has a module of its own."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,6 +7,9 @@ from math import nan
 
 from discrepancy.document import Number, Patch
 from reporting.words import brief
+
+FREE_SHAPE = " (free shape)"
+"""What marks the identifier of an effect whose shape is free: its family."""
 
 
 class VerdictKind(StrEnum):
@@ -46,7 +49,8 @@ class GapWindow:
     first, last : float
         Times of the first and the last sample of the record [s].
     size : float
-        Root mean square of what it does to the readings over their noise, of the channel with the largest.
+        Root mean square residual in it over the noise, of the channel with the largest. Where no noise is
+        recorded, over what the model as it was leaves in fitted trials, before and with the effect.
     with_effect : bool
         Whether it is left by the best hypothesis; else by the model as it was.
     """
@@ -84,6 +88,11 @@ class NamedEffect:
     parameters: tuple[Estimate, ...]
     shape: tuple[Estimate, ...]
     patch: Patch
+
+
+def effect_label(identifier: str, place: str, *, free_shape: bool = False) -> str:
+    """Return an effect with its place, as in "coulomb_friction@slide", marked where its shape is free."""
+    return f"{identifier}{FREE_SHAPE if free_shape else ''}@{place}"
 
 
 @dataclass(frozen=True)
@@ -126,6 +135,15 @@ class Hypothesis:
         """Identifiers of the effects, sorted."""
         return tuple(sorted(effect.identifier for effect in self.effects))
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Its effects with their places, sorted, as `Proof.effects` has them."""
+        labels = [
+            effect_label(effect.identifier, effect.place, free_shape=bool(effect.shape))
+            for effect in self.effects
+        ]
+        return tuple(sorted(labels))
+
 
 @dataclass(frozen=True)
 class Gate:
@@ -151,91 +169,6 @@ class Gate:
 
 
 @dataclass(frozen=True)
-class Scores:
-    """Scores on a set of trials: by a model without or with the effect.
-
-    Attributes
-    ----------
-    rms : mapping of str to float
-        Root mean square residual by channel [channel's unit].
-    chi_square_per_dof : float
-        Against the noise record.
-    log_score : float
-        Mean predictive log density of a sample, standardised by its noise.
-    coverage_50, coverage_90 : float
-        Share of samples within the central predictive intervals.
-    whiteness : float
-        p-value of the Ljung-Box test, the least over dynamic channels (Holm); nan without dynamic trials.
-    sample_count : int
-        Used samples.
-    chi_square_deviation : float
-        Standard deviation of `chi_square_per_dof` if the model is right, from its degrees of freedom and
-        those of the noise records; nan without a noise record.
-    pit : tuple of float
-        Shares of the probability integral transforms in ten equal bins; 0.1 each if predictions are right.
-    pit_p_value : float
-        Of their uniformity, with the effective number of samples; nan with fewer than ten.
-    """
-
-    rms: Mapping[str, Number]
-    chi_square_per_dof: Number
-    log_score: Number
-    coverage_50: Number
-    coverage_90: Number
-    whiteness: Number
-    sample_count: int = 0
-    chi_square_deviation: Number = nan
-    pit: tuple[Number, ...] = ()
-    pit_p_value: Number = nan
-
-
-@dataclass(frozen=True)
-class Proof:
-    """What the effect does to data not used: before and after, on held-out and on fitted trials.
-
-    `gap_closed` = 1 - (χ²_after - 1) / (χ²_before - 1) per degree of freedom on held-out trials;
-    nan with the reason in `gap_reason` where there is no held-out trial or no gap to close.
-    `log_score_gain` per sample with its standard error, trials taken as units.
-    """
-
-    held_out_before: Scores | None
-    held_out_after: Scores | None
-    fitted_before: Scores
-    fitted_after: Scores
-    gap_closed: Number
-    log_score_gain: Number
-    log_score_gain_error: Number
-    remaining: str = ""
-    gap_reason: str = ""
-
-
-@dataclass(frozen=True)
-class ExplainedShare:
-    """What the best hypothesis explains of the gap: mean squares over channels in units of their noise.
-
-    Attributes
-    ----------
-    value, low, high : float
-        1 - (rms after^2 - noise^2) / (rms before^2 - noise^2), 90 % interval by a bootstrap of blocks.
-    left : float
-        Root of rms after^2 - noise^2, over the noise.
-    effect, remainder, noise : float
-        Shares of rms before^2: what the effects take off, what is left beside the noise, the noise.
-    trials : str
-        "held-out", or "fitted" where none was held out.
-    """
-
-    value: Number
-    low: Number
-    high: Number
-    left: Number
-    effect: Number
-    remainder: Number
-    noise: Number
-    trials: str
-
-
-@dataclass(frozen=True)
 class RemainderEstimate:
     """The remainder of a channel in the best hypothesis.
 
@@ -258,30 +191,21 @@ class RemainderEstimate:
 
 
 @dataclass(frozen=True)
-class ShareOfForce:
-    """What share of a missing force a law is, in trials that were fitted or in those held out.
+class ForceLeft:
+    """What a law leaves of a missing force, in trials that were fitted or in those held out.
 
     Attributes
     ----------
-    value, low, high : float
-        1 - mean square of what is left over that of the force without any effect, noise taken from both;
-        90 % interval by a bootstrap of blocks.
     left, whole : float
-        Root mean squares of what is left and of the force without any effect, in the force's unit.
-    ahead : bool
-        Whether it is one of what the force does to predictions over a twelfth of a record, not of the force.
+        Root mean squares of the force beside the law and of the force without any effect, in its unit.
     trials : int
         How many.
     tested : bool
         Whether the law has a force there that could be seen.
     """
 
-    value: Number
-    low: Number
-    high: Number
     left: Number
     whole: Number
-    ahead: bool
     trials: int
     tested: bool
 
@@ -323,8 +247,8 @@ class ForceAtPort:
         Those that order it, as well as the best one does; empty where none does.
     law : str
         What was drawn through it, with their places where laws act at several ports; empty: nothing.
-    fitted, held_out : ShareOfForce or None
-        What share of the force the law is, of those at all ports where laws act at several.
+    fitted, held_out : ForceLeft or None
+        What the law leaves of the force, of those at all ports where laws act at several.
     """
 
     port: str
@@ -338,8 +262,48 @@ class ForceAtPort:
     orders: Mapping[str, Number]
     ordered_by: tuple[str, ...]
     law: str = ""
-    fitted: ShareOfForce | None = None
-    held_out: ShareOfForce | None = None
+    fitted: ForceLeft | None = None
+    held_out: ForceLeft | None = None
+
+
+@dataclass(frozen=True)
+class UnfittedRecord:
+    """A record that the model is not fitted to: the fit leaves more than the signal's own variance.
+
+    `left` is the rms residual, `varies` the standard deviation of the readings about their mean [channel's
+    unit].
+    """
+
+    trial: str
+    channel: str
+    left: Number
+    varies: Number
+
+
+@dataclass(frozen=True)
+class MovedUnknown:
+    """A parameter, gain or zero that the model without any effect moves far from what is stated of it.
+
+    Attributes
+    ----------
+    name : str
+        Of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT in TRIAL".
+    stated, deviation : float
+        What is stated of it, and its standard deviation [`unit`].
+    value : float
+        What the fit without any effect makes of it.
+    deviations : float
+        By how many standard deviations it is moved.
+    unit : str
+        SI; gains are errors of the gain [1].
+    """
+
+    name: str
+    stated: Number
+    deviation: Number
+    value: Number
+    deviations: Number
+    unit: str
 
 
 @dataclass(frozen=True)
@@ -395,8 +359,6 @@ class Verdict:
         Limits and data errors, one sentence each.
     resembles : tuple of str
         What an unexplained rest looks like; never a name.
-    explained : ExplainedShare or None
-        Of the gap, by the best hypothesis, where none leaves noise alone.
     remainders : tuple of RemainderEstimate
         Of the best hypothesis.
     not_fitted : tuple of NotFitted
@@ -408,6 +370,11 @@ class Verdict:
         Of the model, in the hypothesis that stands for the verdict.
     force : ForceAtPort or None
         That is missing; None where none is, or none can be seen.
+    unfitted : tuple of UnfittedRecord
+        Records that the hypothesis of the verdict leaves more of than their own variance: it is not fitted.
+    moved : tuple of MovedUnknown
+        Parameters, gains and zeros that the model without any effect moves by more than two of their stated
+        deviations, the farthest first.
     """
 
     kind: VerdictKind
@@ -423,12 +390,13 @@ class Verdict:
     next_experiments: tuple[Experiment, ...] = ()
     remarks: tuple[str, ...] = ()
     resembles: tuple[str, ...] = ()
-    explained: ExplainedShare | None = None
     remainders: tuple[RemainderEstimate, ...] = ()
     not_fitted: tuple[NotFitted, ...] = ()
     windows: tuple[GapWindow, ...] = ()
     parameters: tuple[CalibratedParameter, ...] = ()
     force: ForceAtPort | None = None
+    unfitted: tuple[UnfittedRecord, ...] = ()
+    moved: tuple[MovedUnknown, ...] = ()
 
     def __repr__(self) -> str:
         effects = [effect.identifier for effect in self.effects]

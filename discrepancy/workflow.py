@@ -20,6 +20,7 @@ from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError, said
+from discrepancy.fits.beginnings import refitted_from_beginnings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
@@ -39,15 +40,16 @@ from discrepancy.judgement.proof import prove
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce, seen_force
-from discrepancy.missing_force.windows import gap_windows, residual_windows
+from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.proof_record import Proof
 from discrepancy.search.starts import Tell
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
-from discrepancy.verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
+from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
 from reporting.words import be, brief, listing
@@ -80,7 +82,7 @@ class Investigation:
     proof : Proof or None
         Where an effect was named, or is the most probable one.
     before, after : ResidualSet or None
-        Residuals without and with it; None where faults of the data stopped the work.
+        Residuals without and with it, over the same noise; None where faults of the data stopped the work.
     problem, search, fit : Problem, Search, CandidateFit or None
         What the naming side worked with; `fit` stands for the verdict.
     seconds : dict of str to float
@@ -182,14 +184,15 @@ def investigate(
             windows = gap_windows(problem, fit, before, seed=seed)
             if after is not before:
                 windows += residual_windows(after, seed=seed, with_effect=True)
+            windows = sized_windows(windows, before, after)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
-    if thorough and verdict.kind not in NO_GAP:
+    if thorough and verdict.kind not in NO_GAP and not verdict.unfitted:
         with stage("Seeing the missing force", "force"):
             missing = seen_force(problem, search.force, search.forces, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
-            proof = prove(before, after, seed=seed)
+            proof = prove(before, after, effects=added_effects(fit), seed=seed)
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):
@@ -203,6 +206,13 @@ def investigate(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds,
         missing,
     )  # fmt: skip
+
+
+def added_effects(fit: CandidateFit) -> tuple[str, ...]:
+    """Return the effects of a fit with their places, sorted, as `Hypothesis.labels` has them."""
+    terms = fit.candidate.terms
+    labels = [effect_label(term.effect.identifier, term.place, free_shape=term.free_shape) for term in terms]
+    return tuple(sorted(labels))
 
 
 def _remarks(
@@ -259,7 +269,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     The model as it is need not fit: see `outliers.wrong_ends`.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    none = fit_to(problem, Candidate(), problem.start(Candidate()))
+    none = refitted_from_beginnings(problem, fit_to(problem, Candidate(), problem.start(Candidate())))
     fits = [(problem, none)]
     if problem.campaign.held_out:
         fits.append(held_out_fit(problem, none))

@@ -103,7 +103,7 @@ def _conclude(content: "parts.ReportInput", folder: Path, report: Path | None, *
         terminal.say(f"Verdict: {folder}" if report is None else f"Report: {report}")
     if fault:
         raise typer.Exit(1)
-    if not json and parts.gives(found.verdict):
+    if not json and parts.gives(found.verdict, found.proof):
         terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 

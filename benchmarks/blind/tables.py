@@ -129,11 +129,11 @@ def _proof(cases: Sequence[Scored]) -> list[str]:
                 [
                     title,
                     len(named),
-                    _median(c.verdict.get("held_out_chi_square_per_dof_after") for c in named),
-                    _median(c.verdict.get("gap_closed") for c in named),
+                    _median(c.verdict.get("held_out_chi_square_per_sample_after") for c in named),
+                    _median(c.verdict.get("share_closed") for c in named),
                     seconds,
                 ]
             )
     lines = ["## Proof on held-out trials where the name is right: median (5 to 95 %)", ""]
-    header = ["cases", "named right", "χ²/dof after", "gap closed", "seconds a case"]
+    header = ["cases", "named right", "χ² per sample after", "share of the error closed", "seconds a case"]
     return lines + _table(header, rows)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema
@@ -15,18 +15,25 @@ from discrepancy.document import PRIMITIVE_UNITS, Number, Origin, read_document,
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.verdict import CalibratedParameter, NamedEffect, Proof, Verdict, VerdictKind
+from discrepancy.proof_record import Proof
+from discrepancy.verdict import CalibratedParameter, NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
 from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 from reporting.folders import restore_folder
 from reporting.words import brief
 
-VERDICT_SCHEMA = "uav-twin verdict 4"
+VERDICT_SCHEMA = "uav-twin verdict 5"
 """Value of the key `schema`; files of earlier numbers are read too."""
 VERDICT_NAME = "verdict.json"
-OLDER_SCHEMAS = ("uav-twin verdict 1", "uav-twin verdict 2", "uav-twin verdict 3")
-"""They lack keys of this one, which have defaults."""
+OLDER_SCHEMAS = tuple(f"uav-twin verdict {number}" for number in (1, 2, 3, 4))
+"""They lack keys of this one, which have defaults, and shares of another definition, which are left
+out."""
+OLD_SHARE = (
+    "The file is of an earlier version, whose share divided the error after by the doubt of the posterior "
+    "too; run its command again."
+)
+"""Why the proof of an older file has no share."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,27 @@ def read_verdict_file(path: Path) -> StoredVerdict:
     VerdictFileError
         If the file is missing, damaged, of another schema, or holds something else than it should.
     """
-    return read_document(path, VERDICT_SCHEMA, StoredVerdict, OLDER_SCHEMAS)
+    return read_document(path, VERDICT_SCHEMA, StoredVerdict, OLDER_SCHEMAS, _without_old_shares)
+
+
+def _without_old_shares(content: dict[str, Any]) -> None:
+    """Leave out of an older file what was told as a share or as chi-square by other definitions."""
+    verdict, proof = content["verdict"], content["proof"]
+    verdict.pop("explained", None)
+    force = verdict.get("force") or {}
+    for role in ("fitted", "held_out"):
+        for name in ("value", "low", "high", "ahead"):
+            (force.get(role) or {}).pop(name, None)
+    if proof is None:
+        return
+    for name in ("gap_closed", "gap_reason"):
+        proof.pop(name, None)
+    for name in ("held_out_before", "held_out_after", "fitted_before", "fitted_after"):
+        scores = proof[name]
+        if scores is not None:
+            scores.pop("chi_square_per_dof", None)
+            scores |= {"chi_square_per_sample": None, "chi_square_deviation": None}
+    proof |= {"closed": None, "closed_reason": OLD_SHARE}
 
 
 def read_verdict(folder: Path | str) -> VerdictFolder:

@@ -8,11 +8,10 @@ import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
+from discrepancy.verdict import FREE_SHAPE
 from fe.runtime.patch import ModelPatch
 
 Key = tuple[tuple[str, str], ...]
-FREE_SHAPE = " (free shape)"
-"""What marks the identifier of an effect whose shape is free: its family."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.beginnings import from_beginnings, refitted_from_beginnings
 from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
@@ -52,7 +53,10 @@ def held_out_fit(problem: Problem, found: CandidateFit) -> tuple[Problem, Candid
     """Return the trials that are held out, and a fit with their own nuisances; what is shared stays."""
     there = problem.with_trials(problem.campaign.held_out)
     start = replace(there.start(found.candidate), shared=found.point.shared, effect=found.point.effect)
-    return there, fit(there, found.candidate, start, local_only=True)
+    if all(trial.name in problem.beginnings for trial in problem.campaign.held_out):
+        start = from_beginnings(there, start)
+    adapted = fit(there, found.candidate, start, local_only=True)
+    return there, refitted_from_beginnings(there, adapted, local_only=True)
 
 
 def _predicted(

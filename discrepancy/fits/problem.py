@@ -56,6 +56,11 @@ class Problem:
     setting : Setting
         Scales for the catalogue.
 
+    Attributes
+    ----------
+    beginnings : dict of str to (L,) ndarray
+        Own unknowns of trials as their first readings show them, by name, where they were looked for.
+
     Raises
     ------
     CampaignDataError
@@ -74,6 +79,7 @@ class Problem:
         }
         self.freedom = np.array([item.degrees_of_freedom for item in self.noise.values()])
         self.refusals: dict[str, str] = {}
+        self.beginnings: dict[str, FloatArray] = {}
         self._take(campaign.fitted)
         self.shared = global_unknowns(campaign, model, campaign.fitted, {})
         self.shared = global_unknowns(campaign, model, campaign.fitted, self._unit_responses())
@@ -304,6 +310,20 @@ class Problem:
             other.model = model.remembering()
         other._take(trials)
         return other
+
+    def first_samples(self, count: int) -> "Problem":
+        """Return the problem of the first samples of the trials in motion."""
+        shorter = copy(self)
+        shorter.trials = tuple(
+            replace(data, weight=data.weight * (np.arange(len(data.weight)) < count)[:, None])
+            if data.trial.is_dynamic
+            else data
+            for data in self.trials
+        )
+        shorter.counts = np.zeros_like(self.counts)
+        for data in shorter.trials:
+            np.add.at(shorter.counts, data.groups, data.weight.sum(axis=0))
+        return shorter
 
     def widened(self, factors: FloatArray) -> "Problem":
         """Return the problem with noise so many times (channels,) as wide in trials in motion, and known.

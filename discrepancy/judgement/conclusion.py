@@ -14,7 +14,6 @@ import numpy as np
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import NINETY, Effect, EffectParameter, Setting, ShapeParameter
 from discrepancy.errors import said
-from discrepancy.fits.candidate import FREE_SHAPE
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
@@ -22,6 +21,7 @@ from discrepancy.missing_force.naming import Explained
 from discrepancy.search.starts import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import (
+    FREE_SHAPE,
     CalibratedParameter,
     Estimate,
     GapWindow,

@@ -23,15 +23,17 @@ from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate
 from discrepancy.fits.predictive import residual_set
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share, missing_force
+from discrepancy.proof_record import ClosedShare
 from discrepancy.search.honest_evidence import noise_levels, refitted
 from discrepancy.search.starts import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate
 
+from .closed_share import closed_text
 from .conclusion import Hypothetic
 from .consistency_gate import consistency_gate
-from .proof import held_out_gate
+from .proof import held_out_gate, told_share
 
 COUNTER = -0.1
 """Share below which trials in which a law has hardly any force speak against it all the same."""
@@ -55,6 +57,10 @@ class Court:
         Fitted and held-out trials of a hypothesis beside their predictions, made once.
     share : callable
         What `share_of` returns, made once.
+    simulated : callable
+        What `fitted` returns, made once.
+    standing : Hypothetic or None
+        The hypothesis that the verdict is about, once there is one.
     """
 
     least_end = SEARCH.least_share
@@ -64,6 +70,9 @@ class Court:
         self.has_held_out = bool(self.problem.campaign.held_out)
         self.residuals = cache(partial(residual_set, self.problem, sensitivities=False))
         self.share = cache(self.share_of)
+        self.simulated = cache(self.fitted)
+        self.closed = cache(self.closed_by)
+        self.standing: Hypothetic | None = None
         self._followed: dict[Key, Any] = {}
         self._free: dict[Key, CandidateFit] = {}
 
@@ -163,8 +172,24 @@ class Court:
         return found
 
     def left(self, item: Any, share: Share) -> str:
-        """Return in words what is left beside a hypothesis."""
-        return said("verdict.left_of_readings" if share.left > 0.0 else "verdict.nothing_left", share=share)
+        """Return how much a hypothesis leaves, over how much there is without an effect."""
+        return f"{share.left:.3g} of {share.whole:.3g} noise deviations (rms beyond the noise)"
+
+    def closed_by(self, item: Any) -> tuple[ClosedShare | None, str]:
+        """Return the share of the mean square error that a hypothesis takes away, and it in words.
+
+        It is of simulations, without and with the hypothesis, whatever hypotheses are compared by.
+        """
+        before, after = self.residuals(self.found.none), self.residuals(self.simulated(item))
+        closed, reason = told_share(before, after)
+        if closed is None:
+            return None, f"{reason[0].lower()}{reason[1:-1]}"
+        return closed, closed_text(before, after, closed)
+
+    def grew(self, item: Any) -> bool:
+        """Whether the error is larger with a hypothesis than without it, or it cannot be simulated."""
+        closed, _ = self.closed(item)
+        return self.simulated(item) is self.found.none or (closed is not None and closed.grew)
 
     # ---------------------------------------------------------------- who may be named
 
@@ -181,9 +206,10 @@ class Court:
             return said("against.free_shape")
         inside = self.share(item, held_out=False)
         if _is_little(inside, self.least_end):
-            return said("against.where_fitted", part=part(inside))
+            return f"where it was fitted it leaves {self.left(item, inside)}"
         if self.has_held_out and not self._survives(item, self.least_end):
-            return said("against.not_fitted", part=part(self.share(item, held_out=True)))
+            outside = self.share(item, held_out=True)
+            return f"in trials that were not fitted it leaves {self.left(item, outside)}"
         count = self.problem.shared.count
         proper = self.problem.shared.precision > 0.0
         for what, own in (("calibrated parameters", slice(count)), ("gains", slice(count, None))):
@@ -291,17 +317,6 @@ def _freedom(item: Hypothetic) -> tuple[int, int]:
     return len(item.candidate.terms), sum(term.free_shape for term in item.candidate.terms)
 
 
-def percent(share: Share) -> str:
-    """Return a share with its interval."""
-    low, high = share.interval
-    return f"{100.0 * share.value:.3g} % ({100.0 * low:.3g} to {100.0 * high:.3g})"
-
-
-def part(share: Share) -> str:
-    """Return a share with its interval, and what it is one of."""
-    return f"{percent(share)} of {share.of}"
-
-
 class ByForce(Court):
     """Hypotheses along the missing force."""
 
@@ -353,8 +368,8 @@ class ByForce(Court):
         return replace(shown, covariance=item.covariance)
 
     def left(self, item: Any, share: Share) -> str:
-        """Return in words what is left beside a hypothesis."""
-        return said("verdict.left_of_force", share=share, unit=self._unit(item))
+        """Return how much of the missing force a hypothesis leaves, over how much there is without one."""
+        return f"{share.left:.3g} of {share.whole:.3g} {self._unit(item)} (rms) of the missing force"
 
     def _unit(self, item: Any) -> str:
         """Return the unit of the force at the port of a hypothesis."""

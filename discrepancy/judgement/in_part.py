@@ -16,13 +16,13 @@ from discrepancy.errors import said
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.shares import Share
 from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import ExplainedShare, RemainderEstimate, Verdict, VerdictKind
-from reporting.words import capital, counted, listing
+from discrepancy.verdict import RemainderEstimate, Verdict, VerdictKind
+from reporting.words import capital, listing
 
+from .closed_share import share_text, trials_text
 from .conclusion import (
     UNSTATED_GAIN,
     Conclusion,
@@ -37,7 +37,7 @@ from .conclusion import (
     probability_text,
 )
 from .consistency_gate import consistency_gate
-from .court import ByForce, Court, families, names, part, percent
+from .court import ByForce, Court, families, names
 from .proof import held_out_gate
 
 LEAST_SHOWN = 0.1
@@ -68,6 +68,22 @@ def judged_in_part(found: Search, first: Verdict) -> Outcome:
         return coloured
     court.add_families()
     return _verdict_of(court, first)
+
+
+def nearly_all_by_laws(found: Search, first: Verdict) -> Outcome | None:
+    """Return the verdict that names laws in part that are nearly all of the missing force; None: none are.
+
+    Parameters
+    ----------
+    found, first
+        As of `judged_in_part`; hypotheses along the missing force are there.
+    """
+    assert found.force is not None
+    court = ByForce(found, found.force)
+    outcome = _verdict_of(court, first)
+    if outcome.verdict.kind is not VerdictKind.NAMED_IN_PART or court.standing is None:
+        return None
+    return outcome if court.told(court.standing).value > SEARCH.nearly_all else None
 
 
 def without_sliver(found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
@@ -148,6 +164,8 @@ def _verdict_of(court: Court, first: Verdict) -> Outcome:
     if len(members) > SEARCH.largest_group:
         return _unexplained(court, first, best, said("against.rivals", rivals=len(members) - 1))
     probability = sum(court.probability(item) for item in members)
+    if court.grew(best):
+        return _unexplained(court, first, best)
     if len(members) > 1:
         return _group(court, members, probability)
     if probability < SEARCH.sure or best.log_evidence - court.nothing.log_evidence < SEARCH.bayes_factor:
@@ -161,22 +179,29 @@ def _in_part(court: Court, best: Hypothetic, probability: float) -> Outcome:
     family = ", ".join(sorted({t.effect.family for t in best.candidate.terms if t.free_shape}))
     named = effects_text(effect for effect in effects if not effect.shape)
     what = listing(filter(None, (named, said("verdict.family_in_part", family=family) if family else "")))
-    inside = court.has_held_out and not share.held_out
-    sentence = said(
-        "verdict.in_part", what=capital(what), certain=probability_text(probability), part=part(share),
-        where=_where(share), inside=said("verdict.hardly_any_force") if inside else "",
-        left=court.left(best, share), shape=_shape(court, best) + _not_proved(court, best),
-    )  # fmt: skip
+    _, explains = court.closed(best)
+    sentence = f"{capital(what)} is missing (probability {probability_text(probability)}): {explains}."
+    if court.has_held_out and not share.held_out:
+        sentence += " In the trials held out it has hardly any force."
+    sentence += f" It leaves {court.left(best, share)}, which is unexplained."
+    sentence += _shape(court, best) + _not_proved(court, best)
     more = {"effects": effects, "family": family, "gates": (court.gate(best),)}
     return _outcome(court, VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], **more)
 
 
 def _group(court: Court, members: Sequence[Hypothetic], probability: float) -> Outcome:
     """Return the verdict that one of several hypotheses is what is missing, what they share first."""
-    share, effects = court.told(members[0]), [named_effects(court.problem, item) for item in members]
+    effects = [named_effects(court.problem, item) for item in members]
     rows = zip(members, effects, strict=True)
-    words = [f"{effects_text(own)} ({percent(court.told(item))})" for item, own in rows]
-    sentence = said("verdict.this_share", members=listing(words, "or"), share=share, where=_where(share))
+    words = [f"{effects_text(own)}{_share_in_brackets(court, item)}" for item, own in rows]
+    sentence = f"Either {listing(words, 'or')} is missing; these data cannot tell which."
+    closed, reason = court.closed(members[0])
+    if closed is None:
+        sentence += f" {capital(reason)}."
+    else:
+        sentence += (
+            f" In brackets the share of the mean square error that each explains in {trials_text(closed)}."
+        )
     common = frozenset.intersection(*map(names, members))
     both = [effect for effect in effects[0] if (effect.identifier, effect.place) in common]
     if both:
@@ -189,6 +214,12 @@ def _group(court: Court, members: Sequence[Hypothetic], probability: float) -> O
     return _outcome(court, VerdictKind.GROUP, sentence, min(probability, 1.0), members[0], members, **more)
 
 
+def _share_in_brackets(court: Court, item: Hypothetic) -> str:
+    """Return the share of the mean square error that a member of a group takes away; empty: none is told."""
+    closed, _ = court.closed(item)
+    return "" if closed is None else f" ({share_text(closed)})"
+
+
 def _unexplained(court: Court, first: Verdict, close: Hypothetic | None = None, why: str = "") -> Outcome:
     """Return the verdict that a force is missing which has no name: how large, and what orders it.
 
@@ -199,18 +230,32 @@ def _unexplained(court: Court, first: Verdict, close: Hypothetic | None = None, 
     effective = [item for item in court.ranked if item.candidate.terms]
     shown = close or max(effective, key=lambda item: court.told(item).value, default=None)
     if shown is None or court.told(shown).value < LEAST_SHOWN:
-        shown, sentence = None, said("verdict.no_tenth", gap=gap)
+        shown, sentence = None, f"{gap} No effect of the catalogue follows it."
+    elif court.grew(shown):
+        sentence = f"{gap} {_worse(court, shown)}"
+        shown = None
     else:
-        share, why = court.told(shown), why or court.against(shown)
+        why = why or court.against(shown)
         if close is not None and not why:
             why = said("against.probability", probability=court.probability(close), sure=SEARCH.sure)
-        told = {"what": effects_text(named_effects(court.problem, shown)), "where": _where(share)}
         why = f"; it is no name, as {why}" if why else ""
-        sentence = said("verdict.best_is", gap=gap, part=part(share), why=why, **told)
+        what, (_, explains) = effects_text(named_effects(court.problem, shown)), court.closed(shown)
+        sentence = f"{gap} The best hypothesis is {what}: {explains}{why}."
     more = {
         "resembles": () if shown is None else plain_names(shown.candidate.identifiers), "gates": first.gates,
     }  # fmt: skip
     return _outcome(court, VerdictKind.UNEXPLAINED, sentence, first.probability, shown, [], **more)
+
+
+def _worse(court: Court, item: Hypothetic) -> str:
+    """Return the sentence on a hypothesis that makes the error larger, and is no name for that reason."""
+    what = effects_text(named_effects(court.problem, item))
+    if court.simulated(item) is court.found.none:
+        return f"The nearest in the catalogue is {what}, but it cannot be simulated: nothing is named."
+    _, words = court.closed(item)
+    return (
+        f"The nearest in the catalogue is {what}, but {words}: nothing is named, and nothing to be applied."
+    )
 
 
 def _outcome(
@@ -223,9 +268,9 @@ def _outcome(
     weights = np.exp(scores - logsumexp(scores)).tolist()
     rows = [*zip(ranked, weights, strict=True)]
     rows = rows[: len(first)] + sorted(rows[len(first) :], key=lambda row: -row[1])
-    fit = court.found.none if stands is None else court.fitted(stands)
+    fit = court.found.none if stands is None else court.simulated(stands)
+    court.standing = stands
     gain = (stands or ranked[0]).log_evidence - court.nothing.log_evidence
-    more["explained"] = None if stands is None else explained_share(court.told(stands))
     more["remainders"] = remainder_estimates(court.problem, fit)
     return Conclusion(court.found, gain, rows).outcome(kind, sentence, probability, fit, **more)
 
@@ -256,24 +301,6 @@ def _not_proved(court: Court, best: Hypothetic) -> str:
     effects = named_effects(court.problem, close)
     added = effects_text(effect for effect in effects if (effect.family, effect.place) not in own)
     return said("verdict.not_proved", what=capital(added))
-
-
-def explained_share(share: Share) -> ExplainedShare:
-    """Return the record of a share of the missing force."""
-    before, after, noise = (float(column.sum()) for column in (share.before, share.after, share.noise))
-    of_noise = min(noise / before, 1.0)
-    remainder = min(max(after - noise, 0.0) / before, 1.0 - of_noise)
-    return ExplainedShare(
-        share.value, *share.interval, float(np.sqrt(max(after - noise, 0.0) / max(noise, 1e-300))),
-        1.0 - of_noise - remainder, remainder, of_noise, "held-out" if share.held_out else "fitted",
-    )  # fmt: skip
-
-
-def _where(share: Share) -> str:
-    trials = counted(share.trials, "trial") if share.trials > 1 else "one trial"
-    return (
-        f"in {trials} that {'were' if share.trials > 1 else 'was'} {'not ' if share.held_out else ''}fitted"
-    )
 
 
 def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[RemainderEstimate, ...]:

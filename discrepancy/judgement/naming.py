@@ -32,8 +32,10 @@ from .conclusion import (
     plain_names,
 )
 from .consistency_gate import consistency_gate
-from .in_part import judged_in_part, without_sliver
+from .in_part import judged_in_part, nearly_all_by_laws, without_sliver
+from .moved_unknowns import moved_sentence, moved_unknowns
 from .proof import held_out_gate
+from .verdict_checks import checked_verdict
 
 Names = tuple[str, ...]
 
@@ -285,6 +287,14 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
         stands for the verdict: of the named set, of the family, of the most probable member of a group or of
         what is too small to tell; else the one without effect.
     """
+    verdict, found, fit = checked_verdict(_searched(problem, effects, tell))
+    moved = moved_unknowns(problem, found.none)
+    sentence = f"{verdict.sentence} {moved_sentence(moved)}".strip()
+    return Outcome(replace(verdict, sentence=sentence, moved=moved), found, fit)
+
+
+def _searched(problem: Problem, effects: Sequence[Effect], tell: Tell) -> Outcome:
+    """Return the verdict on a search along the missing force, or else on whole simulations."""
     found = search(problem, effects, tell)
     first = _named(found)
     if not found.forces or first.verdict.kind is not VerdictKind.UNEXPLAINED:
@@ -343,9 +353,7 @@ def _without_readings(found: Search, verdict: Verdict, fit: CandidateFit) -> Out
     acts = _acts(found.problem, fit)
     if not found.forces or all(acts) or not any(acts):
         return None
-    other = judged_in_part(found, verdict)
-    in_part, share = other.verdict.kind is VerdictKind.NAMED_IN_PART, other.verdict.explained
-    return other if in_part and share is not None and share.value > SEARCH.nearly_all else None
+    return nearly_all_by_laws(found, verdict)
 
 
 def _overruled(found: Search, verdict: Verdict) -> Verdict | None:

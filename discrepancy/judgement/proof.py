@@ -1,29 +1,37 @@
 """Proof: what an effect does to the trials, before and after, at the same scale.
 
+Errors and chi-square are of the residuals over the noise alone. What a posterior leaves open is in what is
+expected of chi-square, and in the probabilistic scores, never in what is told of the error.
+
 Scores follow Gneiting and Raftery 2007 (J. Am. Stat. Assoc. 102, 359-378); predictions are Gaussian with the
 predictive deviations handed over by the fit.
 """
 
 from collections.abc import Sequence
-from math import nan, sqrt
+from dataclasses import dataclass, replace
+from math import isfinite, nan, sqrt
 
 import numpy as np
 from scipy import stats
 
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
-from discrepancy.errors import FitError, said
+from discrepancy.errors import FitError
 from discrepancy.location.residuals import FittedTrial, ResidualSet, mean_square, of_channel
-from discrepancy.verdict import Gate, Proof, Scores
+from discrepancy.proof_record import ClosedShare, Proof, Scores
+from discrepancy.verdict import Gate
+
+from .closed_share import closed_share, over_noise_of, rms_by_channel
 
 PIT_BINS = 10
 """Bins of the histogram of probability integral transforms."""
 
 SMALLEST_GAP = 2.0
-"""A gap to close is at least this many standard deviations of χ²/dof above one."""
+"""A gap to close is at least this many standard deviations of χ² per sample above what is expected."""
 
 HELD_OUT_DEVIATIONS = 3.0
-"""Deviations of χ²/dof on held-out trials above one from which on a name does not survive them."""
+"""Deviations of χ² per sample on held-out trials above what is expected from which on a name does not survive
+them."""
 COVERAGE = (0.80, 0.97)
 """Share of held-out samples that 90 % intervals must hold."""
 LEAST_COVERED = 200
@@ -57,20 +65,21 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     density = np.concatenate(
         [log_density(item)[use] for item, use in zip(residuals.trials, used, strict=True)]
     )
-    square, deviation = chi_square_per_dof(residuals)
+    chi_square = chi_square_of(residuals)
     white = residuals.white(np.random.default_rng(seed))
     channels = [ljung_box(series)[1] for _, _, series in residuals.series(white)]
     uniform = stats.norm.cdf(z)
     counts = np.histogram(uniform, bins=PIT_BINS, range=(0.0, 1.0))[0]
     return Scores(
-        rms=_rms(residuals),
-        chi_square_per_dof=square,
+        rms=rms_by_channel(residuals),
+        chi_square_per_sample=chi_square.per_sample,
         log_score=float(density.mean()),
         coverage_50=float(np.mean(np.abs(z) <= stats.norm.ppf(0.75))),
         coverage_90=float(np.mean(np.abs(z) <= stats.norm.ppf(0.95))),
         whiteness=min(1.0, len(channels) * min(channels)) if channels else nan,
         sample_count=int(z.size),
-        chi_square_deviation=deviation,
+        chi_square_expected=chi_square.expected,
+        chi_square_deviation=chi_square.deviation,
         pit=tuple(float(value) for value in counts / z.size),
         pit_p_value=_uniformity(transforms, used, counts),
     )
@@ -87,30 +96,47 @@ def log_density(item: FittedTrial) -> FloatArray:
     return np.asarray(-0.5 * np.log(2.0 * np.pi) - np.log(spread) - 0.5 * z**2)
 
 
-def chi_square_per_dof(residuals: ResidualSet) -> tuple[float, float]:
-    """Return χ²/dof against the noise records, and its standard deviation if the model is right.
+@dataclass(frozen=True)
+class ChiSquare:
+    """Mean square residual over the noise, and its mean and standard deviation if the model is right."""
 
-    Channels without a noise record do not count; nan if none has one. Degrees of freedom are the expected
-    sum of squares: samples less what the fit absorbs, or plus what its uncertainty adds to held-out trials.
+    per_sample: float
+    expected: float
+    deviation: float
+
+    @property
+    def beyond(self) -> float:
+        """By how many of its deviations it is above what is expected; nan without a noise record."""
+        return (self.per_sample - self.expected) / self.deviation
+
+    @property
+    def beyond_noise(self) -> float:
+        """The same above noise alone, whatever the posterior leaves open."""
+        return (self.per_sample - 1.0) * self.expected / self.deviation
+
+
+def chi_square_of(residuals: ResidualSet) -> ChiSquare:
+    """Return χ² per sample of trials that are all fitted, or all held out, against the noise records.
+
+    Channels without a noise record do not count; nan if none has one. The sum of squares of a right model is
+    that of the noise, less what the fit absorbs, or plus what its uncertainty adds to held-out trials.
     """
     known = residuals.recorded
     if not known:
-        return nan, nan
-    square, freedom = mean_square(residuals, known)
+        return ChiSquare(nan, nan, nan)
+    _, freedom = mean_square(residuals, known)
     if freedom <= 0.0:
-        return nan, nan
+        return ChiSquare(nan, nan, nan)
+    squares, variances = [], []
+    for name in known:
+        for item, column, used in of_channel(residuals.trials, name):
+            squares.append(item.standardised[used, column] ** 2)
+            variances.append(item.expected_variance[used, column])
+    expected = float(np.concatenate(variances).mean())
     # Channels may share their record or not; the worst case, that all share the poorest one, is assumed.
-    noise = min(residuals.degrees_of_freedom(name) for name in known)
-    return square, sqrt(2.0 / freedom + 2.0 / noise)
-
-
-def _rms(residuals: ResidualSet) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for name in residuals.measured:
-        records = of_channel(residuals.trials, name)
-        squares = np.concatenate([item.residual[used, column] ** 2 for item, column, used in records])
-        found |= {name: sqrt(squares.mean())} if squares.size else {}
-    return found
+    noise_freedom = min(residuals.degrees_of_freedom(name) for name in known)
+    deviation = expected * sqrt(2.0 / freedom + 2.0 / noise_freedom)
+    return ChiSquare(float(np.concatenate(squares).mean()), expected, deviation)
 
 
 def correlation_time(series: FloatArray) -> float:
@@ -195,52 +221,76 @@ def held_out_gate(after: ResidualSet) -> Gate:
     Returns
     -------
     Gate
-        Failed where χ²/dof of the held-out trials lies more than `HELD_OUT_DEVIATIONS` of its deviations
-        above one, or the coverage of 90 % intervals is outside `COVERAGE`. `passed` is None without a
-        held-out trial or without a noise record.
+        Failed where χ² per sample of the held-out trials lies more than `HELD_OUT_DEVIATIONS` of its
+        deviations above what is expected, or the coverage of 90 % intervals is outside `COVERAGE`. `passed`
+        is None without a held-out trial or without a noise record.
     """
-    outside = after.held_out
-    if outside is None:
-        return _gate(None, nan, "no_trial")
-    found = scores(outside)
-    beyond = (found.chi_square_per_dof - 1.0) / found.chi_square_deviation
-    if not np.isfinite(beyond):
-        return _gate(None, nan, "no_noise_record")
+    if after.held_out is None:
+        return _held_out_outcome(None, nan, "No trial was held out.")
+    found = scores(after.held_out)
+    beyond = chi_square_of(after.held_out).beyond
+    if not isfinite(beyond):
+        return _held_out_outcome(None, nan, "No noise record to judge them by.")
     if beyond > HELD_OUT_DEVIATIONS:
-        return _gate(False, beyond, "misfit", found)
+        reason = f"On held-out trials χ² per sample is {chi_square_text(found)}."
+        return _held_out_outcome(False, beyond, reason)
     if found.sample_count >= LEAST_COVERED and not COVERAGE[0] <= found.coverage_90 <= COVERAGE[1]:
-        return _gate(False, beyond, "coverage", found)
-    return _gate(True, beyond, "within")
+        percent = 100.0 * found.coverage_90
+        reason = f"90 % intervals hold {percent:.0f} % of the samples of held-out trials."
+        return _held_out_outcome(False, beyond, reason)
+    return _held_out_outcome(True, beyond, "Held-out trials are predicted within their noise.")
 
 
-def _gate(passed: bool | None, beyond: float, say: str, found: Scores | None = None) -> Gate:
-    percent = nan if found is None else 100.0 * found.coverage_90
-    reason = said(f"proof.{say}", found=found, percent=percent)
+def _held_out_outcome(passed: bool | None, beyond: float, reason: str) -> Gate:
     return Gate("held-out trials", passed, beyond, HELD_OUT_DEVIATIONS, reason)
 
 
-def gap_closed(before: Scores | None, after: Scores | None) -> tuple[float, str]:
-    """Return 1 - (χ²_after - 1) / (χ²_before - 1), or nan and the reason.
+def chi_square_text(found: Scores) -> str:
+    """Return χ² per sample beside what a right model would have."""
+    expected = f"{found.chi_square_expected:.3g} ± {found.chi_square_deviation:.2g}"
+    return f"{found.chi_square_per_sample:.3g}, where {expected} is expected of a right model"
 
-    A χ²/dof below one after counts as one: fitting noise closes no gap.
+
+def told_share(before: ResidualSet, after: ResidualSet) -> tuple[ClosedShare | None, str]:
+    """Return the share of the mean square error that a hypothesis takes away, or None and the reason.
+
+    There is none where held-out trials are predicted within their noise without the hypothesis and with it:
+    they do not test it. An error beyond the noise counts even where the posterior leaves that much open.
+
+    Parameters
+    ----------
+    before, after : ResidualSet
+        The same trials and samples, without and with the hypothesis.
     """
-    if before is None or after is None:
-        return nan, said("proof.no_trial")
-    if not np.isfinite(before.chi_square_per_dof):
-        return nan, said("proof.no_noise_record_before")
-    gap = before.chi_square_per_dof - 1.0
-    if gap < SMALLEST_GAP * before.chi_square_deviation:
-        return nan, said("proof.no_gap", found=before)
-    return 1.0 - max(after.chi_square_per_dof - 1.0, 0.0) / gap, ""
+    closed = closed_share(before, after)
+    if closed is None:
+        return None, "The model as it was leaves no error at all."
+    if closed.trials == "held-out":
+        without, with_effect = (_chi_square_by_diagonal(item.held_out or item) for item in (before, after))
+        if without.beyond_noise < SMALLEST_GAP and with_effect.beyond_noise <= HELD_OUT_DEVIATIONS:
+            found = f"χ² per sample {without.per_sample:.3g}, 1 for noise alone"
+            return None, f"Held-out trials show no gap before: {found}."
+    return closed, "" if closed.trials == "held-out" else "No trial was held out."
 
 
-def prove(before: ResidualSet, after: ResidualSet, *, seed: int = 0) -> Proof:
+def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
+    """Return χ² per sample, its deviation without the correlations of what the fit absorbs.
+
+    It is the same whether sensitivities were asked for or not.
+    """
+    trials = tuple(replace(item, sensitivity=None) for item in residuals.trials)
+    return chi_square_of(replace(residuals, trials=trials))
+
+
+def prove(before: ResidualSet, after: ResidualSet, *, effects: tuple[str, ...] = (), seed: int = 0) -> Proof:
     """Return the proof from the residuals without and with the effect.
 
     Parameters
     ----------
     before, after : ResidualSet
         The same trials and samples.
+    effects : tuple of str
+        What is added, as `discrepancy.verdict.effect_label` gives it.
     seed : int
         As of `scores`.
 
@@ -249,26 +299,47 @@ def prove(before: ResidualSet, after: ResidualSet, *, seed: int = 0) -> Proof:
     FitError
         If no sample of one of the roles is used.
     """
-    outside = (before.held_out, after.held_out)
-    held = [None if one is None else scores(one, seed=seed) for one in outside]
+    after = over_noise_of(after, before)
+    held = [None if one.held_out is None else scores(one.held_out, seed=seed) for one in (before, after)]
     fitted = [scores(one.fitted or one, seed=seed) for one in (before, after)]
-    closed, reason = gap_closed(held[0], held[1])
+    closed, reason = told_share(before, after)
     gain, error = nan, nan
-    if outside[0] is not None and outside[1] is not None:
-        gain, error = score_gain(outside[0], outside[1])
-    remaining = _remaining(outside[1] or after.fitted or after, held[1] or fitted[1])
-    return Proof(held[0], held[1], fitted[0], fitted[1], closed, gain, error, remaining, reason)
+    if before.held_out is not None and after.held_out is not None:
+        gain, error = score_gain(before.held_out, after.held_out)
+    remaining = _remaining(after.held_out or after.fitted or after, held[1] or fitted[1])
+    return Proof(
+        held_out_before=held[0],
+        held_out_after=held[1],
+        fitted_before=fitted[0],
+        fitted_after=fitted[1],
+        closed=closed,
+        log_score_gain=gain,
+        log_score_gain_error=error,
+        remaining=remaining,
+        closed_reason=reason,
+        effects=effects,
+    )
 
 
 def _remaining(residuals: ResidualSet, after: Scores) -> str:
     """Return a sentence on what is still not explained."""
-    if not np.isfinite(after.chi_square_per_dof):
-        return said("proof.not_known")
-    where = "held-out" if residuals.trials[0].trial.held_out else "fitted"
+    if not isfinite(after.chi_square_per_sample):
+        return "Without a noise record it is not known what remains."
+    trials = "held-out trials" if residuals.trials[0].trial.held_out else "fitted trials"
+    size = f"χ² per sample {after.chi_square_per_sample:.3g} on {trials}"
     known = residuals.recorded
     square, freedom = mean_square(residuals, known)
     if variance_p_value(square, freedom, min(map(residuals.degrees_of_freedom, known))) < _REMAINS:
-        shares = {name: mean_square(residuals, (name,))[0] for name in known}
-        worst = max(shares, key=lambda name: shares[name])
-        return said("proof.remains", found=after, where=where, worst=worst, share=shares[worst])
-    return said("proof.coloured" if after.whiteness < _REMAINS else "proof.nothing", found=after, where=where)
+        by_channel = {name: _channel_chi_square(residuals, name) for name in known}
+        worst = max(by_channel, key=lambda name: by_channel[name])
+        return f"Still unexplained: {size}, most on {worst} ({by_channel[worst]:.3g})."
+    if after.whiteness < _REMAINS:
+        return f"The size is that of noise ({size}), but residuals are not white (p = {after.whiteness:.1g})."
+    return f"Nothing that these data can show remains ({size})."
+
+
+def _channel_chi_square(residuals: ResidualSet, name: str) -> float:
+    """Return the mean square residual of a channel over the noise."""
+    records = of_channel(residuals.trials, name)
+    squares = [item.standardised[used, column] ** 2 for item, column, used in records]
+    return float(np.concatenate(squares).mean())

@@ -156,8 +156,9 @@ class ResidualSet:
         A residual at a draw of the posterior is distributed as the noise itself (Johnson 2007, Bayesian
         Analysis 2(4), 719-734): r + S z with z standard normal, one z for all trials, restores exactly what
         the fit has absorbed; held-out trials lose the error of the parameters alike. Without sensitivities
-        residuals are divided by their expected deviation. Samples that are not used are drawn from the noise,
-        so that series keep their even spacing.
+        what the fit has absorbed is restored sample by sample, r + sqrt(leverage) z, and residuals of a
+        larger variance than the noise are divided by their deviation. Samples that are not used are drawn
+        from the noise, so that series keep their even spacing.
         """
         columns = (item.sensitivity.shape[2] for item in self.trials if item.sensitivity is not None)
         draw = generator.standard_normal(next(columns, 0))
@@ -167,7 +168,9 @@ class ResidualSet:
             filler = generator.standard_normal(item.residual.shape)
             residual = np.nan_to_num(item.standardised)
             if item.sensitivity is None:
-                residual = residual / np.sqrt(np.clip(item.expected_variance, 1e-12, None))
+                absorbed = np.clip(1.0 - item.expected_variance, 0.0, 1.0)
+                residual = residual + np.sqrt(absorbed) * generator.standard_normal(residual.shape)
+                residual = residual / np.sqrt(np.maximum(item.expected_variance, 1.0))
             elif item.trial.held_out:
                 residual = residual - item.sensitivity @ outside
             else:

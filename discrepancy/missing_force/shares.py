@@ -15,7 +15,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
+from discrepancy.verdict import ForceAtPort, ForceLeft, ForceMoment
 
 from .hypotheses import Columns, scaled, sees_forces
 from .naming import Explained, ForceSearch
@@ -372,6 +372,5 @@ def seen_force(
     return replace(missing, told=told)
 
 
-def _told(share: Share) -> ShareOfForce:
-    sizes = (share.value, *share.interval, share.left, share.whole)
-    return ShareOfForce(*sizes, ahead=share.of == OF_PREDICTIONS, trials=share.trials, tested=share.tested)
+def _told(share: Share) -> ForceLeft:
+    return ForceLeft(share.left, share.whole, trials=share.trials, tested=share.tested)

@@ -108,6 +108,37 @@ def residual_windows(
     return found
 
 
+def sized_windows(
+    windows: Sequence[GapWindow], before: ResidualSet, after: ResidualSet
+) -> tuple[GapWindow, ...]:
+    """Return windows with the sizes and channels that the residuals show in them.
+
+    Parameters
+    ----------
+    windows : sequence of GapWindow
+        Of the model as it was, and of what the hypothesis of the verdict leaves.
+    before, after : ResidualSet
+        Residuals without and with the hypothesis. Both are over the noise of the first, so that a size with
+        the effect can be compared with one without it.
+    """
+    noise = {item.trial.name: item.noise_deviation for item in before.trials}
+    found = []
+    for window in windows:
+        residuals = after if window.with_effect else before
+        (item,) = [item for item in residuals.trials if item.trial.name == window.trial]
+        begin = window.first if window.begin is None else window.begin.value
+        end = window.last if window.end is None else window.end.value
+        time = item.trial.time
+        inside = item.used & ((time >= begin) & (time <= end))[:, None]
+        squares = np.where(inside, (item.residual / noise[window.trial]) ** 2, 0.0).sum(axis=0)
+        sizes = np.sqrt(squares / np.maximum(inside.sum(axis=0), 1))
+        largest = float(sizes.max())
+        shows = zip(item.trial.channels, (sizes > 0.0) & (sizes >= SHOWS * largest), strict=True)
+        channels = tuple(channel for channel, does in shows if does)
+        found.append(replace(window, size=largest, channels=channels))
+    return tuple(found)
+
+
 def _most_telling(port: int, at: Explained, channels: Sequence[tuple[str, ...]]) -> tuple[int, Explained]:
     """Return the missing force, or what one channel shows where that tells more, and its port first.
 

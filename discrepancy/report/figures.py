@@ -16,13 +16,15 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.document import Origin
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
+from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce
+from discrepancy.proof_record import Scores
 from discrepancy.self_calibration import SelfCalibration
-from discrepancy.verdict import Scores
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
 from reporting import figures as style
 from reporting.page import ReportFigure
+from reporting.words import listing
 
 from . import residual_figures
 from .motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
@@ -196,6 +198,17 @@ class ReportInput:
     pack: Pack | None = None
 
 
+def _unit_of_noise(before: ResidualSet) -> str:
+    """Return what the unit of sizes of residuals is."""
+    unknown = [name for name in before.measured if name not in before.recorded]
+    if not unknown:
+        return "1 is noise."
+    return (
+        f"1 is noise; of {listing(unknown)}, whose noise is not recorded, what the model as it was leaves in "
+        "fitted trials."
+    )
+
+
 @style.publication_style()
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     """Draw every figure that these data allow, by name; their words are in `words.toml`.
@@ -218,7 +231,10 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         add("missing_force", missing_force_figure(missing), sentence=force_sentence(missing.told))
     if before is not None:
         names = [item.trial.name for item in before.trials if item.trial.held_out]
-        scale = {"beside": WORDS.say("beside", names=names, both=after is not None)}
+        scale = {
+            "beside": WORDS.say("beside", names=names, both=after is not None),
+            "unit": _unit_of_noise(before),
+        }
         if content.design is not None:
             add("residual_map", residual_figures.planform_figure(before, after, content.design), **scale)
         add("residual_table", residual_figures.heat_figure(before, after), **scale)

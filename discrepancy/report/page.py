@@ -147,8 +147,8 @@ def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Share]]:
 FUNCTIONS = (
     evidence_rows, not_compared_rows, parameter_rows, score_rows, effect_rows, what_is_missing,
     sizes_sentence, deciding, calibration_rows, group_lines, neighbours, seen_of, when_sentence,
-    words.hypothesis_name,    words.headline, words.shares_sentence,
-    words.remainders_sentence, words.residual_sizes, words.tested_shares, words.force_sentence,
+    words.hypothesis_name, words.headline, words.error_sentence, words.noise_levels,
+    words.remainders_sentence, words.tested_trials, words.force_sentence,
 )  # fmt: skip
 """What templates of the page and of the command call."""
 
@@ -165,7 +165,6 @@ def said_on_page(content: ReportInput) -> dict[str, Any]:
         "location": found.location, "fitted": verdict.kind is not VerdictKind.DATA_ERROR,
         "named": verdict.kind in words.NAMING, "nothing": verdict.kind in NO_GAP,
         "label": words.added_label(found), "members": words.members_of(verdict),
-        "explained": None if words.rests_on_force(verdict) else verdict.explained,
         "scored": None if proof is None else words.scored(proof),
         "without": next((item for item in verdict.hypotheses if not item.effects), None),
         "catalogue": {} if search is None else {item.identifier: item for item in search.effects},

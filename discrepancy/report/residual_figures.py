@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
+from discrepancy.judgement.closed_share import over_noise_of
 from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
 from discrepancy.verdict import GapWindow
 from fe.runtime.wing_rows import strain_gauge
@@ -41,6 +42,7 @@ def models(before: ResidualSet, after: ResidualSet | None) -> list[Shown]:
     """Return the model as it was and, where there is one, with the effect."""
     if after is None:
         return [Shown(before, style.PREDICTION, "--", "o", "model", "model as it is")]
+    after = over_noise_of(after, before)
     return [
         Shown(before, style.PREDICTION, "--", "o", "model as it was", "a  model as it was"),
         Shown(after, style.PAST, "-", "D", AFTER, f"b  {AFTER}"),
@@ -116,12 +118,12 @@ BELOW: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "t
 
 
 def size(trials: Sequence[FittedTrial], channel: str) -> float:
-    """Return the rms residual of a channel over what noise would leave; nan where the fit absorbed it all."""
-    left = expected = 0.0
+    """Return the rms residual of a channel over the noise; nan where no sample counts."""
+    total, count = 0.0, 0
     for item, column, used in of_channel(trials, channel):
-        left += float(np.sum(item.standardised[used, column] ** 2))
-        expected += float(item.expected_variance[used, column].sum())
-    return float(np.sqrt(left / expected)) if expected >= 0.5 else float("nan")
+        total += float(np.sum(item.standardised[used, column] ** 2))
+        count += int(used.sum())
+    return float(np.sqrt(total / count)) if count else float("nan")
 
 
 def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:

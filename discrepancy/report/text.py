@@ -15,18 +15,17 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.catalogue.entry import Effect
 from discrepancy.document import PRIMITIVE_UNITS
 from discrepancy.files.verdict import PrimitiveInterval
+from discrepancy.judgement.closed_share import closed_text, share_text
 from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.models.interface import EITHER, MOVES, TURNS, Model
+from discrepancy.proof_record import Proof, Scores
 from discrepancy.verdict import (
     Estimate,
-    ExplainedShare,
     ForceAtPort,
+    ForceLeft,
     Hypothesis,
     NamedEffect,
-    Proof,
-    Scores,
-    ShareOfForce,
     Verdict,
     VerdictKind,
 )
@@ -108,30 +107,20 @@ def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
 
 
 def force_sentence(force: ForceAtPort) -> str:
-    """Return where a force is missing, how large, what orders it, and what share of it its law is."""
+    """Return where a force is missing, how large, what orders it, and what its law leaves of it."""
     what, place, rate = motion_of(force)
     own = force.evidence[force.port]
     others = {name: value for name, value in force.evidence.items() if name != force.port}
     nearest = max(others, key=lambda name: others[name], default="")
     evidence = {"own": own, "nearest": nearest, "ahead": own - others.get(nearest, own)}
     port = {"what": what, "place": place, "rate": rate}
-    return WORDS.say("force", force=force, tested=tested_shares(force), **evidence, **port)
+    return WORDS.say("force", force=force, tested=tested_trials(force), **evidence, **port)
 
 
-def tested_shares(force: ForceAtPort | None) -> list[tuple[str, ShareOfForce]]:
-    """Return which trials, and what share of a missing force its law is in them; only where it has one."""
-    shares = {} if force is None else {"fitted": force.fitted, "held-out": force.held_out}
-    return [(kind, share) for kind, share in shares.items() if share is not None and share.tested]
-
-
-def share_text(share: ShareOfForce) -> str:
-    """Return a share with its 90 % interval."""
-    return f"{100.0 * share.value:.3g} % ({100.0 * share.low:.3g} to {100.0 * share.high:.3g})"
-
-
-def rests_on_force(verdict: Verdict) -> bool:
-    """Whether hypotheses were weighed along the missing force, and not by what simulations of them leave."""
-    return any(isnan(item.chi_square) for item in verdict.hypotheses[:1])
+def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
+    """Return which trials, and what a law leaves of a missing force in them; only where it has a force."""
+    found = {} if force is None else {"fitted": force.fitted, "held-out": force.held_out}
+    return [(kind, left) for kind, left in found.items() if left is not None and left.tested]
 
 
 def scored(proof: Proof) -> tuple[Scores, Scores, str]:
@@ -141,18 +130,33 @@ def scored(proof: Proof) -> tuple[Scores, Scores, str]:
     return proof.fitted_before, proof.fitted_after, "fitted"
 
 
-def shares_sentence(verdict: Verdict) -> str:
-    """Return what the mean square of the gap is made of, and what is left; empty where it is not known."""
-    found = verdict.explained
-    if found is None or rests_on_force(verdict):
+def error_sentence(investigation: Investigation) -> str:
+    """Return what share of the error the effects take away, in which channels from what to what; or why none.
+
+    Empty where nothing was added.
+    """
+    proof, before, after = investigation.proof, investigation.before, investigation.after
+    if proof is None or before is None or after is None:
         return ""
-    return WORDS.say("mean_square", found=found, unexplained=verdict.kind is VerdictKind.UNEXPLAINED)
+    if proof.closed is None:
+        return proof.closed_reason
+    named = investigation.verdict.kind in NAMING
+    what = "With it" if named else "With the best hypothesis, which is no name,"
+    text = closed_text(before, after, proof.closed)
+    return f"{what} {text.removeprefix('it ')}." if proof.closed.grew else f"{_subject(named)}{text[2:]}."
 
 
-def residual_sizes(found: ExplainedShare) -> tuple[str, str]:
-    """Return the rms of the residuals before and after, in deviations of the noise, for people."""
-    noise = max(found.noise, 1e-300)
-    return number((1.0 / noise) ** 0.5, 2), number(((found.remainder + found.noise) / noise) ** 0.5, 2)
+def _subject(named: bool) -> str:
+    """Return what explains a share of the error."""
+    return "It" if named else "The best hypothesis, which is no name,"
+
+
+def noise_levels(proof: Proof) -> tuple[str, str]:
+    """Return the rms of the residuals before and after over the noise, for people."""
+    before, after, _ = scored(proof)
+    levels = (score.chi_square_per_sample**0.5 for score in (before, after))
+    first, second = (number(level, 2) for level in levels)
+    return first, second
 
 
 def remainders_sentence(verdict: Verdict) -> str:
@@ -193,12 +197,6 @@ def formula(text: str) -> str:
     return re.sub(r"\^(\d)(?!\w)", lambda match: match[1].translate(_POWERS), text)
 
 
-def percent(share: float) -> str:
-    """Return a share in percent; never 100 where a little is left."""
-    text = 100.0 * share
-    return "> 99.9" if 99.95 < text < 100.0 else f"{text:.1f}"
-
-
 def nats(evidence: float) -> str:
     """Return an evidence; beyond all doubt its digits tell nothing."""
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
@@ -210,7 +208,7 @@ def parameter_text(item: Estimate) -> str:
 
 
 _NUMBERS: tuple[Any, ...] = (
-    number, percent, nats, share_text, formula, p_value_text, estimate_text, unit_text, parameter_text,
+    number, nats, share_text, formula, p_value_text, estimate_text, unit_text, parameter_text,
     probability_text, isfinite,
 )  # fmt: skip
 WORDS = Words("discrepancy.report", "words.toml", **{function.__name__: function for function in _NUMBERS})

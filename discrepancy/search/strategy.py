@@ -12,6 +12,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.estimation.refinement import refined
+from discrepancy.fits.beginnings import refitted_from_beginnings
 from discrepancy.fits.candidate import Candidate, Key
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
@@ -376,6 +377,7 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     """
     tell("fitting the model as it is")
     none = fit(problem, Candidate(), problem.start(Candidate()), iterations=SEARCH.none_steps)
+    none = refitted_from_beginnings(problem, none, iterations=SEARCH.none_steps)
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)

@@ -50,8 +50,8 @@ def test_an_effect_is_named_and_proved_on_trials_not_used():
     """Draws of its patch have the posterior's spread, and the same seed gives the same verdict."""
     found = drag_found()
     assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
-    assert found.proof.gap_closed >= 0.9
-    assert 0.8 <= found.proof.held_out_after.chi_square_per_dof <= 1.2
+    assert found.proof.closed.value >= 0.9
+    assert 0.8 <= found.proof.held_out_after.chi_square_per_sample <= 1.2
     assert found.proof.log_score_gain > 0.0
     assert found.location is not None
     assert not any("time steps cost" in remark for remark in found.verdict.remarks)
@@ -75,7 +75,7 @@ def test_an_effect_is_named_and_proved_on_trials_not_used():
     other = investigate(*measured(0.01), FEW, seed=3, thorough=False)
     assert other.verdict.sentence == found.verdict.sentence
     assert other.verdict.probability == found.verdict.probability
-    assert other.proof.gap_closed == found.proof.gap_closed
+    assert other.proof.closed == found.proof.closed
     assert other.fit.point.effect.tobytes() == found.fit.point.effect.tobytes()
 
 
@@ -240,13 +240,14 @@ def test_a_law_beside_which_something_slow_is_left_is_named_in_part():
     friction = PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0)
     campaign = replace(pushed(MODEL, (1.01, 0.9), friction, slow=1.0), events=())
     rivals = kit.chosen("coulomb_friction", "quadratic_damping")
-    found = investigate(campaign, MODEL, rivals, thorough=False).verdict
+    result = investigate(campaign, MODEL, rivals, thorough=False)
+    found, closed = result.verdict, result.proof.closed
     assert found.kind is VerdictKind.NAMED_IN_PART, found.sentence
     (effect,) = found.effects
     assert effect.identifier == "coulomb_friction"
     (law,) = effect.patch.primitives
     assert law.coefficient == pytest.approx(0.4, rel=0.1)
-    assert 0.8 < found.explained.low < found.explained.value < 1.0
+    assert 0.8 < closed.low < closed.value < 1.0
 
 
 def test_friction_that_begins_with_an_event_is_named_with_it(campaign):

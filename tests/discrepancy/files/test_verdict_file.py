@@ -165,7 +165,7 @@ def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_
     with refused(VerdictFileError, "There is no file"):
         files.read_verdict_file(tmp_path / "nothing.json")
     path.write_text(whole, encoding="utf-8")
-    with refused(VerdictFileError, "'uav-twin verdict 4', but 'uav-twin patch 2' is needed"):
+    with refused(VerdictFileError, "'uav-twin verdict 5', but 'uav-twin patch 2' is needed"):
         read_patch(path)
     path.unlink()
     wrong = replace(VERDICT, probability="sure")
@@ -236,7 +236,7 @@ def test_files_of_earlier_numbers_are_read(number, tmp_path):
             del row["parameters"]
         later["parameters"] = ()
     if number < 2:
-        later |= {"explained": None, "remainders": (), "not_fitted": ()}
+        later |= {"remainders": (), "not_fitted": ()}
     for key in later:
         del content["verdict"][key]
     path.write_text(json.dumps(content), encoding="utf-8")
@@ -246,3 +246,23 @@ def test_files_of_earlier_numbers_are_read(number, tmp_path):
     found = files.read_verdict_file(path)
     assert same(found.verdict, replace(told, **later))
     assert found.origin == (ORIGIN if number == 3 else replace(ORIGIN, model_file=None))
+
+
+def test_an_older_proof_is_read_without_its_share_and_says_why(tmp_path):
+    """Chi-square after was divided by the posterior's doubt too: its errors are read, its share is not."""
+    path = write_verdict(tmp_path / "verdict.json", VERDICT, prove(FITTED, FITTED), ORIGIN)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["schema"] = "uav-twin verdict 4"
+    content["verdict"]["explained"] = {"value": 0.998}
+    for name in ("held_out_before", "held_out_after", "fitted_before", "fitted_after"):
+        scores = content["proof"][name]
+        scores["chi_square_per_dof"] = scores.pop("chi_square_per_sample")
+        del scores["chi_square_expected"]
+    for name in ("closed", "closed_reason", "effects"):
+        del content["proof"][name]
+    content["proof"] |= {"gap_closed": 0.998, "gap_reason": ""}
+    path.write_text(json.dumps(content), encoding="utf-8")
+    proof = files.read_verdict_file(path).proof
+    assert proof.held_out_after.rms == prove(FITTED, FITTED).held_out_after.rms
+    assert proof.closed is None
+    assert "of an earlier version" in proof.closed_reason

@@ -13,6 +13,7 @@ from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import FitError
 from discrepancy.fits.gates import absolute_gate
+from discrepancy.judgement.closed_share import closed_share
 from discrepancy.judgement.consistency_gate import consistency_gate, directions, score_tests
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.proof import correlation_time, held_out_gate, log_density, prove, scores
@@ -40,7 +41,8 @@ def test_scores_of_a_right_model():
     fitted = bench.fit(np.random.default_rng(13))
     for part in (fitted.fitted, fitted.held_out):
         found = scores(part)
-        assert found.chi_square_per_dof == pytest.approx(1.0, abs=4.0 * found.chi_square_deviation)
+        expected = pytest.approx(found.chi_square_expected, abs=4.0 * found.chi_square_deviation)
+        assert found.chi_square_per_sample == expected
         assert found.coverage_50 == pytest.approx(0.5, abs=0.03)
         assert found.coverage_90 == pytest.approx(0.9, abs=0.02)
         assert found.log_score == pytest.approx(-0.5 * (1.0 + log(2.0 * pi)), abs=0.06)
@@ -56,48 +58,91 @@ def test_scores_of_a_right_model():
         )  # what repeats itself counts once
 
 
-def test_a_closed_gap_is_one_and_an_open_gap_zero():
-    """Half the error leaves a quarter of the gap."""
+def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other():
+    """Half the error leaves a quarter of it; where nothing changed the share is zero."""
     bench = Bench(amplitudes=MANY, held_out=HELD)
     before = bench.fit(np.random.default_rng(5), extra=lacking(bench, 25.0))
     after = bench.fit(np.random.default_rng(5))
     assert [held_out_gate(item).passed for item in (before, after)] == [False, True]
     proof = prove(before, after)
-    assert proof.held_out_before.chi_square_per_dof > 3.0
-    assert proof.gap_closed == pytest.approx(1.0, abs=0.1)
-    assert proof.gap_reason == ""
+    assert proof.held_out_before.chi_square_per_sample > 3.0
+    left = proof.held_out_after.chi_square_per_sample / proof.held_out_before.chi_square_per_sample
+    assert proof.closed.value == pytest.approx(1.0 - left)
+    assert proof.closed.low < proof.closed.value < proof.closed.high
+    assert proof.closed_reason == ""
     assert proof.log_score_gain > 5.0 * proof.log_score_gain_error > 0.0
     other = [replace(item, noise_deviation=3.0 * item.noise_deviation) for item in after.trials]  # its own
     gain = prove(before, replace(after, trials=tuple(other))).log_score_gain
     assert gain == pytest.approx(proof.log_score_gain)
     assert proof.remaining.startswith("Nothing that these data can show remains")
     none = prove(before, before)
-    assert none.gap_closed == 0.0
+    assert none.closed.value == 0.0
     assert none.log_score_gain == none.log_score_gain_error == 0.0
-    assert none.remaining.startswith("Still unexplained: χ²/dof")
+    assert none.remaining.startswith("Still unexplained: χ² per sample")
     exact = Bench(amplitudes=MANY, held_out=HELD, noise_freedom=np.inf)
-    sets = [exact.fit(np.random.default_rng(6), extra=lacking(exact, size)) for size in (40.0, 20.0)]
-    assert prove(*sets).gap_closed == pytest.approx(0.75, abs=0.03)
+    sets = [exact.fit(np.random.default_rng(6), extra=lacking(exact, size)) for size in (400.0, 200.0)]
+    assert prove(*sets).closed.value == pytest.approx(0.75, abs=0.03)
 
 
 def test_no_gap_is_said_and_not_divided_by():
     """Nor is there one without a held-out trial or a noise record."""
     fitted = Bench(amplitudes=(200.0, 150.0), held_out=(False, True)).fit(np.random.default_rng(7))
     proof = prove(fitted, fitted)
-    assert isnan(proof.gap_closed)
-    assert "show no gap before" in proof.gap_reason
+    assert proof.closed is None
+    assert "show no gap before" in proof.closed_reason
     bare = with_noise(fitted, None)
     assert held_out_gate(bare).passed is None
     proof = prove(bare, bare)
-    assert isnan(proof.held_out_after.chi_square_per_dof)
-    assert "No noise record" in proof.gap_reason
+    assert isnan(proof.held_out_after.chi_square_per_sample)
+    assert proof.closed.value == 0.0  # of the error itself
     assert "not known" in proof.remaining
     without = Bench().fit(np.random.default_rng(7))
     proof = prove(without, without)
-    assert isnan(proof.gap_closed)
+    assert proof.closed.trials == "fitted"
     assert isnan(proof.log_score_gain)
-    assert proof.gap_reason == "No trial was held out."
+    assert proof.closed_reason == "No trial was held out."
     assert proof.held_out_after is None
+
+
+def with_error(residuals, factor):
+    """Return residuals so many times as large, of a posterior so wide that all of them are within it."""
+    trials = [
+        replace(
+            item,
+            residual=factor * item.residual,
+            predictive_deviation=100.0 * item.predictive_deviation,
+            leverage=item.leverage + (1e4 if item.trial.held_out else 0.0),
+            sensitivity=None,
+        )
+        for item in residuals.trials
+    ]
+    return replace(residuals, trials=tuple(trials))
+
+
+def test_an_error_that_grew_is_a_negative_share_however_wide_the_posterior():
+    bench = Bench(amplitudes=MANY, held_out=HELD)
+    before = bench.fit(np.random.default_rng(5), extra=lacking(bench, 25.0))
+    proof = prove(before, with_error(before, 1.4))
+    assert proof.closed.value == pytest.approx(1.0 - 1.4**2)
+    assert proof.closed.high < 0.0
+    assert proof.grew
+    ratio = proof.held_out_after.chi_square_per_sample / proof.held_out_before.chi_square_per_sample
+    assert ratio == pytest.approx(1.4**2)
+
+
+def test_a_share_of_few_blocks_has_no_interval():
+    fitted = Bench(count=12, amplitudes=(200.0,)).fit(np.random.default_rng(3))
+    closed = closed_share(fitted, with_error(fitted, 0.5))
+    assert closed.value == pytest.approx(0.75)
+    assert isnan(closed.low)
+    assert isnan(closed.high)
+
+
+def test_one_noise_is_under_both_errors_where_none_is_recorded():
+    """What each hypothesis leaves in fitted trials is its own noise, which is no measure of its error."""
+    bare = with_noise(Bench(amplitudes=MANY, held_out=HELD).fit(np.random.default_rng(7)), None)
+    trials = [replace(item, noise_deviation=0.01 * item.noise_deviation) for item in bare.trials]
+    assert closed_share(bare, replace(bare, trials=tuple(trials))).value == pytest.approx(0.0)
 
 
 def test_scores_of_one_set():
@@ -107,7 +152,7 @@ def test_scores_of_one_set():
     expected = stats.norm.logpdf(item.residual, scale=item.predictive_deviation)
     np.testing.assert_allclose(log_density(item), expected + np.log(item.noise_deviation), rtol=1e-12)
     exact, loose = (
-        scores(residuals).chi_square_deviation
+        scores(residuals).chi_square_deviation / scores(residuals).chi_square_expected
         for residuals in (fitted, with_noise(fitted, NoiseRecord(2.0, 10.0)))
     )
     assert loose**2 == pytest.approx(exact**2 + 0.2)

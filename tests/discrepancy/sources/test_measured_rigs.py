@@ -112,16 +112,17 @@ def test_published_records_are_read_as_they_were_measured(tmp_path):
 def test_what_is_missing_of_a_rig_is_named_in_part_or_its_place_is_said(
     tmp_path, name, effects, missing, least
 ):
-    verdict = investigate(*rig(name, tmp_path), chosen(*effects), thorough=False).verdict
+    found = investigate(*rig(name, tmp_path), chosen(*effects), thorough=False)
+    verdict, proof = found.verdict, found.proof
     if not missing:
         assert verdict.kind is VerdictKind.UNEXPLAINED
         assert "is missing at 'pivot', ordered by" in verdict.sentence
-        assert verdict.explained is None or verdict.explained.value < 0.5
+        assert proof is None or proof.closed.value < 0.5
         return
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     assert {(effect.identifier, effect.place) for effect in verdict.effects} == missing
-    assert verdict.explained.trials == "held-out"
-    assert verdict.explained.low > least
+    assert proof.closed.trials == "held-out"
+    assert proof.closed.low > least
     law = next(iter(verdict.effects[0].patch))
     assert law.velocity_exponent == pytest.approx(2.0 if name == "falling_phone" else 0.5, abs=0.06)
 
