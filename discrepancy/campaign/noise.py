@@ -113,7 +113,7 @@ def record_at_rest(channel: Channel) -> FloatArray | None:
     record = channel.noise
     if record is None or record.samples is None or len(record.samples) < SHORTEST_SERIES:
         return None
-    return record.samples - record.samples.mean()
+    return np.asarray(record.samples - record.samples.mean())
 
 
 def whiteness_is_tested(channel: Channel) -> bool:
