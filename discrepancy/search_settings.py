@@ -107,6 +107,15 @@ class SearchSettings:
     """Log evidence within which another effect is no worse along the missing force, whose motion is taken as
     known: unless trials that were not fitted tell them apart."""
 
+    # ---------------------------------------------------------------- begun from another size
+    restart_sizes: tuple[float, ...] = (
+        0.5, 0.56, 0.63, 0.71, 0.8, 0.87, 0.93, 1.0, 1.07, 1.15, 1.25, 1.4, 1.6, 1.8, 2.0,
+    )  # fmt: skip
+    """Sizes, over that which follows the missing force, from which the leading effect is fitted again where
+    no fit leaves noise alone: friction that ends a motion has optima an eighth to a quarter of it apart."""
+    restarts: int = 6
+    """Such fits, from the sizes at which least is left; the first that leaves noise alone is the last."""
+
     # ---------------------------------------------------------------- weighed with a remainder
     weighed_sets: tuple[int, ...] = (8, 4, 2)
     """Sets of one, two and three effects that may be fitted under the wider noise of what is left."""

@@ -14,7 +14,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter, zoom_fft
 from scipy.stats import f as f_distribution
 
-from discrepancy.campaign.noise_tests import ljung_box
+from discrepancy.campaign.noise_tests import SHORTEST_SERIES, cumulative_periodogram, fisher_g, ljung_box
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRecord, Trial
 from discrepancy.errors import CampaignDataError, said
 from reporting.words import counted
@@ -31,6 +31,8 @@ WHITE_LEVEL = 1e-6
 
 Whitening by a chance correlation would colour white data."""
 LINE_LEVEL = 1e-4
+NOISE_RECORD_LEVEL = 1e-3
+"""p-value below which a noise record itself counts as not white, or as holding a line."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,26 @@ class NoiseModel:
     def stays_coloured(self, trial: Trial) -> bool:
         """Whether coloured noise cannot be whitened in a trial: its samples are no independent ones there."""
         return trial.is_dynamic and self.autoregression.size > 0 and not self.applies(trial.whitened_at)
+
+
+def record_at_rest(channel: Channel) -> FloatArray | None:
+    """Return the samples (n,) of a noise record about their mean; None: too few to be tested."""
+    record = channel.noise
+    if record is None or record.samples is None or len(record.samples) < SHORTEST_SERIES:
+        return None
+    return np.asarray(record.samples - record.samples.mean())
+
+
+def whiteness_is_tested(channel: Channel) -> bool:
+    """Whether what is left in a channel has to be white: its noise record is so itself, without a line.
+
+    Locating and the gate of absolute fit go by this one rule.
+    """
+    series = record_at_rest(channel)
+    if series is None:
+        return True
+    p_values = (fisher_g(series)[1], ljung_box(series)[1], cumulative_periodogram(series)[1])
+    return min(p_values) >= NOISE_RECORD_LEVEL
 
 
 def aliased(frequency: float, interval: float) -> float:

@@ -1,6 +1,6 @@
 """Reading a campaign: a folder with `campaign.toml` and tables in, a checked `Campaign` in SI units out."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from pathlib import Path, PurePosixPath
@@ -17,6 +17,7 @@ from discrepancy.campaign.records import (
     Channel,
     FloatArray,
     InTables,
+    IntArray,
     NoiseRecord,
     Quantity,
     RecordedInput,
@@ -182,7 +183,7 @@ def _trial(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, remarks: list[str]
 ) -> Trial:
     user = f"the trial {section.name!r}"
-    time, start = _times(section, table, user)
+    time, start = _times(section, table, campaign, user)
     zeros = np.zeros(len(table))
     chosen = _measured(section, table, campaign)
     columns, used = zip(*(_readings(channel, section, table, remarks) for channel in chosen), strict=True)
@@ -226,7 +227,9 @@ def _numbers(table: TextTable, item: InTables, user: str, *, empty_allowed: bool
     return numbers * conversion_of(item.quantity, item.unit)
 
 
-def _times(section: schema.TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:
+def _times(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
+) -> tuple[FloatArray, float]:
     """Return the times of a trial's rows and its start [s]."""
     start = section.start or 0.0
     if section.kind not in (TrialKind.STATIC, TrialKind.FLIGHT):
@@ -239,13 +242,30 @@ def _times(section: schema.TrialSection, table: TextTable, user: str) -> tuple[F
             which = "late_release" if late else "before_release"
             raise CampaignDataError(said(f"campaign.{which}", file=table.name, user=user, first=time[0]))
         return time, start
-    table.refuse_repeated([*zip(*table.columns.values(), strict=True)], "row", _REPEATED)
+    of_inputs = (item.table_column for item in campaign.input)
+    loads = [name for name in dict.fromkeys(("force", "load_factor", *of_inputs)) if name in table.columns]
+    branches = _load_branches(table, loads, user).tolist()
+    table.refuse_repeated([*zip(branches, *table.columns.values(), strict=True)], "row", _REPEATED)
     if "time" not in table.columns:
         return np.full(len(table), start), start
     time = table.numbers("time", user)
     if np.any(np.diff(time) < 0.0):
         raise CampaignDataError(f"{table.name}: the times of {user} run backwards; put its rows in order.")
     return time, float(time[0]) if section.start is None else start
+
+
+def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArray:
+    """Return the branch (N,) of its load cycle that each row stands on: a new one begins where a load turns.
+
+    A cycle comes by each level on the way up and on the way down, where a coarse gauge may read alike.
+    """
+    turns = np.zeros(len(table), dtype=np.int64)
+    for column in loads:
+        steps = np.diff(table.numbers(column, user))
+        moving = np.flatnonzero(steps)
+        turned = np.diff(np.sign(steps[moving])) != 0.0
+        turns[moving[1:][turned] + 1] = 1
+    return np.cumsum(turns)
 
 
 def _measured(

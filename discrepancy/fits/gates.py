@@ -98,9 +98,14 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
 
 
 def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
-    """Return name and p-value of the Ljung-Box test of each channel, its dynamic records combined."""
+    """Return name and p-value of the Ljung-Box test of each channel, its dynamic records combined.
+
+    Channels whose noise record is not white itself are left out, as in locating.
+    """
     tests = []
     for channel in np.flatnonzero(_dependent(problem, fit) == 1.0).tolist():
+        if not problem.tests_whiteness[channel]:
+            continue
         series, used, _ = records_of(problem, fit, channel)
         if series:
             tests.append((f"whiteness of {problem.channel_names[channel]}", whiteness(series, used)))

@@ -13,10 +13,12 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.beginnings import from_beginnings, refitted_from_beginnings
-from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, trial_rows
+from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, objective, trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.search_settings import SEARCH
 
 
 def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool = True) -> ResidualSet:
@@ -56,7 +58,40 @@ def held_out_fit(problem: Problem, found: CandidateFit) -> tuple[Problem, Candid
     if all(trial.name in problem.beginnings for trial in problem.campaign.held_out):
         start = from_beginnings(there, start)
     adapted = fit(there, found.candidate, start, local_only=True)
-    return there, refitted_from_beginnings(there, adapted, local_only=True)
+    adapted = refitted_from_beginnings(there, adapted, local_only=True)
+    if adapted.chi_square > SEARCH.far * float(there.counts.sum()):
+        start = _nearest_releases(there, found.candidate, start)
+        again = fit(there, found.candidate, start, local_only=True)
+        adapted = min(adapted, again, key=lambda item: item.objective)
+    return there, adapted
+
+
+RELEASES = tuple(np.linspace(-2.0, 2.0, 17).tolist())
+"""Amplitudes of a release from which the fit of a held-out trial may begin, in prior deviations; of a free
+initial state in tenths of the nominal one."""
+
+
+def _nearest_releases(there: Problem, candidate: Candidate, start: Point) -> Point:
+    """Return a start at the amplitudes of releases that leave least of each trial.
+
+    Where friction ends a motion each number of half swings has an optimum of its own.
+    """
+    nearest = list(start.local)
+    for number, data in enumerate(there.trials):
+        release, amplitude = data.trial.release, data.unknowns.zeros
+        if release is None or amplitude >= data.unknowns.size:
+            continue
+        nominal = 0.0 if release.at_rest else 1.0 / data.unknowns.scale[amplitude]
+        step = 1.0 if release.at_rest else 0.1 * nominal
+        least = np.inf
+        for size in nominal + step * np.array(RELEASES):
+            local = start.local[number].copy()
+            local[amplitude] = size
+            point = replace(start, local=(*nearest[:number], local, *nearest[number + 1 :]))
+            value = objective(there, candidate, point)
+            if value < least:
+                least, nearest[number] = value, local
+    return replace(start, local=tuple(nearest))
 
 
 def _predicted(

@@ -12,7 +12,7 @@ from math import inf
 
 import numpy as np
 
-from discrepancy.campaign.noise import NoiseModel, noise_model
+from discrepancy.campaign.noise import NoiseModel, noise_model, whiteness_is_tested
 from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError, said
@@ -78,6 +78,7 @@ class Problem:
             for name, channel in campaign.channels.items()
         }
         self.freedom = np.array([item.degrees_of_freedom for item in self.noise.values()])
+        self.tests_whiteness = [whiteness_is_tested(channel) for channel in campaign.channels.values()]
         self.refusals: dict[str, str] = {}
         self.beginnings: dict[str, FloatArray] = {}
         self._take(campaign.fitted)

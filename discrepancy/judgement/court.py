@@ -159,6 +159,19 @@ class Court:
         """Return how well the simulation of a hypothesis leaves noise alone."""
         return absolute_gate(self.problem, item)
 
+    def passes_absolute_fit(self, item: Any) -> bool:
+        """Whether the simulation of a hypothesis, fitted to the recorded noise, leaves noise alone."""
+        key = item.candidate.key
+        simulation = self.found.exact.get(key)
+        if simulation is None:
+            simulation = attempt(self.problem, item.candidate, self.begin(item))
+        return simulation is not None and absolute_gate(self.problem, simulation).passed is not False
+
+    def begin(self, item: Any) -> Point:
+        """Return the point from which the simulation of a hypothesis is fitted."""
+        point: Point = item.point
+        return point
+
     def beside(self, item: Any) -> str:
         """Return what else speaks against a name: a gate that it fails where it leaves noise."""
         if item.remainder is not None:
@@ -268,13 +281,15 @@ class Court:
         ]  # fmt: skip
         return min(simpler, key=lambda item: (_freedom(item), -self.score(item)), default=best)
 
-    def probability(self, item: Any) -> float:
-        """Return the probability of a hypothesis with all that hold its effects or their families."""
-        kept = [
-            one for one in self.ranked if not one.candidate.terms or one is item or not self._refuted(one)
-        ]
+    def probability(self, *items: Any) -> float:
+        """Return the probability that one of some hypotheses holds, with all that hold its families."""
+        kept = []
+        for one in self.ranked:
+            is_asked = any(one is item for item in items)
+            if is_asked or not one.candidate.terms or not self._refuted(one):
+                kept.append(one)
         scores = np.array([self.score(one) for one in kept])
-        holds = np.array([families(item) <= families(one) for one in kept])
+        holds = np.array([any(families(item) <= families(one) for item in items) for one in kept])
         if not holds.any():
             return 0.0
         return float(np.exp(logsumexp(scores[holds]) - logsumexp(scores)))
@@ -350,6 +365,10 @@ class ByForce(Court):
         (term,) = item.candidate.terms
         key = Candidate((replace(term, free_shape=True),)).key
         return next((one for one in self.ranked if one.candidate.key == key), None)
+
+    def begin(self, item: Any) -> Point:
+        """Return the point at which the missing force has a hypothesis."""
+        return self.force.whole_point(item)
 
     def beside(self, item: Any) -> str:
         """Return what else speaks against a name: nothing."""

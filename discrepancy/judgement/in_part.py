@@ -163,13 +163,18 @@ def _verdict_of(court: Court, first: Verdict) -> Outcome:
     members = [best, *court.rivals(best)]
     if len(members) > SEARCH.largest_group:
         return _unexplained(court, first, best, said("against.rivals", rivals=len(members) - 1))
-    probability = sum(court.probability(item) for item in members)
     if court.grew(best):
         return _unexplained(court, first, best)
-    if len(members) > 1:
-        return _group(court, members, probability)
-    if probability < SEARCH.sure or best.log_evidence - court.nothing.log_evidence < SEARCH.bayes_factor:
+    probability = court.probability(*members)
+    has_evidence = best.log_evidence - court.nothing.log_evidence >= SEARCH.bayes_factor
+    if probability < SEARCH.sure or not has_evidence:
         return _unexplained(court, first, best)
+    if len(members) > 1:
+        if all(map(court.passes_absolute_fit, members)):
+            return _group(court, members, probability)
+        others = listing([effects_text(named_effects(court.problem, item)) for item in members[1:]], "or")
+        why = f"it leaves more than noise, and these data do not tell it from {others}"
+        return _unexplained(court, first, best, why)
     return _in_part(court, best, probability)
 
 

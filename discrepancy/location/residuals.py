@@ -13,7 +13,12 @@ from functools import cached_property
 import numpy as np
 
 from discrepancy.campaign import noise_tests
-from discrepancy.campaign.noise import noise_model
+from discrepancy.campaign.noise import (
+    NOISE_RECORD_LEVEL,
+    noise_model,
+    record_at_rest,
+    whiteness_is_tested,
+)
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, Trial
 from discrepancy.errors import FitError, said
@@ -258,8 +263,6 @@ def quadratic_moments(
 
 SERIAL = (noise_tests.ljung_box, noise_tests.cumulative_periodogram)
 """Tests of whiteness."""
-NOISE_RECORD_LEVEL = 1e-3
-"""p-value below which a noise record itself counts as not white, or as holding a line."""
 
 
 @dataclass(frozen=True)
@@ -407,15 +410,14 @@ def coloured_noise(residuals: ResidualSet) -> dict[str, str]:
     """Return channels whose noise record itself is not white, with one sentence each."""
     remarks = {}
     for name, channel in residuals.channels.items():
-        samples = None if channel.noise is None else channel.noise.samples
-        if samples is None or samples.size < noise_tests.SHORTEST_SERIES or channel.noise is None:
+        series = record_at_rest(channel)
+        if series is None or channel.noise is None or whiteness_is_tested(channel):
             continue
-        series = samples - samples.mean()
         share, line, place = noise_tests.fisher_g(series)
         if line < NOISE_RECORD_LEVEL:
             interval = channel.noise.interval
             at = f" at {place / (series.size * interval):.4g} Hz" if interval else ""
             remarks[name] = said("location.line_in_noise", name=name, at=at, percent=100.0 * share)
-        elif min(test(series)[1] for test in SERIAL) < NOISE_RECORD_LEVEL:
+        else:
             remarks[name] = said("location.coloured_noise", name=name)
     return remarks

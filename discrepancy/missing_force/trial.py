@@ -21,6 +21,8 @@ from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
 from discrepancy.models.acting import divided
 from discrepancy.models.interface import PortedSystem
+from discrepancy.models.sensing import in_own_clock
+from fe.runtime.patch import ModelPatch
 
 from .kalman import driven
 
@@ -260,9 +262,11 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     fastest = float(np.max(np.abs(np.linalg.eigvals(base.generator)), initial=0.0))
     count = int(np.clip(np.ceil(fastest * interval / FINE_PHASE), COARSEST, FINEST))
 
+    from_its_begin, _ = in_own_clock(trial, ModelPatch())
+
     def moving(of_all: FloatArray, local: FloatArray) -> FloatArray:
         conditions = unknowns.conditions(trial, shared.parameters(of_all), local)
-        return np.stack(model.port_motion(trial, conditions, count))
+        return np.stack(model.port_motion(from_its_begin, conditions, count))
 
     local = point.local[number]
     here = moving(point.shared, local)

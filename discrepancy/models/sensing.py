@@ -14,6 +14,37 @@ from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Pr
 from fe.runtime.sensors import SensorRecord, apply_sensors, check_channels, clock_of
 
 
+def in_own_clock(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
+    """Return a trial whose stamps count from its first sample, if they are of another clock, and its patch.
+
+    Stamps of an epoch or of a logger that ran before are far from zero: models count from the trial's begin.
+    Those of a record that begins within its own length of zero stay, as a release is at zero.
+
+    Parameters
+    ----------
+    trial : Trial
+        With the stamps that its user gave.
+    patch : ModelPatch
+        Its windows are in these stamps, and move with them.
+    """
+    if not trial.is_dynamic or len(trial.time) < 2:
+        return trial, patch
+    first, last = float(trial.time[0]), float(trial.time[-1])
+    if abs(first) <= last - first:
+        return trial, patch
+    primitives = []
+    for item in patch:
+        windows = tuple(
+            window._replace(
+                begin=None if window.begin is None else window.begin - first,
+                end=None if window.end is None else window.end - first,
+            )
+            for window in item.windows
+        )
+        primitives.append(replace(item, windows=windows) if windows else item)
+    return replace(trial, time=trial.time - first), ModelPatch(tuple(primitives))
+
+
 def observe(
     model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch, conditions: Conditions
 ) -> Response:
@@ -42,6 +73,7 @@ def observe(
         If a sensor primitive names a channel that does not exist or has values that no sensor can have.
     """
     patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
+    trial, patch = in_own_clock(trial, patch)
     outputs, count = campaign.outputs(trial), len(trial.channels)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, outputs, patch, conditions)
@@ -116,6 +148,7 @@ def observe_response(
     For callers that keep the response of a structure and try sensors on it. The clock of the patch must be in
     the response. `across` are transverse and shear strain (N, C), which turned gauges see.
     """
+    trial, patch = in_own_clock(trial, patch)
     release = 1.0  # the nominal one; where the motion starts from the static shape, as that is scaled
     if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
         release = trial.release.displacement

@@ -22,6 +22,7 @@ from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
+from .other_optima import canonical_relatives, restarts, sets_at_other_places
 from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, starts, tried
 
 
@@ -240,6 +241,7 @@ class Search:
             self.longer()
         if not self.best().candidate.is_family and self.unexplained():
             self.fit_pairs()
+        self.move_effects()
         self.shorter()
         self.settle()
 
@@ -262,8 +264,33 @@ class Search:
             found = attempt(self.problem, item.candidate, force.whole_point(item))
             if found is not None:
                 self.keep(found, exact=True)
+        self.restart_leading_single(force)
+        self.move_effects()
         self.shorter()
         self.settle()
+
+    def restart_leading_single(self, force: ForceSearch) -> None:
+        """Fit the leading single effect from other sizes, unless one of canonical shape leaves noise alone.
+
+        Dry friction that ends a motion has an optimum for every number of half swings. The missing force
+        leads near the right one, the parameters that follow it may be left in the next. With a free shape a
+        law bends itself to a wrong optimum, so the laws of that family are tried whose shape is canonical.
+        """
+        if not self.unexplained() and not self.best().candidate.is_family:
+            return
+        singles = [fitted for fitted in self.exact.values() if len(fitted.candidate.terms) == 1]
+        if not singles:
+            return
+        (leading,) = max(singles, key=self.score).candidate.terms
+        for hypothesis in canonical_relatives(leading, self.forces):
+            self.tell(f"fitting {hypothesis.candidate.words} from other sizes")
+            for point in restarts(self.problem, hypothesis.candidate, force.whole_point(hypothesis)):
+                fitted = attempt(self.problem, hypothesis.candidate, point)
+                if fitted is None:
+                    continue
+                self.keep(fitted, exact=True)
+                if absolute_gate(self.problem, fitted).passed:
+                    return
 
     def unexplained(self) -> bool:
         """Whether the best candidate cannot be shown to explain the data."""
@@ -294,6 +321,25 @@ class Search:
             if not fitted or self.score(fitted[0]) <= before:
                 break
             current = fitted[0]
+
+    def move_effects(self) -> None:
+        """Fit the best set with one effect at another of its places, while the set leaves more than noise.
+
+        Rough fits keep one place of each set, and few steps may rank places wrongly.
+        """
+        best = self.best()
+        while len(best.candidate.terms) > 1 and self.unexplained():
+            for candidate in sets_at_other_places(best.candidate, self.problem.setting):
+                if candidate.key in self.exact:
+                    continue
+                fitted = attempt(
+                    self.problem, candidate, best.point, give_up=best.objective + SEARCH.out_of_reach
+                )
+                if fitted is not None:
+                    self.keep(fitted, exact=True)
+            if self.best() is best:
+                break
+            best = self.best()
 
     def shorter(self) -> None:
         """Leave one effect at a time out of the best set, while that makes a better one.

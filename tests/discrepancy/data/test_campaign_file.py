@@ -410,3 +410,10 @@ def test_damaged_files_are_refused_or_read_but_never_crash(tmp_path_factory, fil
         assert trial.values.shape == trial.used.shape == (len(trial.time), len(trial.channels))
         assert np.isfinite(trial.values).all()
         assert np.isfinite(trial.force).all()
+
+
+def test_a_cycle_of_a_coarse_gauge_that_reads_alike_up_and_down_is_read(tmp_path):
+    """Its rows stand on two branches of the load; within a branch the same row is refused still."""
+    cycle = "force,g17\n0,0.0\n1,0.5\n2,1.0\n1,0.5\n0,0.0\n1,0.5\n"
+    folder = campaign_folder(tmp_path, "plain", ("tip_up.csv", "", cycle))
+    np.testing.assert_allclose(read_campaign(folder).trials[0].force, [0.0, 1.0, 2.0, 1.0, 0.0, 1.0])
