@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
@@ -57,10 +56,9 @@ def from_beginnings(problem: Problem, point: Point) -> Point:
     known = problem.beginnings
     if any(data.trial.name not in known for data in problem.trials):
         bare = replace(point, effect=np.zeros(0))
-        for data, local in zip(problem.trials, _grown(problem, bare).local, strict=True):
-            known[data.trial.name] = local
-    local: tuple[FloatArray, ...] = tuple(known[data.trial.name] for data in problem.trials)
-    return replace(point, local=local)
+        for data, unknowns in zip(problem.trials, _grown(problem, bare).local, strict=True):
+            known[data.trial.name] = unknowns
+    return replace(point, local=tuple(known[data.trial.name] for data in problem.trials))
 
 
 def _grown(problem: Problem, point: Point) -> Point:
