@@ -56,8 +56,8 @@ def from_beginnings(problem: Problem, point: Point) -> Point:
     known = problem.beginnings
     if any(data.trial.name not in known for data in problem.trials):
         bare = replace(point, effect=np.zeros(0))
-        for data, own in zip(problem.trials, _grown(problem, bare).local, strict=True):
-            known[data.trial.name] = own
+        for data, unknowns in zip(problem.trials, _grown(problem, bare).local, strict=True):
+            known[data.trial.name] = unknowns
     return replace(point, local=tuple(known[data.trial.name] for data in problem.trials))
 
 
