@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import xarray as xr
@@ -39,10 +40,14 @@ from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
 from reporting.arrays import Float
+from reporting.choices import one_of
 from reporting.page import Page, Words
 from reporting.progress import Progress, reporter, stage
 from reporting.provenance import collect_provenance
 from reporting.words import brief, capital, plus_minus
+
+KeptProcedure = Literal["joint", "paper"]
+"""Procedure whose samples a calibration keeps."""
 
 NOTICEABLE = 2.0
 """Standard deviations from which a difference is pointed out."""
@@ -155,12 +160,19 @@ class WingCalibration:
         return save_calibration(self.result, path)
 
 
+def _check_request(procedure: KeptProcedure, seed: int) -> None:
+    """Refuse an unknown procedure, and a seed that is no whole number of 63 bits."""
+    one_of(procedure, get_args(KeptProcedure), "procedure")
+    if seed not in range(2**63):
+        raise CalibrationRecordError(f"`seed` must be a whole number from 0 to 2^63 - 1, and {seed!r} came.")
+
+
 def calibrate(
     lab: LabData | str | Path | None = None,
     design: WingDesign | None = None,
     *,
     asset: str | None = None,
-    procedure: Procedure = "joint",
+    procedure: KeptProcedure = "joint",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> WingCalibration:
@@ -187,9 +199,10 @@ def calibrate(
         If a step cannot be done; one class for each cause.
     FiniteElementError
         If the tailored wing cannot be built.
+    InvalidChoiceError
+        If `procedure` is another word.
     """
-    if procedure not in ("joint", "paper") or seed not in range(2**63):
-        raise CalibrationRecordError(said("posterior.asked", procedure=procedure, seed=seed))
+    _check_request(procedure, seed)
     progress = reporter(progress)
     if not isinstance(lab, LabData):
         lab = published_data() if lab is None else read_lab_folder(Path(lab))

@@ -4,7 +4,7 @@ import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from calibration.static.experiments import (
     published_measurements,
     read_measurements,
 )
+from reporting.choices import one_of
 from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.table_file import table_text
 
@@ -188,7 +189,11 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         records are asked for and there are none.
     ExperimentDataError
         If what is there cannot be a measurement; see the readers of the steps.
+    InvalidChoiceError
+        If `targets` is another word.
     """
+    if targets is not None:
+        one_of(targets, get_args(Targets), "targets")
     path = Path(path)
     if not path.is_dir():
         what = "no folder" if path.exists() else "not there"

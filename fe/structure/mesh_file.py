@@ -115,6 +115,8 @@ def read_by_meshio(path: Path) -> Deck:
     """Read the mesh of a file of any other format, see `read_mesh`."""
     found = _found_by_meshio(path)
     deck, where, suffix = Deck(path), str(path), path.suffix.lower()
+    if suffix == ".msh":
+        _check_element_lines(path)
     points = np.atleast_2d(found.points)
     points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
     deck.nodes = dict(enumerate(map(tuple, points.tolist()), start=1))
@@ -151,6 +153,27 @@ def read_by_meshio(path: Path) -> Deck:
             for name, places in named:
                 deck.members(key, name).extend(own[places].tolist())
     return deck
+
+
+def _check_element_lines(path: Path) -> None:
+    """Refuse a text file of Gmsh with more lines of elements than it declares: the last would be lost.
+
+    Version 2 declares the number of elements, version 4 the numbers of blocks and of elements; Gmsh writes
+    one line for each.
+    """
+    lines = [line.strip() for line in path.read_bytes().splitlines()]
+    is_text = lines[lines.index(b"$MeshFormat") + 1].split()[1] == b"0" if b"$MeshFormat" in lines else False
+    if not is_text or b"$Elements" not in lines or b"$EndElements" not in lines:
+        return
+    start = lines.index(b"$Elements") + 1
+    header, *rows = filter(None, lines[start : lines.index(b"$EndElements")])
+    declared = sum(int(number) for number in header.split()[:2])
+    if len(rows) > declared:
+        fail(
+            f"{path}, line {start + 1}",
+            f"$Elements declares {declared} lines of blocks and elements, but {len(rows)} follow, and the"
+            " last would be lost. Delete the line that is there twice, or write the mesh anew.",
+        )
 
 
 def _found_by_meshio(path: Path) -> Any:

@@ -26,13 +26,14 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field
 
 from fmu_asset.errors import BindingError, said
 from fmu_asset.instances.plan import Interface
 from fmu_asset.worker.client import WorkerLimits
+from reporting.choices import one_of
 from reporting.toml_file import Fault, Number, Positive, Section, checked, read_toml
 
 from .units import same_dimension
@@ -43,8 +44,22 @@ INPUT_ROLES = ("control", "health", "load")
 PORT_QUANTITIES = {"force": ("N", "N.m"), "displacement": ("m", "rad"), "velocity": ("m/s", "rad/s")}
 """What a mechanical port consists of, with its units where it is one of translation or of rotation."""
 
+StandardVersion = Literal["1.0", "2.0", "3.0"]
+"""Version of FMI that an FMU must be of."""
+
+StateChoice = Literal["auto", "serialised", "replay"]
+"""How a state is to be kept; auto trusts what the FMU declares."""
+
 Interpolation = Literal["zero-order", "linear"]
 """How inputs go on between communication points."""
+
+_HEADER_WORDS: Mapping[str, tuple[str | None, ...]] = {
+    "fmi_version": (*get_args(StandardVersion), None),
+    "interface": (*get_args(Interface), None),
+    "interpolation": get_args(Interpolation),
+    "state": get_args(StateChoice),
+}
+"""Words that the table `[binding]` may hold, by key."""
 
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _LARGEST_PATTERN = 100_000
@@ -233,12 +248,12 @@ class Header(Section):
     decimation: int = Field(default=1, ge=1, le=10_000_000)
     start_time: Number = 0.0
     stop_time: Number | None = None
-    fmi_version: Literal["1.0", "2.0", "3.0"] | None = None
+    fmi_version: StandardVersion | None = None
     interface: Interface | None = None
     tolerance: Positive | None = None
     interpolation: Interpolation = "zero-order"
     structural_parameters: dict[str, Number] = Field(default_factory=dict)
-    state: Literal["auto", "serialised", "replay"] = "auto"
+    state: StateChoice = "auto"
     description: str = ""
 
     def faults(self) -> Iterator[Fault]:
@@ -323,7 +338,16 @@ class Binding(Section):
         raise BindingError(said("binding.no_observation", self=self, name=name))
 
     def with_header(self, **changes: Any) -> "Binding":
-        """Return the binding with other values in its table `[binding]`, which are not checked."""
+        """Return the binding with other values in its table `[binding]`; only words are checked.
+
+        Raises
+        ------
+        InvalidChoiceError
+            If a word is none of those that the table may hold.
+        """
+        for name, allowed in _HEADER_WORDS.items():
+            if name in changes:
+                one_of(changes[name], allowed, name)
         return self.model_copy(update={"binding": self.binding.model_copy(update=changes)})
 
     def with_regions(self, regions: Sequence[str]) -> "Binding":

@@ -11,7 +11,7 @@ import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace as changed
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, Literal, TypedDict, Unpack, get_args
 
 from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.errors import FiniteElementError
@@ -39,6 +39,7 @@ from fmu_asset.instances.plan import Interface
 from fmu_asset.packing import contents
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
+from reporting.choices import one_of
 from reporting.files import hash_members
 from reporting.progress import Progress
 
@@ -120,6 +121,8 @@ def build_fmu(
         compiler for a compiled one.
     PatchFileError
         If the FMU cannot carry an effect of the patch.
+    InvalidChoiceError
+        If a kind, a version of FMI, an interface or a platform is none of those.
     """
     target = contents.checked_target(path, replace=replace)
     kind, fmi = options.get("kind", "python"), options.get("fmi", 2)
@@ -232,7 +235,14 @@ def check_form(
         The kind is not of that version of FMI, or a compiler is missing.
     PatchFileError
         The kind cannot carry missing effects.
+    InvalidChoiceError
+        A kind, a version of FMI, an interface or a platform is none of those.
     """
+    one_of(kind, get_args(FmuKind), "kind")
+    one_of(fmi, get_args(FmiVersion), "fmi")
+    one_of(interface, get_args(Interface), "interface")
+    for platform in platforms:
+        one_of(platform, get_args(Platform), "platforms")
     if kind == "python" and (fmi, interface) != (2, "co-simulation"):
         raise FmuBuildError(said("packing.python_kind", fmi=fmi, interface=interface))
     if patched and kind != "python":

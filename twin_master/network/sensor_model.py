@@ -5,19 +5,22 @@ Kapteyn et al. 2021, eqs. (30) and (32).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import rel_entr
 
 from reporting.arrays import Float, Index
+from reporting.choices import one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError, said
 from twin_master.network.kernels import LOG_ROOT_TWO_PI, log_densities, separated
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.transition import expect_controls, expect_shape
 
+Averaging = Literal["outside", "inside"]
+"""Whether draws are averaged over their likelihoods, or their predictions before it."""
 _WORST_SHOWN = 3
 LARGEST = 1e140
 """Its square is still a number."""
@@ -79,6 +82,8 @@ class GaussianSensorModel(QuantityModel):
     ------
     InvalidModelError
         If shapes do not fit, a value is not finite, a standard deviation not positive or an error negative.
+    InvalidChoiceError
+        If `average` is another word.
     """
 
     interval: Float
@@ -97,10 +102,11 @@ class GaussianSensorModel(QuantityModel):
         strain_per_draw: ArrayLike,
         standard_deviation: ArrayLike,
         draw_weight: ArrayLike | None = None,
-        average: Literal["outside", "inside"] = "outside",
+        average: Averaging = "outside",
         model_error: ArrayLike = 0.0,
         interval: ArrayLike | None = None,
     ) -> None:
+        one_of(average, get_args(Averaging), "average")
         super().__init__(strain_per_draw, draw_weight)
         for what, given, positive in (
             ("positive noise standard deviation", standard_deviation, True),
@@ -111,8 +117,6 @@ class GaussianSensorModel(QuantityModel):
             if value.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(value) & enough):
                 count = self.sensor_count
                 raise InvalidModelError(said("network.one_or_each", what=what, sensors=count, value=value))
-        if average not in ("outside", "inside"):
-            raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
         self.standard_deviation: Float = np.full(self.sensor_count, standard_deviation, np.float64)
         self.model_error: Float = np.full(self.sensor_count, model_error, np.float64)
         independent = np.hypot(

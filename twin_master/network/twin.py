@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
 from reporting.arrays import Float
+from reporting.choices import one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError, said
 from twin_master.network import graphical_model
@@ -35,6 +36,8 @@ _LARGEST = np.float64(1e150)
 """What is carried is below this, so that what follows from it are numbers, too."""
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
+DecisionBasis = Literal["filtered", "predicted"]
+"""Belief that the twin decides on: of the present turn, or of the next one."""
 DEFAULT_LAG = 50
 """Turns back that a twin smooths and may be revised."""
 
@@ -158,6 +161,8 @@ class Twin:
     ------
     InvalidModelError
         The policy has another shape or is none, there is no such control, or the lag is negative.
+    InvalidChoiceError
+        If `decide_on` is another word.
     """
 
     def __init__(
@@ -168,13 +173,14 @@ class Twin:
         policy: "ArrayLike | Planner",
         *,
         prediction_steps: int = 10,
-        decide_on: Literal["filtered", "predicted"] = "filtered",
+        decide_on: DecisionBasis = "filtered",
         lag: int | None = DEFAULT_LAG,
         first_control: int | str = 0,
         estimator: Estimator | None = None,
         safest: int | str | None = None,
         on_belief: BeliefPolicy | None = None,
     ) -> None:
+        one_of(decide_on, get_args(DecisionBasis), "decide_on")
         if lag is not None and lag < 0:
             raise InvalidModelError(f"expected a lag of 0 or more turns, or None for all, got {lag}")
         self.name = name

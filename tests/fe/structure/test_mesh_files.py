@@ -116,6 +116,23 @@ def test_physical_groups_of_gmsh_are_sets(tmp_path):
     refuses(tmp_path / "m.vtu", r"m\.vtu: 2 elements, such as 13, have the nodes of another")
 
 
+@pytest.mark.parametrize("file_format", ["gmsh22", "gmsh"])
+def test_a_doubled_line_of_gmsh_loses_no_element(file_format, tmp_path):
+    """The count in the file stays what it was, so that its last element would not be read."""
+    points, cells = box("tetra", (1, 1, 1))
+    tags = [np.ones(len(cells), dtype=np.int32)]
+    data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
+    path = tmp_path / "m.msh"
+    mesh = meshio.Mesh(points, [("tetra", cells)], cell_data=data)
+    meshio.write(path, mesh, file_format=file_format, binary=False)
+    assert len(read_mesh(path, 1.0, "m").cells) == len(cells)
+    lines = path.read_text().splitlines()
+    last = lines.index("$EndElements") - 1
+    lines.insert(last, lines[last - 1])
+    path.write_text("\n".join(lines) + "\n")
+    refuses(path, "but .* follow, and the last would be lost")
+
+
 def test_arrays_of_a_vtu_that_are_sets(tmp_path):
     """As meshio writes sets, and as a mask of zeros and ones; the values keep their names."""
     points, cells = box("hexahedron", (2, 1, 1))

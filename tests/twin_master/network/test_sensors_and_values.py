@@ -314,7 +314,6 @@ REFUSED = [
       for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[DEVIATION[:-1], np.inf])),
     *((lambda bad=bad: GaussianSensorModel(SHOWN, 1.0, SHARE, model_error=bad), "relative model error")
       for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1))),
-    (lambda: GaussianSensorModel(SHOWN, DEVIATION, SHARE, average="both"), "'outside' or 'inside'"),
     (lambda: GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=np.ones((2, 1, 1))),
      r"intervals of shape \(2, 1, 1, factors\), got \(2, 1, 1\)"),
     (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), rf"sensor values of shape \({SENSORS},\)"),
