@@ -277,22 +277,31 @@ def _add_element(deck: Deck, card: _Card) -> None:
 
 
 def cards(path: Path) -> list[_Card]:
-    """Return the words of the bulk data of a file."""
+    """Return the words of the bulk data of a file.
+
+    A continuation with a name goes to the line that ends with this name, also where others stand between.
+    """
     lines = [*lines_of((path,), _NASTRAN_COMMENT, _NASTRAN_INCLUDE)]
     start = next((number for number, (_, text) in enumerate(lines, start=1) if _BEGIN.match(text)), 0)
     found: list[_Card] = []
     marker = ""
+    awaiting: dict[str, _Card] = {}
     for where, text in lines[start:]:
         head, *fields, end = _fields(where, text.expandtabs(8))
         if head and head[0] not in "+*":
             found.append(_Card(head.upper().rstrip("*_"), where, fields))  # meshio writes CTETRA_
             if found[-1].word.startswith("ENDDATA"):
                 return found[:-1]
-        elif not found or (len(head) > 1 and marker and head[1:] != marker):
-            fail(where, f"the continuation {shown(head)} stands behind no line that it continues.")
+            card = found[-1]
         else:
-            found[-1].fields.extend(fields)
-        marker = end.lstrip("+*")
+            name = head[1:].upper()
+            if not found or (name and marker and name != marker and name not in awaiting):
+                fail(where, f"the continuation {shown(head)} stands behind no line that it continues.")
+            card = awaiting.pop(name, found[-1])
+            card.fields.extend(fields)
+        marker = end.lstrip("+*").upper()
+        if marker:
+            awaiting[marker] = card
     return found
 
 

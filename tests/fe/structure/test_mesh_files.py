@@ -16,6 +16,7 @@ from fe.elements.cells import jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.structure.deck import words_of
+from fe.structure.decks import cards
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_by_meshio, read_mesh
 from reporting.json_file import parse_json
@@ -258,6 +259,19 @@ def test_grid_points_of_any_coordinate_system(kind, form, tmp_path):
     assert len(mesh.cells_of("nastran:ref=7", "here")) == 2
     assert volume(mesh) == pytest.approx(1.0)
     assert mesh.remarks == ()
+
+
+@pytest.mark.parametrize("marker", ["+A", "+a"])
+def test_a_continuation_of_nastran_goes_to_the_line_with_its_marker(marker, tmp_path):
+    """Other lines may stand between, and the case of a marker does not count."""
+    first = "CHEXA          1       1       1       2       3       4       5       6"
+    grid = "GRID           1              0.      0.      0."
+    rest = "+A             7       8"
+    (tmp_path / "m.bdf").write_text("\n".join([first + marker, grid, rest]))
+    hexahedron, point = cards(tmp_path / "m.bdf")
+    assert hexahedron.fields[2:10] == list("12345678")
+    assert point.fields[2:5] == ["0."] * 3
+    assert not any(point.fields[5:])
 
 
 def test_real_numbers_and_lines_of_nastran(tmp_path):
