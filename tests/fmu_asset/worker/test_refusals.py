@@ -112,7 +112,7 @@ def test_the_flight_of_a_watched_fmu_in_python_is_the_same_and_no_file_is_refuse
     plain = outputs()
     with watch_for_refusals() as report:
         assert outputs() == plain
-        assert set(report.counts) <= {"sockets"}  # by which the C library looks up the user's name
+        assert set(report.counts) <= {"sockets"}  # which Python or its libraries try on their own
 
 
 @pytest.mark.parametrize(
