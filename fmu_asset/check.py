@@ -6,7 +6,7 @@ When it is flown: the same twice, finite, resumable, at other steps, again and a
 import os
 import zipfile
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,8 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import contradictions
 from fmu_asset.errors import BindingError, FmuCallError, FmuError, said, visible
 from fmu_asset.packing.structure_fmu import recorded_content_hash
+from fmu_asset.worker.refusals import watch_for_refusals
+from fmu_asset.worker.sandbox import landlock_version
 from reporting.arrays import Float
 from reporting.progress import Progress, reporter
 from reporting.units import meaning_of
@@ -265,11 +267,13 @@ class Flights:
             self._series = self._fly()
         except FmuError as error:
             yield "first flight", "problem", _sentence(error)
+            yield "sandbox", *self._sandbox()
             for name in [*others, "instances"]:
                 yield name, "skipped", "It does not fly."
             return
         step = self._binding.interval
         yield "first flight", "ok", f"{_STEPS} steps of {step:g} s, {self._series.shape[1]} finite outputs."
+        yield "sandbox", *self._sandbox()
         for name, check in others.items():
             with progress.stage(f"Checking {name}"):
                 try:
@@ -306,6 +310,15 @@ class Flights:
         return _outputs(asset, _STEPS)
 
     # ------------------------------------------------------------------ the checks
+
+    def _sandbox(self) -> Told:
+        """Fly once more, and count what the sandbox refuses until the flight ends or fails."""
+        if not (self._binding.limits.sandbox and landlock_version()):
+            return "skipped", "There is no sandbox: the binding turns it off, or the kernel has none."
+        with watch_for_refusals() as report:
+            with suppress(FmuError):
+                self._fly()
+            return report.verdict(), report.sentence()
 
     def _determinism(self) -> Told:
         again = self._fly()

@@ -13,6 +13,7 @@ from fmu_asset.errors import FmuWorkerError
 from fmu_asset.folders import end_processes
 
 from .protocol import WORKER_NUMBER, Exit, ended, receive
+from .refusals import report_descriptor
 from .sandbox import Grants, landlock_version
 
 CLOSE_LIMIT = 2.0
@@ -69,14 +70,17 @@ class WorkerProcess:
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         environment |= {"PYTHONDONTWRITEBYTECODE": "1", "TMPDIR": str(folder)}
         confined = "" if grants is None else json.dumps(asdict(grants))
+        report = report_descriptor()
+        watched = "" if report is None else str(report)
         try:
             with (folder / "worker.log").open("wb") as log:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", program, root, str(folder), shared, confined],
+                    [sys.executable, "-P", "-c", program, root, str(folder), shared, confined, watched],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=log,
                     bufsize=0,
+                    pass_fds=() if report is None else (report,),
                     cwd=folder,
                     env=environment,
                     # What the terminal sends is for the twin alone.

@@ -177,6 +177,12 @@ _CALLS: dict[str, tuple[int, tuple[int, int, int, int], int, _Numbers, _Numbers,
 }  # fmt: skip
 
 
+def refused_calls() -> tuple[int, ...]:
+    """Return the numbers of the system calls that the filter refuses whatever their arguments are."""
+    machine = os.uname().machine
+    return _CALLS[machine][4] if machine in _CALLS else ()
+
+
 def _filter_calls(*, tcp: bool) -> None:
     """Refuse what else reaches other processes; sockets of the internet only where a port is granted."""
     if os.uname().machine not in _CALLS or sys.maxsize < 2**32:
