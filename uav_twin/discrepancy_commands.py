@@ -210,20 +210,29 @@ def import_files(
     column: list[str] | None = None,
     unit: list[str] | None = None,
     quantity: list[str] | None = None,
+    scale: list[str] | None = None,
+    zero: list[str] | None = None,
+    gain: list[str] | None = None,
+    hold: list[str] | None = None,
     kind: list[str] | None = None,
     release: list[str] | None = None,
     load_place: list[str] | None = None,
     decimal: list[str] | None = None,
+    interval: list[str] | None = None,
+    begins: list[str] | None = None,
+    held_out: list[str] | None = None,
     reference_temperature: str | None = None,
     model: str | None = None,
 ) -> None:
     """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say."""
     folder = out or Path(files[0].stem)
     refuse_filled(folder)
-    given = (column, unit, quantity, kind, release, load_place, decimal)
+    of_columns = (column, unit, quantity, scale, zero, gain, hold)
+    kept_for_proof = [f"{name}=yes" for name in held_out or ()]
+    of_files = (kind, release, load_place, decimal, interval, begins, kept_for_proof)
     answers = {
         option: {about: value for about, _, value in (item.rpartition("=") for item in said or ())}
-        for option, said in zip((*parts.OF_COLUMNS, *parts.OF_FILES), given, strict=True)
+        for option, said in zip((*parts.OF_COLUMNS, *parts.OF_FILES), (*of_columns, *of_files), strict=True)
     }
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
@@ -233,22 +242,36 @@ def import_files(
         found = parts.Understanding(found.sheets, answers, known)
     _show_understood(found)
     asked = sys.stdin.isatty() and sys.stdout.isatty()
-    if asked and found.questions:
-        while found.questions:
+    if asked and (found.questions or found.assumptions):
+        while found.questions or found.assumptions:
             found = _asked(found)
         _show_understood(found)
     campaign = found.campaign(folder.resolve().name)
     if asked and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
         raise typer.Exit(1)
-    parts.write_campaign(campaign, folder, si=True)
-    options.show("import", folder=folder, campaign=campaign, given=words_of(folder, model))
+    parts.write_campaign(campaign, folder, si=True, units=found.units())
+    assumed = []
+    if found.assumed:
+        remedy = "give --zero and --gain, or correct offset_deviation and gain_deviation"
+        assumed = [f"{found.assumed} Where you know better, {remedy} in {folder / 'campaign.toml'}."]
+    given = words_of(folder, model)
+    options.show("import", folder=folder, campaign=campaign, given=given, assumed=assumed)
 
 
 def _asked(found: "parts.Understanding") -> "parts.Understanding":
-    """Return what is understood with one answer more; one that does not fit is told, and changes nothing."""
-    (option, expected), (about, *_) = next(iter(found.questions.items()))
-    said = typer.prompt(f"{about}, {option} ({expected})" if about else f"{option} ({expected})")
+    """Return what is understood with one answer more; one that does not fit is told, and changes nothing.
+
+    What must be said comes first, then what has a default, which an empty line takes.
+    """
+    default = None
+    if found.questions:
+        (option, expected), (about, *_) = next(iter(found.questions.items()))
+    else:
+        (option, expected), defaults = next(iter(found.assumptions.items()))
+        about, default = next(iter(defaults.items()))
+    question = f"{about}, {option} ({expected})" if about else f"{option} ({expected})"
+    said: str = typer.prompt(question, default=default)
     try:
         return found.with_answer(option, about, said.strip())
     except CampaignFileError as error:

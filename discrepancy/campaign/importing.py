@@ -2,14 +2,26 @@
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from math import isfinite
 from typing import Any
 
-import numpy as np
-
+from discrepancy.campaign.columns import (
+    EXACT,
+    FREE,
+    INPUT,
+    LEFT_OUT,
+    NOISE,
+    Column,
+    gain_deviation,
+    load_or_time,
+    release_in_si,
+    sampling_interval,
+    scaled_unit,
+    zero_deviation,
+)
 from discrepancy.campaign.reading import TABLE_ERRORS, assemble
-from discrepancy.campaign.records import Campaign, Quantity, TrialKind
-from discrepancy.campaign.sampling import as_meant
+from discrepancy.campaign.records import Campaign, Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import (
@@ -25,66 +37,22 @@ from reporting.files import hash_record
 from reporting.table_file import TextTable
 from reporting.words import be, counted, listing
 
-NOISE, LEFT_OUT, INPUT = "noise", "-", "input:"
-"""Kind of a file of samples at rest, role of a column that is left out, and how that of an input begins."""
 KINDS = (*TrialKind, NOISE)
-OF_COLUMNS, OF_FILES = ("column", "unit", "quantity"), ("kind", "release", "load-place", "decimal")
-"""Options that are about columns, and about files or (under an empty name) all of them."""
+OF_COLUMNS = ("column", "unit", "quantity", "scale", "zero", "gain", "hold")
+"""Options that are about columns."""
+OF_FILES = ("kind", "release", "load-place", "decimal", "interval", "begins", "held-out")
+"""Options that are about files or, under an empty name, all of them."""
+OF_ALL_COLUMNS = ("zero", "gain", "hold")
+"""Options about columns that may, under an empty name, be about all of them."""
+ASSUMED_ZERO, ASSUMED_GAIN = "1%", "2%"
+"""How well a zero (of the largest reading) and a gain are taken to be known where nobody says it."""
+_TIMED = (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN, NOISE)
 _SI = dict(zip(INPUT_COLUMNS, ("s", "N", "1", "degC", "1", "1", "1", "1"), strict=True))
 _UNTITLED = re.compile(r".*\.xls[mx]#|\.[^.]*$")
-_HELD = (Quantity.DISPLACEMENT, Quantity.SIGNAL)
 _STRAIN = re.compile(r".*(strain|[εϵ]|m/m)")
 
 Answers = Mapping[str, Mapping[str, str]]
 """What was said, by option and by the column or file that it is about."""
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column as it is understood; None and empty texts where a question is open.
-
-    Attributes
-    ----------
-    sheet : Sheet
-        Where it is from.
-    head : str
-        Its name, without a unit.
-    role : str
-        `LEFT_OUT`, a column that every table may have (`time`, `force`), `INPUT` and a name, or an output.
-    unit, si : str
-        As written or said, and in SI.
-    quantity : Quantity or None
-        Of a channel or an input.
-    to_si : float or None
-        What one of the unit is in SI.
-    """
-
-    sheet: Sheet
-    head: str
-    role: str
-    unit: str
-    si: str = ""
-    quantity: Quantity | None = None
-    to_si: float | None = None
-
-    @property
-    def title(self) -> str:
-        """Its name in the campaign."""
-        return self.head if self.quantity and INPUT not in self.role else self.role.removeprefix(INPUT)
-
-    def in_si(self, decimal: str) -> tuple[str, ...]:
-        """Return its cells in SI, empty where too little is known."""
-        if self.to_si is None or not decimal:
-            return ("",) * len(self.sheet.lines)
-        cells = self.sheet.numbers(self.head, decimal)
-        if self.to_si == 1.0:
-            return cells
-        values = np.array([float(cell or "nan") for cell in cells])
-        if self.role == "time" and len(cells) > 1 and np.all(np.diff(values) > 0.0):
-            values = as_meant(values, cells)  # minutes of few digits may be even
-        # two digits less than a float may need, so that no rounding shows: 4.387 mm is 0.004387 m
-        shown = (f"{value * self.to_si:.15g}" for value in values.tolist())
-        return tuple(cell and text for cell, text in zip(cells, shown, strict=True))
 
 
 class Understanding:
@@ -113,12 +81,14 @@ class Understanding:
     ) -> None:
         self.sheets, self.answers, self._quantity_of = sheets, answers, quantity_of
         self.questions: dict[tuple[str, str], list[str]] = {}
+        self.assumptions: dict[tuple[str, str], dict[str, str]] = {}
         names = [sheet.name for sheet in sheets]
         if len({*names}) < len(names):
             raise CampaignFileError(said("sheets.one_name", names=listing(names)))
         heads = dict.fromkeys(head for sheet in sheets for head in sheet.heads)
-        for options, known in ((OF_COLUMNS, [*heads]), (OF_FILES, [*names, ""])):
+        for options, about in ((OF_COLUMNS, [*heads]), (OF_FILES, [*names, ""])):
             for option in options:
+                known = [*about, ""] if option in OF_ALL_COLUMNS else about
                 for name in answers.get(option, {}).keys() - {*known}:
                     of = listing(map(repr, filter(None, known)), "or")
                     raise CampaignFileError(said("sheets.about", option=option, of=of, name=name))
@@ -137,6 +107,12 @@ class Understanding:
         ]
         ringing = [name for name, kind in self.kinds.items() if kind == TrialKind.RINGDOWN]
         self.releases = {name: self._release(name) for name in ringing}
+        self.intervals = {sheet.name: self._interval(sheet) for sheet in sheets}
+        self.zeros = {column.head: self._zero(column) for column in self._with_zero()}
+        self.gains = {column.head: self._gain(column.head) for column in self.columns if column.is_channel}
+        self.holds = {column.head: self._hold(column) for column in self.columns if self._is_held(column)}
+        self.begins = {name: self._begins(name) for name in names}
+        self.held_out = {name: self._held_out(name) for name in names}
         self.reference_temperature = None
         if any(column.role == "temperature" for column in self.columns):
             given = self._said("reference-temperature", "", "degC, at which the model's parameters hold")
@@ -161,19 +137,157 @@ class Understanding:
             raise CampaignFileError(f"--{option} must be {listing(choices, 'or')}, and {answer!r} came.")
         return answer or ""
 
+    def _said_or(
+        self, default: str, option: str, about: str, expected: str, choices: Collection[str] = ()
+    ) -> str:
+        """Return an answer; the default, and an assumption, where there is none."""
+        given = self.answers.get(option, {})
+        if about not in given and "" not in given:
+            self.assumptions.setdefault((option, expected), {})[about] = default
+            return default
+        return self._said(option, about, expected, choices)
+
+    def _is_assumed(self, option: str, about: str) -> bool:
+        return any(key[0] == option and about in names for key, names in self.assumptions.items())
+
+    # ---------------------------------------------------------------- zeros and gains
+
+    def _with_zero(self) -> list[Column]:
+        """Return the first column of each channel or input whose unit and quantity are known."""
+        first: dict[str, Column] = {}
+        for column in self.columns:
+            if column.quantity is not None:
+                first.setdefault(column.head, column)
+        return [*first.values()]
+
+    def _zero(self, column: Column) -> float | str:
+        """Return the standard deviation of a zero in SI, or "free"."""
+        default = ASSUMED_ZERO if column.is_channel else EXACT
+        expected = (
+            f"how well its zero is known in each trial: a standard deviation such as 0.1{column.read_in} "
+            f"or 1% of the largest reading, {EXACT} or {FREE}"
+        )
+        answer = self._said_or(default, "zero", column.head, expected)
+        return zero_deviation(column, answer, self._largest(column.head))
+
+    def _largest(self, head: str) -> float:
+        """Return the largest reading of a column in all trials, in SI; zero while it cannot be read."""
+        largest = 0.0
+        for column in self.columns:
+            if column.head == head and self.kinds[column.sheet.name] != NOISE:
+                readings = (float(cell) for cell in column.in_si(self.decimals[column.sheet.name]) if cell)
+                largest = max(largest, *map(abs, filter(isfinite, readings)), 0.0)
+        return largest
+
+    def _gain(self, head: str) -> float | str:
+        """Return the relative standard deviation of a gain, or "free"."""
+        expected = (
+            f"how well its gain is known: a standard deviation such as 2%, {EXACT}, or {FREE} for a signal"
+        )
+        answer = self._said_or(ASSUMED_GAIN, "gain", head, expected)
+        return gain_deviation(head, answer)
+
+    @property
+    def assumed(self) -> str:
+        """Which zeros and gains nobody stated, and as what they are taken; empty where all are stated."""
+        parts = []
+        for column in self._with_zero():
+            zero = self.zeros[column.head]
+            if column.is_channel and self._is_assumed("zero", column.head) and not isinstance(zero, str):
+                assert column.quantity is not None
+                deviation = zero / conversion_of(column.quantity, column.read_in)
+                parts.append(f"the zero of {column.head!r} to {deviation:.2g} {column.read_in}")
+        gains = [repr(head) for head in self.gains if self._is_assumed("gain", head)]
+        if gains:
+            several = "gains" if gains[1:] else "gain"
+            parts.append(f"the {several} of {listing(gains)} to {ASSUMED_GAIN.replace('%', ' %')}")
+        if not parts:
+            return ""
+        return f"Zeros and gains that nobody stated are assumed to be known: {listing(parts)}."
+
+    # ---------------------------------------------------------------- trials
+
+    def _interval(self, sheet: Sheet) -> float | None:
+        """Return the sampling interval of a table without a time [s]; None where it has one or needs none."""
+        columns = [column for column in self.columns if column.sheet is sheet]
+        given = self.answers.get("interval", {})
+        if any(column.role == "time" for column in columns):
+            if sheet.name in given:
+                raise CampaignFileError(
+                    f"{sheet.name} has a column of times, and --interval came for it: leave one of them out."
+                )
+            return None
+        understood = all(column.role for column in columns)  # else one of them may be the time
+        if not understood or self.kinds[sheet.name] not in _TIMED:
+            return None
+        answer = self._said("interval", sheet.name, "seconds between its rows, as no column is a time")
+        if not answer:
+            return None
+        return sampling_interval(answer)
+
+    def _is_held(self, column: Column) -> bool:
+        """Whether it is a load that is known at samples only; motions are smooth."""
+        if self.kinds[column.sheet.name] == TrialKind.FORCED:
+            return column.role == "force"
+        moving = column.quantity is not None and bool(column.quantity.moving)
+        return INPUT in column.role and column.quantity is not None and not moving
+
+    def _hold(self, column: Column) -> str | None:
+        """Return what a load does between its samples; None where nobody said it."""
+        kinds = [*map(str, Hold)]
+        expected = f"what it does between its samples, {listing(kinds, 'or')}"
+        answer = self._said_or(Hold.LINEAR.value, "hold", column.head, expected, kinds)
+        return None if self._is_assumed("hold", column.head) else answer
+
+    def _begins(self, file: str) -> str | None:
+        """Return how a forced or driven trial begins; None where nobody said it."""
+        if self.kinds[file] not in (TrialKind.FORCED, TrialKind.DRIVEN):
+            if file in self.answers.get("begins", {}) and self.kinds[file]:
+                raise CampaignFileError(
+                    f"--begins is for forced and driven trials, and {file} is {self.kinds[file]}."
+                )
+            return None
+        kinds = [*map(str, Start)]
+        expected = (
+            f"how it begins, {listing(kinds, 'or')}: at rest under what acts at first, under nothing, or not"
+        )
+        answer = self._said_or(Start.SETTLED.value, "begins", file, expected, kinds)
+        return None if self._is_assumed("begins", file) else answer
+
+    def _held_out(self, file: str) -> bool:
+        """Return whether a trial is kept for proof."""
+        trials = [name for name, kind in self.kinds.items() if kind != NOISE]
+        given = self.answers.get("held-out", {})
+        if self.kinds[file] == NOISE or not (trials[1:] or given):
+            if file in given:
+                raise CampaignFileError(f"--held-out is for trials, and {file} holds samples at rest.")
+            return False
+        expected = "whether it is kept for proof and not fitted, yes or no"
+        return self._said_or("no", "held-out", file, expected, ("yes", "no")) == "yes"
+
     def _release(self, file: str) -> dict[str, Any]:
         question = "how far the point was held that was let go, such as 15.5mm"
         given = self._said("release", file, question) or "1m"
-        if found := re.fullmatch(r"\s*([-+]?\d+\.?\d*(?:e[-+]?\d+)?)\s*(\S+)\s*", given, re.ASCII):
-            for quantity in (item for item in _HELD if item in quantities_of(found[2])):
-                size = float(found[1]) * conversion_of(quantity, found[2])
-                return {"displacement": size, "unit": UNITS[quantity].si}
-        raise CampaignFileError(said("campaign.release", given=given))
+        return release_in_si(given)
 
     # ---------------------------------------------------------------- columns
 
-    def _column(self, sheet: Sheet, head: str, unit: str) -> Column:
+    def _scaled(self, head: str, unit: str) -> tuple[str, str, float]:
+        """Return the unit of a column's cells, that of its readings, and one cell's unit in the latter."""
         unit = self.answers.get("unit", {}).get(head, unit)
+        scale = self.answers.get("scale", {}).get(head)
+        if scale is None:
+            return unit, unit, 1.0
+        return scaled_unit(head, unit, scale)
+
+    def _column(self, sheet: Sheet, head: str, unit: str) -> Column:
+        cell_unit, unit, factor = self._scaled(head, unit)
+        column = self._column_read_in(sheet, head, unit)
+        to_si = None if column.to_si is None else factor * column.to_si
+        return replace(column, unit=cell_unit, read_in=unit, to_si=to_si)
+
+    def _column_read_in(self, sheet: Sheet, head: str, unit: str) -> Column:
+        """Return a column whose readings are in a unit."""
         role = self._role(sheet, head, unit)
         if not unit and role != LEFT_OUT:
             self._said("unit", head, "such as mm, kN or ms; 1 for a mere number")
@@ -206,10 +320,10 @@ class Understanding:
         driven = self.kinds[sheet.name] not in (TrialKind.STATIC, TrialKind.FORCED, TrialKind.RINGDOWN, NOISE)
         if answer is not None or (called in _SI and not (driven and called == "force")):
             return called if answer is None else answer
-        units = self.answers.get("unit", {})
-        kinds = [_kind(units.get(*pair)) for pair in zip(sheet.heads, sheet.units, strict=True)]
-        if kinds.count(_kind(unit)) == 1 and _kind(unit) in (("time",) if driven else ("time", "force")):
-            return _kind(unit)
+        kind = load_or_time(unit)
+        kinds = [load_or_time(self._scaled(*pair)[1]) for pair in zip(sheet.heads, sheet.units, strict=True)]
+        if kinds.count(kind) == 1 and kind in (("time",) if driven else ("time", "force")):
+            return kind
         if self._quantity_of is not None and self._quantity_of(head) is not None:
             return head
         what = f"{', '.join(INPUT_COLUMNS[:4])}, {INPUT}NAME, or {LEFT_OUT} to leave it out"
@@ -256,13 +370,13 @@ class Understanding:
         for item in self.columns:
             if item.quantity is not None:
                 what = {"name": item.title, "quantity": item.quantity.value, "unit": item.si}
-                what |= {} if INPUT in item.role else {"output": item.role}
+                what |= self._stated(item)
                 if (inputs if INPUT in item.role else channels).setdefault(item.title, what) != what:
                     raise CampaignFileError(f"{item.title!r} is something else in {item.sheet.name}.")
         content: dict[str, Any] = {
             "format": FORMAT, "name": name, "channel": [*channels.values()], "input": [*inputs.values()],
             "trial": [self._trial(file) for file, kind in self.kinds.items() if kind != NOISE],
-            "remarks": [self._origin(sheet) for sheet in self.sheets],
+            "remarks": [*(self._origin(sheet) for sheet in self.sheets), *filter(None, [self.assumed])],
         }  # fmt: skip
         if resting := [file for file, kind in self.kinds.items() if kind == NOISE]:
             content["noise"] = {"file": resting[0]}
@@ -274,9 +388,37 @@ class Understanding:
         # whoever reads what is written remarks on it as it is by then
         return replace(assemble(section, tables, origin), remarks=section.remarks)
 
+    def _stated(self, column: Column) -> dict[str, Any]:
+        """Return what `[[channel]]` or `[[input]]` says of a column beside its name, quantity and unit."""
+        stated: dict[str, Any] = {"hold": self.holds.get(column.head)}
+        if column.is_channel:
+            stated = {"output": column.role, "gain_deviation": self.gains[column.head]}
+        stated["offset_deviation"] = self.zeros[column.head]
+        return {key: value for key, value in stated.items() if value is not None}
+
+    def units(self) -> dict[str, str]:
+        """Return the unit in which each channel was read, of several the first."""
+        units: dict[str, str] = {}
+        for column in self.columns:
+            if column.is_channel:
+                is_temperature = column.quantity is Quantity.TEMPERATURE
+                units.setdefault(column.title, column.si if is_temperature else column.read_in)
+        return units
+
     def _trial(self, file: str) -> dict[str, Any]:
         places = self.answers.get("load-place", {})
-        known = {"release": self.releases.get(file), "load_place": places.get(file, places.get(""))}
+        holds = [
+            self.holds[column.head]
+            for column in self.columns
+            if column.sheet.name == file and column.role == "force" and self._is_held(column)
+        ]
+        known = {
+            "release": self.releases.get(file),
+            "load_place": places.get(file, places.get("")),
+            "hold": holds[0] if holds else None,
+            "begins": self.begins[file],
+            "held_out": self.held_out[file] or None,
+        }
         given = {key: value for key, value in known.items() if value is not None}
         return {"name": _UNTITLED.sub("", file), "kind": self.kinds[file], "file": file, **given}
 
@@ -287,19 +429,20 @@ class Understanding:
         if twice := next((title for title in titles if titles.count(title) > 1), None):
             raise CampaignFileError(said("sheets.twice", file=sheet.name, title=twice))
         columns = {item.title: item.in_si(self.decimals[sheet.name]) for item in used}
+        interval = self.intervals[sheet.name]
+        if interval is not None:
+            stamps = tuple(f"{row * interval:.15g}" for row in range(len(sheet.lines)))
+            columns = {"time": stamps, **columns}
         return TextTable(sheet.name, columns, sheet.lines, TABLE_ERRORS)
 
     def _origin(self, sheet: Sheet) -> str:
         used = [item for item in self.columns if item.sheet is sheet and item.role != LEFT_OUT]
-        columns = listing(f"{item.head!r} [{item.unit}] is {item.role}" for item in used)
+        scales = self.answers.get("scale", {})
+        columns = listing(
+            f"{item.head!r} [{item.unit}]{f' times {scales[item.head]}' if item.head in scales else ''} "
+            f"is {item.role}"
+            for item in used
+        )
         empty = sum(sheet.columns[sheet.heads.index(item.head)].count("") for item in used)
         left = f"; {counted(empty, 'cell')} {be(empty)} empty" if empty else ""
         return f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: {columns}{left}."
-
-
-def _kind(unit: str) -> str:
-    """Return "time" or "force" where a unit is one of them."""
-    try:
-        return "time" if conversion(unit, "s") else ""
-    except ValueError:
-        return "force" if Quantity.FORCE in quantities_of(unit) else ""

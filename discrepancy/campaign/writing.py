@@ -1,7 +1,8 @@
 """Writing a campaign as a folder that `campaign.reading.read_campaign` reads back."""
 
 import re
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,25 @@ NOISE_FILE = "noise.csv"
 """Name of the table of samples at rest."""
 
 
-def write_campaign(campaign: records.Campaign, folder: str | Path, *, si: bool = False) -> Path:
+_EXACT_DIGITS, _SHOWN_DIGITS = 17, 15
+"""Digits that keep a float as it is, and that show 4.387 as such after it was in another unit."""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Units of the channels in the files, and significant digits of readings."""
+
+    units: Mapping[str, str]
+    digits: int
+
+
+def write_campaign(
+    campaign: records.Campaign,
+    folder: str | Path,
+    *,
+    si: bool = False,
+    units: Mapping[str, str] | None = None,
+) -> Path:
     """Write a campaign; `read_campaign` gives it back, equal to rounding but for its hash.
 
     Strain is written in microstrain, displacement in mm, the rest in SI (all, if asked for). `campaign.toml`
@@ -32,6 +51,9 @@ def write_campaign(campaign: records.Campaign, folder: str | Path, *, si: bool =
         Made if it is missing; files of the same names are replaced.
     si : bool
         Write strain and displacement in SI, too.
+    units : mapping of str to str, optional
+        Unit of each channel in the files, by the channel's name, in the place of these; readings have 15
+        significant digits then.
 
     Returns
     -------
@@ -47,15 +69,20 @@ def write_campaign(campaign: records.Campaign, folder: str | Path, *, si: bool =
         As `reporting.files.atomic_file`.
     """
     folder = Path(folder)
+    layout = _Layout(
+        units={name: _unit(channel, si) for name, channel in campaign.channels.items()} | dict(units or {}),
+        digits=_EXACT_DIGITS if units is None else _SHOWN_DIGITS,
+    )
     slugs = (re.sub(r"[^a-z0-9]+", "_", trial.name.lower()).strip("_")[:40] for trial in campaign.trials)
     files = [f"{number:02d}_{slug or 'trial'}.csv" for number, slug in enumerate(slugs, start=1)]
     texts = {
-        file: _trial_table(campaign, trial, si) for file, trial in zip(files, campaign.trials, strict=True)
+        file: _trial_table(campaign, trial, layout)
+        for file, trial in zip(files, campaign.trials, strict=True)
     }
-    noise = _noise_table(campaign, si)
+    noise = _noise_table(campaign, layout)
     if noise:
         texts[NOISE_FILE] = noise[0]
-    texts[CAMPAIGN_FILE] = _campaign_text(campaign, files, noise[1] if noise else None, si)
+    texts[CAMPAIGN_FILE] = _campaign_text(campaign, files, noise[1] if noise else None, layout)
     for name, text in texts.items():
         atomic_write_text(folder / name, text)
     return folder
@@ -64,7 +91,7 @@ def write_campaign(campaign: records.Campaign, folder: str | Path, *, si: bool =
 # ---------------------------------------------------------------- tables
 
 
-def _trial_table(campaign: records.Campaign, trial: records.Trial, si: bool) -> str:
+def _trial_table(campaign: records.Campaign, trial: records.Trial, layout: _Layout) -> str:
     columns: dict[str, records.FloatArray] = {}
     if trial.is_dynamic or np.any(trial.time != trial.start):
         columns["time"] = trial.time
@@ -83,7 +110,7 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, si: bool) -> 
                 columns[key] = values[:, index]
     columns |= {item.name: item.values for item in trial.inputs}
     for index, name in enumerate(trial.channels):
-        columns[name] = _in_unit(trial.values[:, index], campaign.channels[name], si)
+        columns[name] = _in_unit(trial.values[:, index], campaign.channels[name], layout)
     return table_text(columns)
 
 
@@ -93,11 +120,14 @@ def _unit(item: records.InTables, si: bool) -> str:
     return UNITS[item.quantity].si if si else UNITS[item.quantity].written
 
 
-def _in_unit(values: records.FloatArray, channel: records.Channel, si: bool) -> records.FloatArray:
-    return values / conversion_of(channel.quantity, _unit(channel, si))
+def _in_unit(values: records.FloatArray, channel: records.Channel, layout: _Layout) -> records.FloatArray:
+    in_unit = values / conversion_of(channel.quantity, layout.units[channel.name])
+    if layout.digits == _EXACT_DIGITS:
+        return in_unit
+    return np.array([float(f"{value:.{layout.digits}g}") for value in in_unit.tolist()])
 
 
-def _noise_table(campaign: records.Campaign, si: bool) -> tuple[str, float] | None:
+def _noise_table(campaign: records.Campaign, layout: _Layout) -> tuple[str, float] | None:
     """Return the table of samples at rest and their interval, None without any."""
     recorded = {
         name: (channel.noise.samples, channel.noise.interval)
@@ -114,7 +144,7 @@ def _noise_table(campaign: records.Campaign, si: bool) -> tuple[str, float] | No
     columns: dict[str, records.FloatArray] = {"time": interval * np.arange(float(longest))}
     for name, (samples, _) in recorded.items():
         columns[name] = np.full(longest, np.nan)
-        columns[name][: len(samples)] = _in_unit(samples, campaign.channels[name], si)
+        columns[name][: len(samples)] = _in_unit(samples, campaign.channels[name], layout)
     return table_text(columns), interval
 
 
@@ -122,7 +152,7 @@ def _noise_table(campaign: records.Campaign, si: bool) -> tuple[str, float] | No
 
 
 def _campaign_text(
-    campaign: records.Campaign, files: list[str], noise_interval: float | None, si: bool
+    campaign: records.Campaign, files: list[str], noise_interval: float | None, layout: _Layout
 ) -> str:
     source = f"The campaign {campaign.name!r}"
     inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
@@ -138,7 +168,7 @@ def _campaign_text(
         noise=noise_interval and schema.NoiseFileSection(file=NOISE_FILE, interval=noise_interval),
         loggers=dict(campaign.loggers),
         accept=campaign.accept,
-        channel=tuple(_channel(channel, si) for channel in campaign.channels.values()),
+        channel=tuple(_channel(channel, layout) for channel in campaign.channels.values()),
         input=tuple(_input(item) for item in inputs.values()),
         trial=tuple(_trial(campaign, *pair) for pair in zip(campaign.trials, files, strict=True)),
         event=tuple(placed_events(campaign.events, campaign.trials, source)),
@@ -148,12 +178,12 @@ def _campaign_text(
     return toml_text(content)
 
 
-def _channel(channel: records.Channel, si: bool) -> records.Channel:
+def _channel(channel: records.Channel, layout: _Layout) -> records.Channel:
     """Return a channel as a file has it; samples at rest are in a table of their own."""
     noise = channel.noise
     if noise is not None:
         noise = None if noise.samples is not None else replace(noise, interval=None, file="")
-    return replace(channel, unit=_unit(channel, si), column="", noise=noise)
+    return replace(channel, unit=layout.units[channel.name], column="", noise=noise)
 
 
 def _input(item: records.RecordedInput) -> records.RecordedInput:

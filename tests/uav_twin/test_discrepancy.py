@@ -102,7 +102,7 @@ def test_everything_that_is_not_said_is_named_at_once():
         assert part in sentence
 
 
-def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
+def test_samples_at_rest_inputs_temperatures_and_remarks_of_origins_and_assumptions_only():
     for name in ("n1", "n2"):
         rest = "".join(f"{k / 100},{(k * 7) % 11 - 5},20\n" for k in range(40))
         Path(f"{name}.csv").write_text(f"time [s],x [um],temperature [degC]\n{rest}", "utf-8")
@@ -119,7 +119,8 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
     said(*IMPORT, "push.csv", "n1.csv", *given)
     toml = Path("lab/campaign.toml").read_text("utf-8")
     assert "begins" not in toml
-    assert toml.count("Imported from") == toml.split("]\n\n[")[0].count('",\n') == 2
+    assert toml.count("Imported from") == 2
+    assert toml.split("]\n\n[")[0].count('",\n') == 3  # and that zeros and gains were assumed
     assert "; 1 cell is empty." in toml
     read = read_campaign("lab")
     noise = read.channels["x"].noise
@@ -132,7 +133,7 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_the_origins_only():
     assert read.channels["leaf_strain"].quantity is Quantity.SIGNAL
     assert "(assumed: say `begins`" in " ".join(read.remarks)
     Path("lab/campaign.toml").write_text(toml.replace('"driven"', '"driven"\nbegins = "still"'), "utf-8")
-    assert "assumed" not in " ".join(read_campaign("lab").remarks)
+    assert "(assumed: say `begins`" not in " ".join(read_campaign("lab").remarks)
     Path("turn.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
     said(*IMPORT, "turn.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
     assert read_campaign("turn").trials[0].load_factor.tolist() == [1.0, 2.5]
@@ -180,11 +181,11 @@ def in_a_terminal(answers: list[str], *words: object) -> tuple[int, str]:
 def test_a_terminal_is_asked(tmp_path):
     """And a no writes nothing."""
     (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
-    code, screen = in_a_terminal(["ringdown", ",", "tip", "mm", "12 mm", "n"], "swing.csv")
+    code, screen = in_a_terminal(["ringdown", ",", "tip", "mm", "12 mm", "", "", "n"], "swing.csv")
     assert code == 1, screen
     assert "Nothing was written." in screen
     assert [path.name for path in Path().iterdir()] == ["swing.csv"]
-    answers = ["swinging", "ringdown", ",", "tip", "miles per hour", "mm", "12 mm", "y"]
+    answers = ["swinging", "ringdown", ",", "tip", "miles per hour", "mm", "12 mm", "a bit", "0.5mm", "", "y"]
     code, screen = in_a_terminal(answers, "swing.csv", "--out", "lab")
     assert code == 0, screen
     assert "--kind must be static, ringdown, forced, driven, flight or noise, and 'swinging' came." in screen
@@ -192,6 +193,101 @@ def test_a_terminal_is_asked(tmp_path):
     read = read_campaign(tmp_path / "lab")
     assert read.trials[0].values[1, 0] == 2e-3
     assert read.trials[0].release.displacement == 0.012
+    assert "--zero of 'Weg' must be a standard deviation such as 0.1mm or 1%" in screen
+    assert read.channels["Weg"].offset_deviation == pytest.approx(0.0005, rel=1e-12)
+    assert read.channels["Weg"].gain_deviation == 0.02
+
+
+SWINGS = ("t [ms],x [um],U [V]", *(f"{10 * k},{k % 5 - 2}0,{0.5 * k}" for k in range(16)))
+PLAIN = ("--column", "x=x", "--column", "U=-")
+
+
+def swings(*names: str, first_column: bool = True) -> None:
+    """Write records in time: a displacement of up to 20 um, and a voltage."""
+    rows = [row if first_column else row.partition(",")[2] for row in SWINGS]
+    for name in names:
+        Path(name).write_text("\n".join(rows) + "\n", "utf-8")
+
+
+def test_zeros_and_gains_that_nobody_states_are_not_exact():
+    swings("a.csv")
+    printed = said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN)
+    sentence = (
+        "Zeros and gains that nobody stated are assumed to be known: "
+        "the zero of 'x' to 0.2 um and the gain of 'x' to 2 %."
+    )
+    read = read_campaign("a")
+    assert read.channels["x"].offset_deviation == pytest.approx(2e-7, rel=1e-12)
+    assert read.channels["x"].gain_deviation == 0.02
+    assert sentence in " ".join(printed.split())
+    assert sentence in read.remarks
+
+
+@pytest.mark.parametrize(
+    ("zero", "gain", "known"),
+    [
+        ("exact", "exact", (0.0, 0.0)),
+        ("free", "0.5%", (np.inf, 0.005)),
+        ("x=0.001mm", "x=0.03", (1e-6, 0.03)),
+        ("3", "x=exact", (3e-6, 0.0)),
+    ],
+)
+def test_zeros_and_gains_are_as_stated(zero, gain, known):
+    swings("a.csv")
+    printed = said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--zero", zero, "--gain", gain)
+    channel = read_campaign("a").channels["x"]
+    assert (channel.offset_deviation, channel.gain_deviation) == pytest.approx(known, rel=1e-12)
+    assert "assumed" not in printed
+
+
+def test_holds_begins_and_files_for_proof_are_written():
+    swings("a.csv", "b.csv")
+    given = ("--kind", "driven", "--column", "x=x", "--column", "U=input:U", "--quantity", "U=voltage")
+    said(*IMPORT, "a.csv", "b.csv", *given, "--hold", "U=zero_order", "--begins", "a.csv=still",
+         "--begins", "b.csv=unknown", "--held-out", "b.csv")  # fmt: skip
+    read = read_campaign("a")
+    assert [(trial.begins.value, trial.held_out) for trial in read.trials] == [
+        ("still", False),
+        ("unknown", True),
+    ]
+    assert [item.hold.value for item in read.trials[0].inputs] == ["zero_order"]
+
+
+def test_a_table_without_a_time_has_the_interval_that_is_stated():
+    swings("a.csv", first_column=False)
+    given = (*IMPORT, "a.csv", "--kind", "driven", *PLAIN)
+    assert "--interval NAME=... for 'a.csv' (seconds between its rows" in refused(*given)
+    said(*given, "--interval", "0.02")
+    assert read_campaign("a").trials[0].time.tolist() == [0.02 * k for k in range(16)]
+    swings("b.csv")
+    sentence = refused(*IMPORT, "b.csv", "--kind", "driven", *PLAIN, "--interval", "b.csv=0.02")
+    assert "b.csv has a column of times, and --interval came for it" in sentence
+
+
+@pytest.mark.parametrize(
+    ("scale", "in_newtons"), [("200 N/V", 100.0), ("0.2 kN/V", 100.0), ("200 N/mV", 1e5), ("-2 kN/V", -1e3)]
+)
+def test_a_scale_makes_a_voltage_a_force(scale, in_newtons):
+    swings("a.csv")
+    given = ("--kind", "driven", "--column", "x=x", "--column", "U=input:F")
+    said(*IMPORT, "a.csv", *given, "--scale", f"U={scale}")
+    (force,) = read_campaign("a").trials[0].inputs
+    assert (force.quantity, force.values[1]) == (Quantity.FORCE, pytest.approx(in_newtons, rel=1e-12))
+
+
+def test_a_scale_of_a_mere_number_keeps_the_unit_and_one_of_another_unit_is_refused():
+    swings("a.csv")
+    said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--scale", "x=-1")
+    assert read_campaign("a").trials[0].values[0, 0] == pytest.approx(20e-6, rel=1e-14)
+    sentence = refused(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--scale", "x=200 N/V", "--out", "b")
+    assert "--scale of 'x' is for cells in V, and they are in um" in sentence
+
+
+def test_channels_keep_the_units_and_digits_of_the_files():
+    swings("a.csv")
+    said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN)
+    assert 'unit = "um"' in Path("a/campaign.toml").read_text("utf-8")
+    assert Path("a/01_a.csv").read_text("utf-8").splitlines()[:3] == ["time,x", "0.0,-20.0", "0.01,-10.0"]
 
 
 @pytest.fixture
