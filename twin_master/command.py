@@ -254,7 +254,9 @@ def _write(text: str, *, flush: bool) -> bool:
 
 def _line(scenario: "parts.Scenario", decision: Mapping[str, Any]) -> str:
     """Return a decision for people: a line of a terminal."""
-    health = ", ".join(f"{name} {said}" for name, said in parts.health_in_words(decision).items())
+    health = "no state is believed"
+    if decision.get("state_believed", True):
+        health = ", ".join(f"{name} {said}" for name, said in parts.health_in_words(decision).items())
     line = (
         f"{scenario.mission.step_name} {decision['turn']}: {decision['control']}, {health}; "
         f"next {decision['next_control']} with probability {decision['probability']:.3f}"

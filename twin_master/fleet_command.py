@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,13 @@ def _heading(standing: Mapping[str, Any]) -> str:
 def _watched_table(standing: Mapping[str, Any]) -> "parts.Table":
 
     told = [(name, asset) for name, asset in standing["assets"].items() if asset["last"] is not None]
-    worst = sorted(told, key=lambda row: (row[1]["alarms"], row[1]["severity"]), reverse=True)[:ROWS]
+
+    def urgency(row: tuple[str, Mapping[str, Any]]) -> tuple[int, float]:
+        """Return alarms and severity of an asset; one in no state that is believed is the worst."""
+        _, asset = row
+        return asset["alarms"], inf if asset["severity"] is None else asset["severity"]
+
+    worst = sorted(told, key=urgency, reverse=True)[:ROWS]
     states, rows = list(dict.fromkeys(name for _, asset in worst for name in asset["last"]["health"])), []
     for name, asset in worst:
         last, health = asset["last"], parts.health_in_words(asset["last"])

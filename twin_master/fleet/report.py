@@ -48,7 +48,8 @@ NEXT, FAILURES = 15, 10
 class Standing:
     """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls.
 
-    `leaving` (B,) is the probability that a control is left soon; NaN where it is not known.
+    Moments are NaN where no state is believed. `leaving` (B,) is the probability that a control is left soon;
+    NaN where it is not known.
     """
 
     group: str
@@ -172,7 +173,9 @@ def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: i
         own = {name.removeprefix(prefix): told[name] for name in told if name.startswith(prefix)}
         last = [asset["last"] for asset in own.values()]
         mean, deviation = (
-            np.array([[one["health"][name][moment] for name in scenario.state_names] for one in last])
+            np.array(
+                [[one["health"][name][moment] for name in scenario.state_names] for one in last], np.float64
+            )
             for moment in ("mean", "standard_deviation")
         )
         turn, control = np.array([one["turn"] for one in last]), [one["control"] for one in last]
@@ -218,11 +221,12 @@ def _add_group(
     if courses is not None:
         page.add_report_figure(WORDS.figure("course", course_figure(scenario, *courses)))
     factors, soon = printed_factors(scenario), np.rint(100.0 * np.nan_to_num(standing.leaving))
-    order = np.lexsort((-standing.severity, -soon, -standing.alarms))[:most].tolist()
+    severity_first = np.nan_to_num(standing.severity, nan=np.inf)  # of no state that is believed
+    order = np.lexsort((-severity_first, -soon, -standing.alarms))[:most].tolist()
     rows, told = [], bool(standing.alarms.any())
     for row in order:
         states = [
-            f"{factor.scale * mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{factor.scale * deviation:.1f}"
+            _moments(factor.scale * mean, factor.scale * deviation)
             for factor, mean, deviation in zip(
                 factors, standing.mean[row], standing.deviation[row], strict=True
             )
@@ -237,6 +241,13 @@ def _add_group(
     WORDS.add_table(
         page, "next", rows, more=more, shown=len(rows), assets=count, alarms=told, mission=scenario.mission
     )
+
+
+def _moments(mean: float, deviation: float) -> str:
+    """Return the cell of a table with mean and standard deviation; NaN where no state is believed."""
+    if np.isnan(mean):
+        return "not believed"
+    return f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}"
 
 
 @style.publication_style()

@@ -50,7 +50,7 @@ def read_standing(folder: Path) -> dict[str, Any]:
 
     Of each asset `last` is what its last decision said, None before the first; `alarms` and `refused` are
     numbers; `leaving` is the probability that its control is left within the steps that are predicted, and
-    `severity` how badly off it is.
+    `severity` how badly off it is. Both are None where no state is believed.
     """
     path = folder / STATE_NAME
     return dict(read_json(path, FleetError)) if path.is_file() else {"assets": {}, "failures": {}}
@@ -108,10 +108,11 @@ class WatchedAsset:
         last = leaving = worst = None
         if self.decision is not None and self.watch.filtered is not None:
             last = {key: self.decision[key] for key in _OF_A_DECISION}
-            control = self.watch.scenario.control_names.index(last["control"])
-            leaving = float(attention(self._knowledge, self.watch.filtered, control))
-            mean = np.array([state["mean"] for state in last["health"].values()])
-            worst = float(severity(self.watch.scenario, mean))
+            if self.decision.get("state_believed", True):
+                control = self.watch.scenario.control_names.index(last["control"])
+                leaving = float(attention(self._knowledge, self.watch.filtered, control))
+                mean = np.array([state["mean"] for state in last["health"].values()])
+                worst = float(severity(self.watch.scenario, mean))
         alarms, refused = self._alarms_before + len(self.alarms), self.watch.intake.counts.rejected
         return {"last": last, "alarms": alarms, "refused": refused, "leaving": leaving, "severity": worst}
 

@@ -42,6 +42,8 @@ _LARGEST = 20_000_000
 """Numbers that the beliefs of the rivals may take: each turn that is kept holds them."""
 _CLEARLY = float(np.log(10.0))
 """A single gauge is the simpler explanation: several must be so much better for the alarm to say so."""
+_OR_THE_ASSET = "or the asset near it is not as the model says, as where it has softened"
+"""Said beside a gauge that is off: softening that the model does not know is mostly seen by one gauge."""
 _NAMED_SHARE = 0.1
 _NAMED_DEVIATIONS = 2.0
 _MOST_NAMED = 6
@@ -168,6 +170,8 @@ class WatchfulEstimator:
         own["leading"][0] = number
         told = {"words": self._words, "step": self._words.step.capitalize(), "turn": turn, "first": first}
         sentence = said("learning.follows" if number else "learning.explained", **told)
+        if number > 0:
+            sentence = f"{sentence} {_OR_THE_ASSET[0].upper()}{_OR_THE_ASSET[1:]}: these data cannot tell."
         if number < 0:
             sentence = said("learning.unexplained", **told)
         return [Notice("hypothesis", sentence, (number,) if number > 0 else (), first.probability)]
@@ -400,6 +404,7 @@ class WatchfulEstimator:
             what = f"one of {self._words.sensors(named)} does not show what the model says"
         else:
             what = f"{self._words.sensors(named)} shows too {'much' if sign[named[0]] > 0.0 else 'little'}"
+        what = f"{what}, {_OR_THE_ASSET}"
         return self._alarm(own, turn, what, named, log_value, onset)
 
     def _alarm(

@@ -258,7 +258,7 @@ class Shares:
         self.shows[:, before] = np.clip(np.exp(showing - fault), LEAST_SHOWS, 1.0)
         self.current[NONE:] = fault + np.log(self.shows[:, now])
         self.hidden = fault + np.log1p(-self.shows[:, now])
-        return np.maximum(np.exp(self.hidden) - hidden_before, 0.0)
+        return np.asarray(np.maximum(np.exp(self.hidden) - hidden_before, 0.0))
 
     def advance(self, log_hazard: float, begins: Float) -> Float:
         """Let faults begin and end in a turn.
@@ -294,7 +294,7 @@ class Shares:
         # A fault that began in this turn is not known under the other controls.
         fresh = np.exp(begun - np.logaddexp(self.current[NONE:], self.hidden))
         self.shows += fresh[:, None] * (SHOWS_ELSEWHERE - self.shows)
-        return np.exp(ended[NONE:])
+        return np.asarray(np.exp(ended[NONE:]))
 
     def weigh(self, log_ratio: Float) -> None:
         """Correct the shares by the log evidence of each hypothesis over that of the model (3 + G K,)."""

@@ -35,7 +35,7 @@ from twin_master.mission.journal import (
 )
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Plant, Reading, Turn
-from twin_master.network.estimator import Notice
+from twin_master.network.estimator import Notice, is_state_believed
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
 from twin_master.network.twin import Twin, TwinTurn
@@ -49,7 +49,8 @@ _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
     """Return what the operator is told with a line of a journal: never a control without its certainty.
 
-    Nothing where it tells no decision.
+    Nothing where it tells no decision. Of a state that is not believed, because none explains the sensors, no
+    moments are told.
     """
     for reason in ("quiet", "refused"):  # the last decision was told again
         if reason in line:
@@ -59,11 +60,17 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
     filtered = array_of(line["filtered"])
     mean, deviation = model.states.mean(filtered), model.states.standard_deviation(filtered)
     controls, coming = scenario.control_names, line["next_control"]
+    believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
     record = {
         "turn": line["turn"],
         "control": controls[line.get("control_in_force", line["control_index"])],
+        "state_believed": believed,
         "health": {
-            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
+            factor.name: {
+                "mean": mean[index] if believed else None,
+                "standard_deviation": deviation[index] if believed else None,
+                "unit": factor.unit,
+            }
             for index, factor in enumerate(scenario.state)
         },
         "next_control": controls[coming],
@@ -82,9 +89,15 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
 
 
 def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
-    """Return mean and standard deviation of each factor of the state, as a decision tells them."""
+    """Return mean and standard deviation of each factor of the state, as a decision tells them.
+
+    Of a state that is not believed it is said that it is not.
+    """
     told = {}
     for name, known in decision["health"].items():
+        if known["mean"] is None:
+            told[name] = "not believed"
+            continue
         scale, unit = printed_state(known["unit"])
         digits = ".0f" if unit == "%" else ".3g"
         mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))

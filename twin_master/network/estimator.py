@@ -19,6 +19,14 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import filter_sequence, smooth
 from twin_master.scenario.schema import Scenario
 
+BELIEVED = 0.5
+"""Largest probability of "none of these" with which a state is still believed."""
+
+
+def is_state_believed(none_of_these: float) -> bool:
+    """Return whether a state may be told, given the probability that none explains the sensors."""
+    return none_of_these <= BELIEVED
+
 
 class SensorModel(Protocol):
     """What the sensors say in each state: a `GaussianSensorModel`, or one of a user's own.

@@ -19,6 +19,7 @@ from reporting.words import counted, listing, parameter_title, small
 from twin_master.assets.asset_source import calibrated_with
 from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.errors import RunFolderError
+from twin_master.network.estimator import is_state_believed
 from twin_master.report import mission as course
 from twin_master.report import model as tailored
 from twin_master.report.reading import Run, read_run
@@ -73,7 +74,16 @@ def _decision(run: Run) -> str:
 
 
 def _belief(run: Run) -> str:
-    """Return the last estimate of the state, and of the parameter where it is learnt."""
+    """Return the last estimate of the state, and of the parameter where it is learnt.
+
+    Where no state explains the sensors none is told.
+    """
+    unexplained = run.get("notice/none_of_these")
+    if unexplained is not None and not is_state_believed(unexplained[-1]):
+        return (
+            f"At the end no state is believed: no state of the model explains the {run.sensors.word}s "
+            f"(probability {unexplained[-1]:.3g})."
+        )
     parts = [_state(run, index) for index in range(min(len(run.factors), _STATES_SAID))]
     rest = len(run.factors) - len(parts)
     if rest:

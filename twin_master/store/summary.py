@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
 from reporting.words import counted, parameter_title
+from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
@@ -240,12 +241,14 @@ def _scored(result: MissionResult) -> Iterator[Told]:
 
 
 def _watched(result: MissionResult) -> Iterator[Told]:
-    """Yield the figures of a watched asset: what is believed of it now."""
+    """Yield the figures of a watched asset: what is believed of it now; None where no state is."""
     states, belief = result.knowledge.model.states, result.flight.filtered[-1]
     moments = np.transpose((states.mean(belief), states.standard_deviation(belief)))
     for factor, values in zip(result.scenario.state, moments, strict=True):
         scale, unit = printed_state(factor.unit)
-        yield "last", {"state": factor.name, "unit": unit}, (scale * values).tolist()
+        believed = is_state_believed(float(result.flight.unexplained[-1]))
+        figures: list[Any] = (scale * values).tolist() if believed else [None, None]
+        yield "last", {"state": factor.name, "unit": unit}, figures
 
 
 def control_changes(

@@ -21,21 +21,23 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from jinja2 import Template
 from markupsafe import Markup
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from reporting.arrays import Float
-from reporting.errors import DamagedFileError, ReportingError
-from reporting.json_file import plain, read_json
+from reporting.errors import ReportingError
+from reporting.json_file import plain
 from twin_master.errors import RunFolderError, TwinMasterError, said
 from twin_master.learning.expectation import Expected, expected_of, joined
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
-from twin_master.network.estimator import Learnt
+from twin_master.network.estimator import Learnt, is_state_believed
 from twin_master.network.inference import known_control, predict
 from twin_master.report.reading import NORMAL_95, printed_factors, printed_sensors
 from twin_master.report.structure import design_of, planform_of
-from twin_master.run_folder import PICTURE, VERDICT, kept_scenario
+from twin_master.run_folder import kept_scenario
 from twin_master.scenario.schema import REWARD_NAMES
+from twin_master.viewer.picture import Picture, picture_of
 
 TURNS_AT_ONCE = 200
 """Turns that are read before the viewers are answered again."""
@@ -52,6 +54,8 @@ class Belief(NamedTuple):
     ----------
     probability : (n, S)
         Of each state.
+    believed : (n,)
+        Whether a state is believed; else none explains the sensors.
     expected : Expected
         Of sensors and rewards, without quantiles; the reward of the error is NaN where nothing was observed.
     control_probability : (n, U)
@@ -59,25 +63,9 @@ class Belief(NamedTuple):
     """
 
     probability: Float
+    believed: NDArray[np.bool_]
     expected: Expected
     control_probability: Float
-
-
-class Picture(NamedTuple):
-    """The missing force that a verdict shows: behind which turn it came, its drawing, what it says."""
-
-    turn: int
-    drawing: Path
-    said: str
-
-
-def _picture(turn: int, verdict: Path) -> Picture | None:
-    """Return what the folder of a verdict shows of a missing force; None: nothing, or no whole verdict."""
-    with suppress(DamagedFileError, KeyError, TypeError):
-        if (verdict / PICTURE).is_file():
-            record = read_json(verdict / VERDICT, DamagedFileError)["verdict"]
-            return Picture(turn, verdict / PICTURE, str(record["sentence"]))
-    return None
 
 
 class Flight:
@@ -174,7 +162,7 @@ class Flight:
         if "model" in record:  # another one was adopted
             self._believe(place)
         verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))
-        picture = _picture(turn, self.folder / verdict) if verdict else None
+        picture = picture_of(turn, self.folder / verdict) if verdict else None
         self.pictures += [picture] if picture else []
         self.number += 1
 
@@ -214,8 +202,13 @@ class Flight:
     def believed(self, turns: Sequence[Record]) -> Belief:
         """Return what the twin believed of each of n turns when it was flown."""
         models = groupby(turns, lambda turn: id(self._known_in(turn)))
-        probability, expected, control = zip(*(self._believed([*own]) for _, own in models), strict=True)
-        return Belief(np.concatenate(probability), joined(expected), np.concatenate(control))
+        parts = [self._believed([*own]) for _, own in models]
+        return Belief(
+            probability=np.concatenate([part.probability for part in parts]),
+            believed=np.concatenate([part.believed for part in parts]),
+            expected=joined(part.expected for part in parts),
+            control_probability=np.concatenate([part.control_probability for part in parts]),
+        )
 
     def _believed(self, turns: Sequence[Record]) -> Belief:
         """Return what the twin believed of turns in which it knew the same."""
@@ -231,20 +224,28 @@ class Flight:
                 u = slice(turn["control_index"], turn["control_index"] + 1)
                 parts.append(learns.of_marginals(_learnt(turn), own[None, :, u], u, seen))
             expected = joined(parts)
-        return Belief(filtered, expected, np.array([turn["decision_probability"] for turn in turns]))
+        believed = np.array([is_state_believed(_unexplained(turn)) for turn in turns])
+        decided = np.array([turn["decision_probability"] for turn in turns])
+        return Belief(filtered, believed, expected, decided)
 
     def predicted(self, turn: Record) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""
         known, horizon = self._known_in(turn), self.scenario.mission.prediction_steps
         flown, learns = (array_of(turn["filtered"]), turn["control_index"]), known.expectation
         coming = predict(known.model, *flown, known.plan.policy, horizon).predicted
-        none = turn.get("suspicion", {}).get("hypotheses", {}).get("none of these", 0.0)
+        none = _unexplained(turn)
         joint = coming[..., None] * known.asked(none)
         if learns is None:
             expected = _expected(known, joint, None)
         else:
             expected = learns.of_marginals(_learnt(turn), joint, slice(None), None)
-        return Belief(coming, expected, joint.sum(axis=-2))
+        believed = np.full(len(coming), is_state_believed(none))
+        return Belief(coming, believed, expected, joint.sum(axis=-2))
+
+
+def _unexplained(turn: Record) -> float:
+    """Return the probability in a turn that no state of the model explains the sensors."""
+    return float(turn.get("suspicion", {}).get("hypotheses", {}).get("none of these", 0.0))
 
 
 def _expected(known: Knowledge, joint: Float, rows: Float | None) -> Expected:
@@ -419,11 +420,11 @@ class Teller:
         }
 
     def _printed(self, belief: Belief, observed: Float | None) -> dict[str, Any]:
-        """Return arrays, a row for each turn, in printed units; NaN stands for what there is not."""
+        """Return arrays, a row for each turn, in printed units; NaN: there is none, or it is not believed."""
         scales = self._scales
         levels = np.array([(factor.levels[0], factor.levels[-1]) for factor in self._factors]).T
         states, expected = self._flight.knowledge.model.states, belief.expected
-        mean = scales * states.mean(belief.probability)
+        mean = np.where(belief.believed[:, None], scales * states.mean(belief.probability), np.nan)
         reach = 2.0 * scales * states.standard_deviation(belief.probability)
         reward, reward_reach = expected.reward_mean, NORMAL_95 * expected.reward_standard_deviation
         center, spread = expected.mean, np.hypot(expected.standard_deviation, expected.noise)
@@ -435,7 +436,7 @@ class Teller:
             "state": mean,
             "state_lower": np.clip(mean - reach, *levels),
             "state_upper": np.clip(mean + reach, *levels),
-            "state_deviation": 0.5 * reach,
+            "state_deviation": np.where(np.isnan(mean), np.nan, 0.5 * reach),
             "reward": reward,
             "reward_lower": reward - reward_reach,
             "reward_upper": reward + reward_reach,

@@ -173,7 +173,9 @@ class Wing {
     const regions = planform.regions.map((region, index) => {
       const middle = region.reduce((sum, point) => sum + point[0], 0) / region.length;
       const top = Math.max(...region.map((point) => point[1]));
-      return `<polygon points="${outline(region)}" fill="${colourOf(SCALES.damage, least, most, this.loss[index])}" stroke="#000000"/>` +
+      const loss = this.loss[index]; // null where no state is believed
+      const fill = loss === null ? "none" : colourOf(SCALES.damage, least, most, loss);
+      return `<polygon points="${outline(region)}" fill="${fill}" stroke="#000000"/>` +
         `<text x="${x(middle)}" y="${y(top) - 4}" text-anchor="middle">${escaped(this.said[index])}</text>`;
     });
     const [low, high] = [Math.min(sensors.lowest, 0), sensors.highest];

@@ -201,7 +201,12 @@ function drawSensors(now) {
   }
 }
 
+function isBelieved(now) {
+  return now.state.every((value) => value !== null);
+}
+
 function estimate(factor, index, now) {
+  if (!isBelieved(now)) return `${factor.symbol}: not believed`;
   const decimals = factor.levels.at(-1) - factor.levels[0] > 10 ? 0 : 2;
   const [mean, deviation] = [now.state[index], now.state_deviation[index]].map((value) => value.toFixed(decimals));
   return `${factor.symbol} ${mean} ± ${deviation} ${factor.unit}`;
@@ -209,7 +214,9 @@ function estimate(factor, index, now) {
 
 function say(now, turn) {
   const next = now.probability.indexOf(Math.max(...now.probability));
-  const health = scene.factors.map((factor, index) => estimate(factor, index, now)).join(", ");
+  const health = isBelieved(now)
+    ? scene.factors.map((factor, index) => estimate(factor, index, now)).join(", ")
+    : `no state is believed, for none explains the ${scene.sensors.word}s`;
   const lost = now.observed.filter((value) => value === null).length;
   const missing = lost ? ` ${lost} of ${now.observed.length} ${scene.sensors.word}s lost.` : "";
   element("said").textContent =

@@ -155,6 +155,8 @@ def policy_change(before: Knowledge, after: Knowledge) -> str:
 
 SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
+CLEARLY = math.log(10.0)
+"""Evidence by which several gauges must be a better explanation than one, as of the alarm itself [nats]."""
 CHECKED = 250_000
 """Bytes at the end of a journal that are read at least, so that damage there is found."""
 
@@ -200,6 +202,8 @@ class Teaching:
         The models that were adopted, as the journal has them.
     first_alarm : tuple or None
         The turn of the first alarm, and its notice.
+    of_many : bool
+        Whether the gauges together speak for the alarm whose cause is looked for, and no single one does.
     """
 
     threshold: float
@@ -209,6 +213,7 @@ class Teaching:
     untold: list[dict[str, Any]] = field(default_factory=list)
     adopted: list[dict[str, Any]] = field(default_factory=list)
     first_alarm: tuple[int, Mapping[str, Any]] | None = None
+    of_many: bool = False
     _alarm: tuple[int, int] | None = None
     _ask_at: int = 0
     _since: int = 0
@@ -263,10 +268,10 @@ class Teaching:
     def _ask(self, suspicion: Mapping[str, Any]) -> None:
         if self._alarm is None or self.question or self.trial or self.turn < self._ask_at:
             return
-        evidence = max(
-            suspicion.get("log_evidence_none", -math.inf), suspicion.get("log_evidence_any_gauge", -math.inf)
-        )
-        if evidence >= math.log(self.threshold):
+        of_many = suspicion.get("log_evidence_none", -math.inf)
+        of_one = suspicion.get("log_evidence_any_gauge", -math.inf)
+        if max(of_many, of_one) >= math.log(self.threshold):
+            self.of_many = of_many >= of_one + CLEARLY
             self.question = max(self._alarm[1], self._since), self.turn
 
     def _verdict(self, verdict: dict[str, Any]) -> None:

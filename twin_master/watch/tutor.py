@@ -29,6 +29,8 @@ GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
 alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
+ABSOLUTE_FIT = "absolute fit"
+"""Gate of a verdict that says whether what is named leaves noise alone."""
 SEARCH = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
 """The command that looks for the cause of an alarm."""
 COURTESY = 10
@@ -67,7 +69,8 @@ class Tutor:
             folder = watch.folder / TEACHING / f"turns_{first}_to_{last}"
             log = folder.with_name(folder.name + ".log")
             if self._searched(folder, log, ["--from-turn", str(first), "--to-turn", str(last)]):
-                watch.write(verdict={"turn": teaching.turn, **verdict_of(folder, log, first, last, step)})
+                found = verdict_of(folder, log, first, last, step)
+                watch.write(verdict={"turn": teaching.turn, "of_many": teaching.of_many, **found})
         if teaching.trial is not None and teaching.turn >= teaching.trial["turn"] + TRIAL_TURNS:
             self._judge(teaching.trial, step)
 
@@ -114,7 +117,7 @@ class Tutor:
         except CANNOT as error:
             sentence = f"The patch cannot be believed by this twin: {error}"
         notice = Notice("trial", sentence).as_record()
-        if outcome is not None and outcome.gained >= LEAST_GAIN:
+        if outcome is not None and is_adopted(trial, outcome):
             watch.adopt(outcome, notice)
         else:
             watch.write(verdict={**trial, "tried": False, "notice": notice})
@@ -144,23 +147,61 @@ def verdict_of(folder: Path, log: Path, first: int, last: int, step: str) -> dic
     try:
         verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
         kind, told = str(verdict["kind"]), f": {verdict['kind']}. {verdict['sentence']}"
+        caveats = caveats_of(verdict)
     except (DamagedFileError, KeyError, TypeError) as error:
         lines = [str(error), *log.read_text(encoding="utf-8", errors="replace").split("\n")]
         *_, said = (line.strip() for line in lines if line.strip())
         kind, told = "none", f", and the search ended without a verdict: {said}"
+        caveats = []
     patch, place = folder / PATCH, f"{TEACHING}/{folder.name}"
-    tried = kind in TRIED and patch.is_file()
+    tried = kind in TRIED and patch.is_file() and not caveats
     sentence = f"{step.capitalize()}s {first} to {last} were searched for the cause{told}"
+    if kind in TRIED:
+        sentence = " ".join([sentence, *(caveat for caveat in caveats if caveat not in sentence)])
     if tried:
         which = "patch of the most probable of these" if kind == GROUP else "patch"
         sentence += f" The {which} is tried beside the model for {TRIAL_TURNS} {step}s."
     elif patch.is_file():
-        options = f"--model-patch DIR/{place}/{PATCH} --from-turn {first}"
-        sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
+        sentence += f" To believe it none the less: {command_to_believe(place, first)}"
     return {
         "from_turn": first, "to_turn": last, "tried": tried, "kind": kind, "folder": place,
         "notice": Notice("verdict", sentence).as_record(),
     }  # fmt: skip
+
+
+def caveats_of(verdict: Mapping[str, Any]) -> list[str]:
+    """Return why the patch of a verdict is not to be tried: a name needs an absolute fit.
+
+    Parameters
+    ----------
+    verdict : dict
+        As `verdict.json` has it.
+
+    Returns
+    -------
+    list of str
+        The reasons of the gates that failed, and of an absolute fit that was not tested; empty where none.
+    """
+    gates = verdict["gates"]
+    caveats = [str(gate["reason"]) for gate in gates if gate["passed"] is False]
+    tested = [gate for gate in gates if gate["name"] == ABSOLUTE_FIT and gate["passed"] is not None]
+    if not tested:
+        caveats.append("Whether it leaves noise alone was not tested.")
+    return caveats
+
+
+def command_to_believe(place: str, first: int) -> str:
+    """Return the command that believes the patch in a folder of a watch from a turn on."""
+    return f"uav-twin watch --resume --out DIR --model-patch DIR/{place}/{PATCH} --from-turn {first}"
+
+
+def is_adopted(trial: Mapping[str, Any], outcome: Outcome) -> bool:
+    """Return whether a patch is believed after its trial.
+
+    After an alarm of many gauges none is: what is named then is the effect of the catalogue that comes
+    closest, and any that moves all gauges gains evidence over a model that explains none.
+    """
+    return outcome.gained >= LEAST_GAIN and not trial.get("of_many", False)
 
 
 def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str:
@@ -171,6 +212,12 @@ def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str
     )
     if outcome.gained < LEAST_GAIN:
         return f"{compared}, {LEAST_GAIN:g} are needed, and is not adopted."
+    if not is_adopted(trial, outcome):
+        return (
+            f"{compared}, and is not adopted from its name alone, because many gauges raised the alarm: any "
+            "effect that moves all of them explains more than the model does. Look at the asset first. To "
+            f"believe it: {command_to_believe(trial['folder'], first)}"
+        )
     said = f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
     if trial["kind"] == GROUP:
         said += " It is one of a group: which of them is true these data cannot tell."

@@ -240,7 +240,8 @@ def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_re
     console = said("run", spoilt, "--out", noticed, "--no-report")
     assert _shown(123_456, "") == "123456"  # a turn has all of its digits
     alarm = next(line for line in console.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
-    assert "gauge 5 shows too much, since about turn 2 (" in alarm
+    assert "gauge 5 shows too much, or the asset near it" in alarm
+    assert ", since about turn 2 (" in alarm
     search = f"; to find the cause: uav-twin discrepancy run --from-run {noticed} --from-turn 2"
     assert alarm.endswith(f"alarm from 100){search}")
     assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in console

@@ -78,7 +78,10 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     assert found.suspicion.gauge_off > 0.9
     (alarm,) = (notice for one in watched for notice in one.notices if notice.kind == "alarm")
     assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
-    assert f": gauge 2 (spar) shows too much, since about turn {alarm.since}" in alarm.sentence
+    assert (
+        ": gauge 2 (spar) shows too much, or the asset near it is not as the model says, as where it has "
+        f"softened, since about turn {alarm.since}"
+    ) in alarm.sentence
     assert alarm.sentence.endswith("alarm from 100)")
     assert np.abs(found.filtered - plain.filtered).max() > 0.1
     carried = [estimate.carried for estimate in watched]
@@ -116,7 +119,7 @@ def test_shares_of_hypotheses_switch_as_their_chain_says():
 
 
 def two_controls() -> tuple[Shares, Float]:
-    """Return shares under the second of two controls, where a fault is nearly sure, and where faults begin."""
+    """Return shares under the second of two controls with a fault that is nearly sure, and its priors."""
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
     shares = Shares.at_first(0.5, begins, 1, 2)
     shares.weigh(np.array([0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 0.0]))
@@ -349,6 +352,9 @@ def test_belief_and_decision_follow_what_holds_now(between):
     assert "least gauges 17 and " in alarms[1].sentence  # of those that are off it was, too
     sentences = [n.sentence for found in course[True] for n in found.notices if n.kind == "hypothesis"]
     assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
+    assert (
+        "Or the asset near it is not as the model says, as where it has softened: these data" in sentences[0]
+    )
     assert "the model explains the gauges again (probability" in sentences[1]
     assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
 

@@ -14,7 +14,8 @@ import pytest
 from fe.runtime.patch import SensorGain
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
-from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful
+from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
+from twin_master.command import _line
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import replay
@@ -25,7 +26,7 @@ from twin_master.viewer.flight import Request, Teller
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.teaching import Outcome, Teaching, both_patches, patched_model, policy_change
-from twin_master.watch.tutor import TRIED, Tutor, trial_sentence
+from twin_master.watch.tutor import TRIED, Tutor, trial_sentence, verdict_of
 
 pytestmark = pytest.mark.xdist_group("teaching")  # one worker makes the wing and its watches
 
@@ -41,7 +42,9 @@ if kind is None:
     sys.exit("Nothing can be said.")
 place = out.with_name("." + out.name)
 place.mkdir()
-(place / "verdict.json").write_text(json.dumps({"verdict": {"kind": kind, "sentence": "It is so."}}))
+gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves noise alone."}]
+verdict = {"kind": kind, "sentence": "It is so.", "gates": gates}
+(place / "verdict.json").write_text(json.dumps({"verdict": verdict}))
 (place / "patch.json").write_text(json.dumps(patch))
 place.rename(out)
 """
@@ -168,6 +171,92 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
         assert any(sentence in text for text in notices)
         assert sum("searched for the cause" in text for text in notices) == 2
+
+
+def verdict_folder(folder: Path, gates: list[dict[str, Any]]) -> Path:
+    """Write what a search leaves that has named something."""
+    folder.mkdir()
+    verdict = {"kind": "named", "sentence": "A mass is missing.", "gates": gates}
+    (folder / "verdict.json").write_text(json.dumps({"verdict": verdict}))
+    of_gauge(folder, "patch.json", 0.1)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "passed", "caveat"),
+    [
+        ("absolute fit", False, "It leaves three noises."),
+        ("absolute fit", None, "Whether it leaves noise alone was not tested."),
+        ("shape", True, "Whether it leaves noise alone was not tested."),
+        ("held-out trials", False, "It leaves three noises."),
+    ],
+)
+def test_a_name_without_an_absolute_fit_is_not_tried_and_the_notice_says_why(tmp_path, name, passed, caveat):
+    gates = [{"name": name, "passed": passed, "reason": "It leaves three noises."}]
+    verdict = verdict_of(verdict_folder(tmp_path / "verdict", gates), tmp_path / "log", 3, 13, "turn")
+    assert not verdict["tried"]
+    sentence = verdict["notice"]["sentence"]
+    assert f"named. A mass is missing. {caveat}" in sentence
+    assert "To believe it none the less: uav-twin watch --resume" in sentence
+
+
+@pytest.fixture(scope="module")
+def saturated(mission, tmp_path_factory) -> Path:
+    """The mission as gauges recorded it that all saturate softly, from the first turn on."""
+    observed = 4e-3 * np.tanh(mission.observed / 4e-3)
+    return write_csv(tmp_path_factory.mktemp("saturated") / "saturated.csv", observed, mission.control_index)
+
+
+def test_after_an_alarm_of_many_gauges_nothing_is_adopted_from_its_name_alone(base, saturated, tmp_path):
+    """All gauges saturate; what is named, that all show too little, gains much and is as wrong."""
+    script, answer = tmp_path / "answer.py", tmp_path / "answer.json"
+    script.write_text(ANSWER)
+    answer.write_text(json.dumps(["named", patch_record(SensorGain("*", -0.1, "strain"))]))
+    watch = watchful(base, tmp_path / "watch")
+    teach = Tutor(watch, wait=True, command=(sys.executable, str(script), str(answer), "-"))
+    watch.run(CsvFeed(saturated, watch.scenario), str, teach.act, turns=30)
+    records = journal(watch.folder)
+    trial = next(n["sentence"] for r in records for n in r.get("notices", []) if n["kind"] == "trial")
+    assert not any("model" in record for record in records)
+    assert "and is not adopted from its name alone, because many gauges raised the alarm" in trial
+    assert "uav-twin watch --resume --out DIR --model-patch DIR/teaching/turns_0_to_" in trial
+    assert " gained -" not in trial
+
+
+@pytest.fixture(scope="module")
+def unbelieved(base, saturated, tmp_path_factory) -> tuple[Watch, list[dict[str, Any]]]:
+    """A watch that ends while no state explains the gauges, with its decisions."""
+    watch, decisions = watchful(base, tmp_path_factory.mktemp("unbelieved") / "watch"), []
+    counts = watch.run(CsvFeed(saturated, watch.scenario), decisions.append, turns=12)
+    watch.store(counts)
+    assert decisions[-1]["none_of_these"] > 0.5 > decisions[0]["none_of_these"]
+    return watch, decisions
+
+
+def test_a_decision_tells_no_state_that_is_not_believed(unbelieved):
+    watch, decisions = unbelieved
+    health = {"mean": None, "standard_deviation": None, "unit": "1"}
+    assert (decisions[-1]["state_believed"], decisions[-1]["health"]) == (False, {"z1": health, "z2": health})
+    assert "no state is believed; next 2g" in _line(watch.scenario, decisions[-1])
+    assert decisions[0]["state_believed"]
+    assert decisions[0]["health"]["z1"]["mean"] >= 0.0
+
+
+def test_report_and_summary_tell_no_state_that_is_not_believed(unbelieved):
+    watch, _ = unbelieved
+    page = (watch.folder / "report.html").read_text(encoding="utf-8")
+    assert "At the end no state is believed: no state of the model explains the gauges" in page
+    assert "At the end the twin puts" not in page
+    figures = figures_of(watch.folder)
+    assert {figures[key] for key in figures if key.startswith("last_")} == {None}
+
+
+def test_the_page_that_follows_a_flight_shows_no_state_that_is_not_believed(unbelieved):
+    watch, _ = unbelieved
+    asked = Request(number=1, flight=-1, first=0, end=0, turn=-1, shown=-1, count=-1)
+    answer = json.loads(str(Teller(viewed(watch.folder)).answer(asked)))
+    assert answer["past"]["state"][-1] == answer["ahead"]["state"][0] == [None, None]
+    assert None not in answer["past"]["state"][0]
 
 
 def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence_and_is_no_decision(noticing, recorded):
