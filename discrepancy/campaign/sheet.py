@@ -27,6 +27,18 @@ from reporting.words import counted, listing, one_line
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
 EXCEL = (".xlsx", ".xlsm")
+OTHER_FORMATS = {
+    ".mat": ("a MATLAB file", "save the table as text: writetable(T, 'FILE.csv')"),
+    ".xls": ("an Excel file of before 2007", "save it as .xlsx or as CSV"),
+    ".ods": ("an OpenDocument spreadsheet", "save it as .xlsx or as CSV"),
+    ".tdms": (
+        "a LabVIEW TDMS file",
+        "export it as text, or with npTDMS: tdms_file.as_dataframe().to_csv('FILE.csv')",
+    ),
+    ".uff": ("a universal file", "export its records as text, or read them with pyuff and write a CSV file"),
+    ".unv": ("a universal file", "export its records as text, or read them with pyuff and write a CSV file"),
+}
+"""Formats that are not read, by their ending: what they are, and how a table comes out of them."""
 _LONGEST_HEAD = 200
 _LOOKED_AT = 500
 """Lines by which the separator is chosen."""
@@ -108,7 +120,11 @@ def read_sheet(path: Path) -> Sheet:
         are written in two ways, or a time cannot be read or can be in two.
     """
     file = path if path.exists() else path.with_name(path.name.partition("#")[0])
-    excel = file.suffix.lower() in EXCEL
+    ending = file.suffix.lower()
+    if ending in OTHER_FORMATS:
+        what, remedy = OTHER_FORMATS[ending]
+        raise CampaignFileError(f"{file.name} is {what}, which is not read: {remedy}.")
+    excel = ending in EXCEL
     rows, separator = (_excel_rows(file, path.name.partition("#")[2]), "") if excel else _text_rows(file)
     where = f"{path.name}, {'row' if excel else 'line'}"
     head, units, body, below = _laid_out(rows, path.name, where)

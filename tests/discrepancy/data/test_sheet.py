@@ -314,3 +314,14 @@ def test_what_is_no_unit_of_ours_is_of_no_quantity_and_a_ratio_of_volts_a_signal
     assert quantities_of(unit) == (Quantity.SIGNAL,) * ("V/" in unit or "V/v" in unit)
     with pytest.raises(ValueError, match=r"strain must have a unit such as .*, and '.*' came"):
         conversion_of(Quantity.STRAIN, unit)
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [("a.mat", "MATLAB"), ("a.XLS", "before 2007"), ("a.tdms", "TDMS"), ("a.uff", "universal file")],
+)
+def test_a_format_that_is_not_read_is_named_with_the_way_round(tmp_path, name, what):
+    file = tmp_path / name
+    file.write_bytes(b"\x00\x01")
+    with pytest.raises(CampaignFileError, match=f"{what}.*which is not read: .*(CSV|csv|text)"):
+        read_sheet(file)
