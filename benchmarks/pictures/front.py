@@ -75,8 +75,8 @@ def draw_effect() -> Drawing:
     proof = investigation.proof
     numbers = {
         "friction": law.coefficient,
-        "before": proof.held_out_before.chi_square_per_dof,
-        "after": proof.held_out_after.chi_square_per_dof,
+        "before": proof.held_out_before.chi_square_per_sample,
+        "after": proof.held_out_after.chi_square_per_sample,
     }
     return Drawing(png, numbers)
 
