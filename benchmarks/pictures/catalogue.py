@@ -23,7 +23,9 @@ PICTURES = {
             front.draw_effect,
             (
                 Statement("README.md", "found as Coulomb friction, {friction} N;"),
-                Statement("README.md", "χ² per sample of the held-out release falls from {before} to {after}."),
+                Statement(
+                    "README.md", "χ² per sample of the held-out release falls from {before} to {after}."
+                ),
             ),
             minutes=True,
             source=NOTEBOOK_EFFECT,
