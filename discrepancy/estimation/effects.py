@@ -55,7 +55,6 @@ class EffectLaws:
         self,
         number: int,
         trajectory: Trajectory,
-        laws: Mapping[int, FloatArray],
         effect: FloatArray,
         shared: FloatArray,
         smoothing: float,
@@ -63,7 +62,7 @@ class EffectLaws:
         """Return forces at ports and readings of a trial along a trajectory; None where they cannot be."""
         try:
             forces = self._forces(number, trajectory, effect, shared, smoothing)
-            return forces, self._readings(number, trajectory, laws, effect)
+            return forces, self._readings(number, trajectory, effect)
         except (DiscrepancyError, InvalidPatchError):
             return None
 
@@ -148,15 +147,13 @@ class EffectLaws:
 
     # ------------------------------------------------------------ sensors
 
-    def _readings(
-        self, number: int, trajectory: Trajectory, laws: Mapping[int, FloatArray], effect: FloatArray
-    ) -> Readings:
+    def _readings(self, number: int, trajectory: Trajectory, effect: FloatArray) -> Readings:
         """Return what effects that are no laws do to readings, with derivatives by their unknowns."""
         trial = self.trials[number]
         known = np.zeros_like(trial.residual)
         by_unknown: dict[int, FloatArray] = {}
         at = len(trial.shared)
-        motion = seen_motion(trajectory, laws)
+        motion = seen_motion(trajectory)
         for term, part in self.candidate.parts(effect):
             if not len(term.patch(self.columns.problem.setting, part).of(PortForce)):
                 known = known + self._shown(number, motion, term, part)
@@ -181,7 +178,7 @@ def moved(values: FloatArray, index: int, step: float) -> FloatArray:
     return found
 
 
-def seen_motion(trajectory: Trajectory, laws: Mapping[int, FloatArray]) -> Motion:
+def seen_motion(trajectory: Trajectory) -> Motion:
     """Return a trajectory as sensors see it: what laws and missing forces add."""
     return Motion(
         added=trajectory.added,

@@ -56,7 +56,6 @@ class Laws(Protocol):
         self,
         number: int,
         trajectory: Trajectory,
-        laws: Mapping[int, FloatArray],
         effect: FloatArray,
         shared: FloatArray,
         smoothing: float,
@@ -146,8 +145,6 @@ class Start:
         Unknowns.
     trajectories : tuple of Trajectory
         Of each trial.
-    laws : tuple of mapping of int to (F,) ndarray
-        Force of the laws at ports in each trial.
     processes : mapping of int to Process
         Missing forces, large enough that the trajectory follows the readings.
     """
@@ -155,7 +152,6 @@ class Start:
     effect: FloatArray
     shared: FloatArray
     trajectories: tuple[Trajectory, ...]
-    laws: tuple[Mapping[int, FloatArray], ...]
     processes: Mapping[int, Process]
 
 
@@ -165,7 +161,6 @@ def following(found: Estimate) -> Start:
         found.effect,
         found.shared,
         tuple(item.trajectory for item in found.trials),
-        tuple(item.laws for item in found.trials),
         found.processes,
     )
 
@@ -294,9 +289,7 @@ class Estimator:
         """Return all trials, linear along trajectories; None where the laws cannot be followed."""
         found = []
         for number, trial in enumerate(self.trials):
-            along = laws.along(
-                number, at.trajectories[number], at.laws[number], at.effect, at.shared, smoothing
-            )
+            along = laws.along(number, at.trajectories[number], at.effect, at.shared, smoothing)
             if along is None:
                 return None
             forces, sensors = along
@@ -329,7 +322,6 @@ class Estimator:
                     trajectory.toward(smoothed.trajectory, part)
                     for trajectory, smoothed in zip(current.trajectories, ahead.trials, strict=True)
                 ),
-                tuple(item.laws for item in ahead.trials),
                 current.processes,
             )
             error = self._error_of_laws(laws, current, there, linear, smoothing)

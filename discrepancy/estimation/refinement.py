@@ -74,9 +74,7 @@ def estimated(search: ForceSearch, followed: Explained) -> Explained | None:
         port: replace(process, size=max(process.size, search.whole_size(port)))
         for port, process in followed.processes.items()
     }
-    found = estimator.estimate(
-        laws, Start(followed.effect, followed.shared, trajectories, ({},) * len(trials), processes)
-    )
+    found = estimator.estimate(laws, Start(followed.effect, followed.shared, trajectories, processes))
     return None if found is None else _explained(search, followed, found)
 
 

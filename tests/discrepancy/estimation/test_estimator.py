@@ -28,7 +28,7 @@ def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):
         Trajectory(motion.added, motion.positions, motion.speeds, motion.forces) for motion in seen.motions
     )
     estimator = Estimator(trials, search.problem.shared.precision, search.about(seen.processes))
-    start = Start(np.zeros(0), seen.shared, trajectories, ({},) * len(trials), seen.processes)
+    start = Start(np.zeros(0), seen.shared, trajectories, seen.processes)
     found = estimator.estimate(nothing, start)
     assert found.log_evidence == pytest.approx(seen.log_evidence, abs=0.05)
     for one, motion in zip(found.trials, seen.motions, strict=True):
