@@ -13,6 +13,7 @@ from twin_master.fleet.flight import GROUPS, fleet_config
 from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, WITHIN, has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.belief_planning import leaving_probability
+from twin_master.network.estimator import BELIEVED
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
@@ -114,6 +115,12 @@ def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.int64]:
     return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
 
 
+def believed_means(group: "xr.Dataset") -> Float:
+    """Return the means of the states of B twins in T turns (B, T, F), SI; NaN where no state is believed."""
+    unexplained = group["unexplained"].values > BELIEVED
+    return np.where(unexplained[..., np.newaxis], np.nan, group["mean"].values)
+
+
 def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
     """Return the last turn of each twin: that of a recording may come early."""
     last: NDArray[np.int64] = np.maximum((group["control_index"].values >= 0).sum(axis=1) - 1, 0)
@@ -188,7 +195,8 @@ def known_twins(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") ->
 def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
     """Return the probability that each twin of a group leaves its control soon, see `attention`: (B,).
 
-    It is NaN of twins that have not flown. Parameters and errors are those of `known_twins`.
+    It is NaN of twins that have not flown, and where no state is believed. Parameters and errors are those of
+    `known_twins`.
     """
     chance, belief = np.full(group.sizes["twin"], np.nan), group["belief"].values.astype(np.float64)
     control = group["control_index"].values[np.arange(len(chance)), last_turns(group)]
@@ -196,6 +204,8 @@ def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Flo
         for index in np.unique(control[rows]).tolist():
             mine = rows[control[rows] == index]
             chance[mine] = attention(knowledge, belief[mine], index)
+    last = np.arange(len(chance)), last_turns(group)
+    chance[group["unexplained"].values[last] > BELIEVED] = np.nan
     return chance
 
 

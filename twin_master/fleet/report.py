@@ -25,7 +25,15 @@ from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND, WATCHED_KIND, fleet_config, told_of
 from twin_master.fleet.learn import LESSONS_NAME, lesson_rows
-from twin_master.fleet.reading import figure_rows, group_figures, last_turns, leaving, noticed, severity
+from twin_master.fleet.reading import (
+    believed_means,
+    figure_rows,
+    group_figures,
+    last_turns,
+    leaving,
+    noticed,
+    severity,
+)
 from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, has_flown, open_group
 from twin_master.fleet.watching import STATE_NAME, counts_of, read_standing
 from twin_master.mission.journal import JOURNAL_NAME
@@ -66,6 +74,13 @@ class Standing:
     def severity(self) -> Float:
         """How badly off each is (B,)."""
         return severity(self.scenario, self.mean)
+
+    @property
+    def worst(self) -> int | None:
+        """The row of the asset that is worst off; None where no state is believed of any."""
+        if np.isnan(self.severity).all():
+            return None
+        return int(np.nanargmax(self.severity))
 
 
 def write_fleet_report(folder: Path | str) -> Path:
@@ -126,7 +141,7 @@ def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: in
         except TwinMasterError as error:
             page.add_paragraph(WORDS.say("unknown", error=error))
         failed = int(np.sum(group["status"].values == FAILED))
-        courses = group["mean"].values[flown], group["state"].values[flown]
+        courses = believed_means(group)[flown], group["state"].values[flown]
         _add_group(page, standing, most, failed, courses)
 
 
@@ -136,7 +151,7 @@ def _flown(record: dict[str, Any], group: "xr.Dataset") -> Standing:
     at = flown, last_turns(group)[flown]
     return Standing(
         record["name"], scenario, [record["members"][row][0] for row in flown], at[1],
-        group["mean"].values[at], group["standard_deviation"].values[at],
+        believed_means(group)[at], group["standard_deviation"].values[at],
         [scenario.control_names[u] for u in group["control_index"].values[at]],
         noticed(group, "alarm")[flown], np.full(len(flown), np.nan),
     )  # fmt: skip
@@ -148,8 +163,9 @@ def _opening(found: list[Standing], groups: "list[xr.Dataset]") -> str:
     first = np.concatenate([group["first_notice"].values[:, NOTICE_KINDS.index("alarm")] for group in groups])
     alarmed = first[first >= 0]
     called = delay[~np.isnan(delay)]
-    worst = max((one for one in found if one.names), key=lambda one: one.severity.max(), default=None)
-    row = 0 if worst is None else int(np.argmax(worst.severity))
+    known = [one for one in found if one.worst is not None]
+    worst = max(known, key=lambda one: np.nanmax(one.severity), default=None)
+    row = None if worst is None else worst.worst
     return WORDS.say(
         "opening", flown=sum(len(one.names) for one in found), assets=len(delay),
         alarmed=len(alarmed), first=min(alarmed, default=0),
@@ -218,7 +234,7 @@ def _add_group(
         page.add_paragraph(WORDS.say("nothing"))
         return
     page.add_report_figure(WORDS.figure("map", map_figure(scenario, standing.mean, failed), failed=failed))
-    if courses is not None:
+    if courses is not None and not np.isnan(courses[0]).all():
         page.add_report_figure(WORDS.figure("course", course_figure(scenario, *courses)))
     factors, soon = printed_factors(scenario), np.rint(100.0 * np.nan_to_num(standing.leaving))
     severity_first = np.nan_to_num(standing.severity, nan=np.inf)  # of no state that is believed

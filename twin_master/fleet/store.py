@@ -80,6 +80,7 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
         "mean": mean,
         "standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
         "log_evidence": flights.log_evidence,
+        "unexplained": flights.unexplained,
         "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, turns) - 1],
         "delay": np.where(failed, np.nan, delay),
         "early": np.where(failed, -1, early),

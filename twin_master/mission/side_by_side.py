@@ -43,6 +43,8 @@ class Flights:
         p(D_t | o_0..o_t).
     log_evidence : (B, T)
         log p(o_t | o_0..o_{t-1}).
+    unexplained : (B, T)
+        Probability that no state explains the sensors, see `is_state_believed`; 0 of twins without notices.
     failure : list of str
         What ended the flight of each twin; empty for one that flew to its end.
     ended : list of str
@@ -56,6 +58,7 @@ class Flights:
     state: Float
     filtered: Float
     log_evidence: Float
+    unexplained: Float
     failure: list[str]
     ended: list[str]
     notices: list[list[tuple[int, Notice]]]
@@ -71,6 +74,7 @@ class Flights:
             state=np.full((count, steps, factors), np.nan),
             filtered=np.full((count, steps, size), np.nan),
             log_evidence=np.full((count, steps), np.nan),
+            unexplained=np.full((count, steps), np.nan),
             failure=[""] * count,
             ended=[""] * count,
             notices=[[] for _ in range(count)],
@@ -79,7 +83,7 @@ class Flights:
     def put(self, twin: int, history: History) -> None:
         """Take in the turns of a twin."""
         turns = len(history.turns)
-        names = ["row", "control_index", "filtered", "log_evidence"] if turns else []
+        names = ["row", "control_index", "filtered", "log_evidence", "unexplained"] if turns else []
         for name in names + ["state"] * history.simulated:
             getattr(self, name)[twin, :turns] = getattr(history, name)
         self.ended[twin], self.notices[twin] = history.ended, history.notices
@@ -188,6 +192,7 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
             (flights.state, state),
             (flights.filtered, now.filtered),
             (flights.log_evidence, now.log_evidence),
+            (flights.unexplained, np.zeros(count)),  # none of these gives notice
         ):
             array[flying, step] = row[flying]
         before = now.log_filtered, control

@@ -321,19 +321,46 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     assert probability["2g"] == 0.05  # as it was assumed
     assert probability["3g"] != 0.10
     assert "raised an alarm, first in" in write_fleet_report(outcome.folder).read_text()
-    # A watched asset says how probably it leaves its control, as the store does; also one taken up again.
-    config = json.loads((outcome.folder / "config.json").read_text())
-    soon = leaving(outcome.folder, config["fleet"]["groups"][0], group)
-    for _ in range(2):  # the second time nothing is left to read
-        assets = watched(fleet_file, tmp_path / "out").assets
-        records = [asset.record() for _, asset in sorted(assets.items())]
-        assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
-        assert sum(record["alarms"] > 0 for record in records) == alarmed
+    records = [asset.record() for asset in watched(fleet_file, tmp_path / "out").assets.values()]
+    assert sum(record["alarms"] > 0 for record in records) == alarmed
     (tmp_path / "logs" / "wing-9.csv").write_text("turn,control\n")
     few = fly_fleet(load_fleet(fleet_of(tmp_path, LOGS, "steps = 5")), tmp_path / "few", Engine(0)).failures
     none = "its recording has no turn yet."
     long = "it has 6 turns, and 5 at most are flown: set `steps` of the group."
     assert few == {"north/wing-1": long, "north/wing-2": long, "north/wing-9": none}
+
+
+def leaving_soon(fleet_file: Path, folder: Path) -> Any:
+    """Fly the recordings of a fleet; return the folder, and how probably each asset leaves its control."""
+    outcome = fly_fleet(load_fleet(fleet_file), folder, Engine(0))
+    config = json.loads((outcome.folder / "config.json").read_text())
+    return outcome.folder, leaving(outcome.folder, config["fleet"]["groups"][0], open_fleet(folder)["north"])
+
+
+def watched_records(fleet_file: Path, folder: Path) -> list[dict[str, Any]]:
+    return [asset.record() for _, asset in sorted(watched(fleet_file, folder).assets.items())]
+
+
+def test_a_watched_asset_says_how_probably_it_leaves_its_control_as_the_store_does(fleet_file, tmp_path):
+    """Also one that is taken up again, of which nothing is left to read."""
+    path = tmp_path / "wing.toml"
+    path.write_text("notice = false\n" + path.read_text())  # so that a state is believed whatever comes
+    _, soon = leaving_soon(fleet_of(tmp_path, LOGS, f"steps = {TURNS}"), tmp_path / "flown")
+    for _ in range(2):
+        records = watched_records(fleet_file, tmp_path / "out")
+        assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
+
+
+def test_of_an_asset_in_no_state_that_is_believed_a_fleet_tells_no_state(fleet_file, tmp_path):
+    """The recordings are noise, which no state explains."""
+    folder, soon = leaving_soon(fleet_of(tmp_path, LOGS, f"steps = {TURNS}"), tmp_path / "flown")
+    assert np.isnan(soon).all()
+    records = watched_records(fleet_file, tmp_path / "out")
+    assert [(record["leaving"], record["severity"]) for record in records] == [(None, None)] * 3
+    for fleet in (folder, tmp_path / "out"):
+        page = write_fleet_report(fleet).read_text()
+        assert page.count("not believed") >= 3
+        assert "worst off" not in page
 
 
 def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_file, tmp_path):
