@@ -46,7 +46,7 @@ from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.proof_record import Proof
 from discrepancy.search.starts import Tell
-from discrepancy.search.strategy import Search
+from discrepancy.search.strategy import OnSearch, Search, nobody_looks
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
@@ -115,6 +115,7 @@ def investigate(
     seed: int = 0,
     thorough: bool = True,
     progress: Progress | None = None,
+    on_search: OnSearch = nobody_looks,
 ) -> Investigation:
     """Find out what a model lacks.
 
@@ -133,6 +134,8 @@ def investigate(
         False: no map of residuals and no next experiment, for studies over many campaigns.
     progress : Progress, optional
         Where to report.
+    on_search : callable, optional
+        Takes each search as it begins, to look at while it goes on.
 
     Returns
     -------
@@ -166,7 +169,7 @@ def investigate(
         problem = without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = name(problem, catalogue, tell=tell)
+        verdict, search, fit = name(problem, catalogue, tell=tell, on_search=on_search)
         verdict = with_untested(verdict, setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):

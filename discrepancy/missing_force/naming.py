@@ -6,7 +6,7 @@ motion, new columns: an iterated smoother whose fixed point is the most probable
 Laplace's.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -239,7 +239,9 @@ class ForceSearch:
 
     # ---------------------------------------------------------------- what
 
-    def name(self, effects: Sequence[Effect]) -> list[Explained]:
+    def name(
+        self, effects: Sequence[Effect], tell: Callable[[str], None] = lambda words: None
+    ) -> list[Explained]:
         """Return hypotheses, the most probable first: sets of effects that were found one after another.
 
         Each effect alone, with its own shape and with a free one; the best of these with one more effect,
@@ -251,10 +253,15 @@ class ForceSearch:
             best = self._ranked(found, len(effects))[0]
             longer: dict[Key, Explained] = {}
             for base in beam:
-                for _, term, starts in self.screened(base, effects)[:width]:
+                beside = f" beside {base.candidate.words}" if base.candidate.terms else ""
+                tell(f"comparing all effects{beside} with the missing force")
+                promising = self.screened(base, effects)[:width]
+                for number, (_, term, starts) in enumerate(promising):
                     candidate = base.candidate.plus(term)
                     if candidate.key in longer:
                         continue
+                    remaining = len(promising) - number - 1
+                    tell(f"following {candidate.words} along the missing force, {remaining} more")
                     begun = (np.concatenate((base.effect, start)) for start in starts)
                     ends = [one for at in begun if (one := self.followed(base, candidate, at)) is not None]
                     if ends:

@@ -1,6 +1,6 @@
 """The search for the set of effects that explains a campaign: screen, fit, add."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import exp
@@ -253,7 +253,7 @@ class Search:
     def by_force(self, force: ForceSearch) -> None:
         """Compare the sets of effects that follow the missing force best, in place of what was fitted."""
         self.exact, self.rough = {(): self.none}, {}
-        self.forces = refined(force, force.name(self.effects), len(self.effects), self.tell)
+        self.forces = refined(force, force.name(self.effects, self.tell), len(self.effects), self.tell)
         able = [
             one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
             if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
@@ -403,7 +403,20 @@ class Search:
         self.refine(rough, self.score(self.best()) - SEARCH.close)
 
 
-def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
+OnSearch = Callable[["Search"], None]
+"""Takes a search that begins, to look at while it goes on."""
+
+
+def nobody_looks(search: Search) -> None:
+    """Take a search that begins, and leave it alone."""
+
+
+def search(
+    problem: Problem,
+    effects: Sequence[Effect],
+    tell: Tell = in_silence,
+    on_search: OnSearch = nobody_looks,
+) -> Search:
     """Fit the model without effect, then search the catalogue.
 
     Parameters
@@ -415,6 +428,8 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         or ended is tried so too.
     tell : callable
         Takes a few words on what is fitted, and how much is left.
+    on_search : callable
+        Takes the search once it has the fit without effect.
 
     Returns
     -------
@@ -432,6 +447,7 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
         if again is not None and again.objective < none.objective - SEARCH.worth_fitting:
             found = Search(problem, usable, again, tell=tell)
+    on_search(found)
     force = found.force if found.moves else None
     if force is None or len(force.ports) > 1:  # forces at several ports take up nearly any law at one
         found.singles()

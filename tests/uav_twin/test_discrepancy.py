@@ -16,6 +16,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.files.verdict import read_patch, read_verdict_file
 from discrepancy.model_choice import choose_model
+from discrepancy.search.strategy import Search
 from discrepancy.sources.examples import example_campaign, plan_for
 from tests import command_line
 from tests.command_line import Terminal, command, refused, said
@@ -339,6 +340,38 @@ def test_from_an_example_to_a_verdict(campaign, tmp_path):
     assert str(tmp_path) not in page
     # a second time: only on demand (that it comes to the same conclusion is tested in test_workflow.py)
     assert "--replace" in refused("discrepancy", "run", str(campaign), *RIG, "--out", str(out))
+
+
+def test_an_interrupted_search_keeps_what_it_has_found(campaign, tmp_path):
+    """Ctrl-C comes when single effects are compared; another run takes the place of what was kept."""
+    out = tmp_path / "verdict"
+    run = ("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--no-report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Search, "sets", interrupt)
+        words = refused(*run, code=130)
+    kept = out / "verdict_so_far.json"
+    assert f"Interrupted; the hypotheses fitted until then are in {kept}." in words
+    record = json.loads(kept.read_text(encoding="utf-8"))
+    assert record["schema"] == "uav-twin verdict so far 1"
+    assert record["hypotheses"][0]["effects"][0]["identifier"] == "seating_offset"
+    assert sum(item["probability"] for item in record["hypotheses"]) == pytest.approx(1.0, abs=1e-3)
+    said(*run)
+    assert not kept.exists()
+    assert (out / "verdict.json").is_file()
+
+
+def test_a_search_that_is_interrupted_before_it_has_found_anything_leaves_no_folder(campaign, tmp_path):
+    out = tmp_path / "verdict"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("discrepancy.workflow.check_data", interrupt)
+        words = refused("discrepancy", "run", str(campaign), *RIG, "--out", str(out), code=130)
+    assert "Interrupted." in words
+    assert not out.exists()
+
+
+def interrupt(*_: object) -> None:
+    """Do what Ctrl-C does."""
+    raise KeyboardInterrupt
 
 
 def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path):
