@@ -13,7 +13,8 @@ from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.models.sensing import observe
 from discrepancy.models.structures import WingModel
-from discrepancy.search.strategy import Search, search
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import search
 from discrepancy.sources.examples import example_campaign, wing_plan
 from fe.runtime.patch import ModelPatch, PowerDamping, RootCompliance
 

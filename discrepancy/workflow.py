@@ -46,7 +46,8 @@ from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.proof_record import Proof
 from discrepancy.search.starts import Tell
-from discrepancy.search.strategy import OnSearch, Search, nobody_looks
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import OnSearch, nobody_looks
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label

@@ -15,7 +15,8 @@ from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.search.starts import Tell, acts_within, in_silence
-from discrepancy.search.strategy import OnSearch, Search, nobody_looks, search
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import OnSearch, nobody_looks, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, Verdict, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain

@@ -23,7 +23,7 @@ from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.sensing import observe
 from discrepancy.report.figures import ReportInput
-from discrepancy.search.strategy import search
+from discrepancy.search.whole_search import search
 from discrepancy.sources.examples import example_campaign, plan_of
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder

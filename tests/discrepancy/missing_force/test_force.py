@@ -26,7 +26,8 @@ from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence
-from discrepancy.search.strategy import Search, search
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import search
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
