@@ -12,8 +12,8 @@ from benchmarks.cantilever import Cantilever, campaign
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Quantity, Trial
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.models.interface import Conditions
-from discrepancy.models.sensing import observe
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 from reporting.figures import PREDICTION, REFERENCE, new_figure, publication_style, to_png
 

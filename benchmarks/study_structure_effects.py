@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.model_choice import load_model
-from discrepancy.models.acting import Acting, Shown
-from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.motion import motion_of
+from discrepancy.system.excitation import Acting, Shown
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.motion import motion_of
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.model_cache import reduced_structure

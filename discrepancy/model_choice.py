@@ -8,12 +8,12 @@ from calibration.joint.wing_table import SHIPPED_PRIOR
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError, said
 from discrepancy.files.verdict import StoredPatch, read_patch
-from discrepancy.models.fmu import FmuModel
-from discrepancy.models.interface import Model
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.structures import StructureModel, WingModel
+from discrepancy.fmu_models.model import FmuModel
 from discrepancy.sources.from_run import run_model
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_file import SHIPPED_MODELS
+from discrepancy.system.structures import StructureModel, WingModel
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure

@@ -42,14 +42,14 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce, seen_force
 from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
 from discrepancy.model_choice import load_model
-from discrepancy.models.interface import Model
-from discrepancy.models.lumped import LumpedModel
 from discrepancy.proof_record import Proof
 from discrepancy.search.starts import Tell
 from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import OnSearch, nobody_looks
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter

@@ -51,7 +51,6 @@ from discrepancy.model_choice import ModelChoice as ModelChoice
 from discrepancy.model_choice import ModelKind as ModelKind
 from discrepancy.model_choice import choice_of_run as choice_of_run
 from discrepancy.model_choice import choose_model as choose_model
-from discrepancy.models.interface import Model as Model
 from discrepancy.parameters.calibration import calibrate_parameters as calibrate_parameters
 from discrepancy.report.figures import ReportInput as ReportInput
 from discrepancy.report.page import said_on_page as said_on_page
@@ -67,6 +66,7 @@ from discrepancy.sources.examples import plan_of as plan_of
 from discrepancy.sources.examples import write_example as write_example
 from discrepancy.sources.from_run import run_campaign as run_campaign
 from discrepancy.sources.measured_rigs import write_rig_campaign as write_rig_campaign
+from discrepancy.system.interface import Model as Model
 from discrepancy.verdict import VerdictKind as VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder as check_verdict_folder
 from discrepancy.verdict_folder import write_verdict_folder as write_verdict_folder

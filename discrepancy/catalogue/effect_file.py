@@ -62,7 +62,7 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Effect, EffectKeys, Setting
 from discrepancy.catalogue.needs import DYNAMIC, NEEDS, PLACES, Asked, EffectSection, Target
 from discrepancy.errors import CatalogueError, said
-from discrepancy.models.interface import PortScale
+from discrepancy.system.scales import PortScale
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import EVERY_CHANNEL, PRIMITIVES, ModelPatch, Primitive, Window

@@ -11,7 +11,8 @@ from pydantic import Field
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import SENTENCES, said
-from discrepancy.models.interface import ACROSS, PortScale
+from discrepancy.system.response import ACROSS
+from discrepancy.system.scales import PortScale
 from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
 

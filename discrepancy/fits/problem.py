@@ -16,8 +16,8 @@ from discrepancy.campaign.noise import NoiseModel, noise_model, whiteness_is_tes
 from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError, said
-from discrepancy.models.interface import Model
-from discrepancy.models.sensing import observe
+from discrepancy.system.interface import Model
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 from reporting.memory import Memory
 

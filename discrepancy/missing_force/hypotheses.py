@@ -18,9 +18,9 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import Response
-from discrepancy.models.sensing import observe_response
 from discrepancy.search_settings import SEARCH
+from discrepancy.system.response import Response
+from discrepancy.system.sensing import observe_response
 from fe.compilation import compiled, law_functions
 from fe.runtime.arrays import HEAD, PLACE
 from fe.runtime.errors import InvalidPatchError

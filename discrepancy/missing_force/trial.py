@@ -19,9 +19,9 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
-from discrepancy.models.acting import divided
-from discrepancy.models.interface import PortedSystem
-from discrepancy.models.sensing import in_own_clock
+from discrepancy.system.excitation import divided
+from discrepancy.system.response import PortedSystem
+from discrepancy.system.sensing import in_own_clock
 from fe.runtime.patch import ModelPatch
 
 from .kalman import driven

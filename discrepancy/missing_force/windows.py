@@ -16,7 +16,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.models.interface import PortedSystem
+from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import GROUND, MOST_EVENTS, Events, changes, events, throughout

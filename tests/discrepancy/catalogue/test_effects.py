@@ -21,10 +21,10 @@ from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import mains_lines
 from discrepancy.errors import CatalogueError
-from discrepancy.models.interface import ACROSS, Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.sensing import observe
 from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import ACROSS, Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime import patch as patches
 from fe.runtime.patch import FreePlay, LoadGain, ModelPatch, PointMass, PowerStiffness, SensorGain
 from tests.discrepancy.rigs import INPUTS, asked, campaign, chosen, model_of, seen, setting_of

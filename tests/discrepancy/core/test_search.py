@@ -11,9 +11,9 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import whiteness_tests
 from discrepancy.judgement import in_part
-from discrepancy.models.interface import Conditions
-from discrepancy.models.sensing import observe
 from discrepancy.search.strategy import Search
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import Clock, ModelPatch, PowerDamping, Window

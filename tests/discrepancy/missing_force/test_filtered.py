@@ -16,8 +16,8 @@ from discrepancy.missing_force.shares import _noise
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
 from discrepancy.missing_force.windows import _most_telling, residual_windows
-from discrepancy.models.interface import PortedSystem
 from discrepancy.report.residual_figures import time_line_figure
+from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate
 from tests.discrepancy.bench import Bench

@@ -13,8 +13,8 @@ from fmpy import read_model_description
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
-from discrepancy.models.interface import ACROSS, Conditions
-from discrepancy.models.structures import WingModel
+from discrepancy.system.response import ACROSS, Conditions
+from discrepancy.system.structures import WingModel
 from fe.high_pass import filtered_record
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors

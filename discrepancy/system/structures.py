@@ -14,10 +14,12 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
-from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Outputs, Place, PortScale
-from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.system_model import Case, State, SystemModel
+from discrepancy.system.excitation import Acting, Course, Load, Shown, place_among
+from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.response import MOVES, TURNS, Outputs, Place
+from discrepancy.system.scales import PortScale
+from discrepancy.system.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError

@@ -3,204 +3,25 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError, said
+from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
+from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
 from reporting.memory import Memory
 from reporting.words import brief, capital, counted
 
-
-@dataclass(frozen=True)
-class PortScale:
-    """Natural scales of a port for the campaign at hand: they make dimensionless effects physical.
-
-    Attributes
-    ----------
-    displacement : float
-        A, the largest motion of the port by the unpatched model in the dynamic trials that are fitted; in the
-        other trials if there are none [m or rad].
-    stiffness : float
-        k, the stiffness of the first bending mode seen at the port, w1^2 / phi1(port)^2 [N/m or N m/rad].
-    angular_frequency : float
-        w1 [rad/s].
-    static_stiffness : float or None
-        1 / (p . K^-1 p), the stiffness at rest seen at the port [N/m or N m/rad]. At a stiff joint it is a
-        small part of `stiffness`, and no effect can take away more. None: not known, taken as `stiffness`.
-    largest_displacement : float or None
-        The largest motion of the port in all trials, flights too [m or rad]. None: taken as `displacement`.
-    spread : tuple of (float, float)
-        Where a force at the port acts: its share, and the motion there over that of the port, by place. A
-        force that is spread over the wing acts on the motion of each place, and A is the mean's.
-    free : bool
-        Whether nothing holds the port (a body that falls or rolls), so that no place is its zero.
-    turns : bool
-        Whether its motion turns in a trial, or may: one that goes one way shows no memory.
-    of_state : bool
-        Whether it is a port of a state (a level, a temperature), at which laws are flows: `displacement`
-        times `angular_frequency` is then its largest value, `displacement` times `stiffness` the flow scale.
-    driven : bool
-        Whether drives alone move it, so that no force holds it still.
-    """
-
-    displacement: float
-    stiffness: float
-    angular_frequency: float
-    static_stiffness: float | None = None
-    largest_displacement: float | None = None
-    spread: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
-    free: bool = False
-    turns: bool = True
-    of_state: bool = False
-    driven: bool = False
-
-    def mean_power(self, exponent: float) -> float:
-        """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""
-        return sum((share * float(abs(motion) ** exponent) for share, motion in self.spread), 0.0)
-
-
-@dataclass(frozen=True)
-class Scales:
-    """Natural scales of a model under a campaign.
-
-    Attributes
-    ----------
-    length : float
-        Semi-span or characteristic length L [m].
-    tip_stiffness : float
-        Static stiffness at the load point [N/m].
-    modal_mass : float
-        Mass of the first mode referred to the load point [kg].
-    angular_frequency : float
-        w1 [rad/s].
-    force, load_factor : float
-        Largest applied force [N] and load factor [1] of the campaign.
-    duration : float
-        Longest dynamic record [s]; 1 without one.
-    campaign_time : float
-        Time from the first to the last sample of the campaign [s]; 1 if unknown.
-    ports : mapping of str to PortScale
-        By port name; besides those of `Model.ports` the places of forces that are spread over the structure.
-    """
-
-    length: float
-    tip_stiffness: float
-    modal_mass: float
-    angular_frequency: float
-    force: float
-    load_factor: float
-    duration: float
-    campaign_time: float
-    ports: Mapping[str, PortScale]
-
-
-Place = str | tuple[float, float]
-MOVES, TURNS, EITHER = ("N", "m"), ("N m", "rad"), ("N or N m", "m or rad")
-"""Units of a force and of a motion at a port."""
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """All that a response depends on besides trial and patch.
-
-    Attributes
-    ----------
-    parameters : (P,) ndarray
-        Values of `Model.parameters`, in order.
-    initial : (R, 2) ndarray
-        Ring-downs. At rest: column 0 holds deviations from the static release shape, in units of the release
-        displacement, by mode, row 0 that of the whole shape (so the motion starts at (1 + initial[0, 0])
-        times the static shape plus initial[r, 0] of mode r); column 1 is zero. Not at rest: displacement and
-        velocity / w_r of mode r, in units of the release displacement, at the release point.
-    clock : tuple of float
-        (rate, zero): a sample stamped t shows the motion at (1 + rate) t + zero [1], [s].
-    health : (N, 2) ndarray
-        Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
-    offset : tuple of float
-        Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
-    refinement : int
-        Time steps are this many times smaller than usual, to check the integration.
-    """
-
-    parameters: FloatArray
-    initial: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    clock: tuple[float, float] = (0.0, 0.0)
-    health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
-    offset: tuple[float, ...] = ()
-    refinement: int = 1
-
-    def stamps(self, time: FloatArray) -> FloatArray:
-        """Return the times at which samples with stamps (N,) show the motion [s]."""
-        return (1.0 + self.clock[0]) * time + self.clock[1]
-
-    @property
-    def key(self) -> tuple[object, ...]:
-        """All of it as a value that can be looked up."""
-        values = vars(self).values()
-        return tuple(item.tobytes() if isinstance(item, np.ndarray) else item for item in values)
-
-
-class Response(NamedTuple):
-    """What perfect sensors would show.
-
-    Attributes
-    ----------
-    values : (N, C) ndarray
-        By output, SI units.
-    rates : (N, C) ndarray or None
-        Their time derivatives, for dynamic trials.
-    """
-
-    values: FloatArray
-    rates: FloatArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class PortedSystem:
-    """A model in motion as a linear system with ports: what a force that nobody knows of does to readings.
-
-    s' = A s - sum_p b_p g_p, y = C s - sum_p e_p g_p, in the coordinates s = (q, q') of the modes. What is
-    known to act is in the model's own response; s is what a missing force adds to it.
-
-    Attributes
-    ----------
-    generator : (n, n) ndarray
-        A [1/s].
-    ports : tuple of str
-        Names, P of them.
-    actions : (P, n) ndarray
-        b of each port: what takes its force from the state.
-    positions, speeds : (P, n) ndarray
-        Rows by which a port moves. A port of a state moves at the speed that the state is.
-    outputs : (C, n) ndarray
-        Rows of the outputs.
-    through : (P, C) ndarray
-        e of each port: what an output shows of its force at once.
-    """
-
-    generator: FloatArray
-    ports: tuple[str, ...]
-    actions: FloatArray
-    positions: FloatArray
-    speeds: FloatArray
-    outputs: FloatArray
-    through: FloatArray
-
-
-Outputs = tuple[tuple[str, Quantity], ...]
-"""Outputs, and the quantity wanted of each."""
-ACROSS = ".transverse", ".shear"
-"""What follows the name of a strain in those across its gauge's direction: strain, engineering shear."""
 NO_PATCH = ModelPatch()
 
 
@@ -356,7 +177,7 @@ class Model(ABC):
     def sensors(self) -> ModelPatch:
         """Sensors that are built in, for channels or for outputs of those names.
 
-        They are no part of its responses: `discrepancy.models.sensing.observe` applies them, since what
+        They are no part of its responses: `discrepancy.system.sensing.observe` applies them, since what
         sensors show of a response depends on all of them together.
         """
         return self.patch.of(*SENSORS)

@@ -7,7 +7,8 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError, said
-from discrepancy.models.interface import ACROSS, Conditions, Model, Response
+from discrepancy.system.interface import Model
+from discrepancy.system.response import ACROSS, Conditions, Response
 from fe.high_pass import filtered_record
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation

@@ -14,8 +14,8 @@ from scipy.signal import periodogram
 
 from discrepancy.campaign.records import FloatArray, Hold, Trial
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import SMOOTH_PARTS, Acting, Course, Load, straight
-from discrepancy.models.fmu_file import FmuModelDescription, FmuVariables, ReleaseOf
+from discrepancy.fmu_models.description import FmuModelDescription, FmuVariables, ReleaseOf
+from discrepancy.system.excitation import SMOOTH_PARTS, Acting, Course, Load, straight
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem

@@ -11,12 +11,13 @@ from scipy.linalg import eigh
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError, said
-from discrepancy.models import lumped_file
-from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
-from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Outputs, Place
-from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.system_model import Case, State, SystemModel
+from discrepancy.system import lumped_file
+from discrepancy.system.excitation import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
+from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.model_file import DescribedModel
+from discrepancy.system.response import EITHER, MOVES, TURNS, Outputs, Place
+from discrepancy.system.system_model import Case, State, SystemModel
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
@@ -90,7 +91,7 @@ class Rig(NamedTuple):
 
 
 class LumpedModel(DescribedModel, SystemModel):
-    """A lumped model (`discrepancy.models.interface.Model`).
+    """A lumped model (`discrepancy.system.interface.Model`).
 
     Damping that is given as modal ratios stays at these ratios when the structure changes. Health (z1, z2)
     has no meaning here and is passed over.

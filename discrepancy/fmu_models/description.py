@@ -13,8 +13,8 @@ from pydantic import BeforeValidator, Field
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import DEFAULT_PLACE
-from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
+from discrepancy.system.excitation import DEFAULT_PLACE
+from discrepancy.system.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding

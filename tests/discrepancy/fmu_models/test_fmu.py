@@ -13,11 +13,12 @@ import pytest
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.fmu_models.description import FmuModelDescription
+from discrepancy.fmu_models.model import FmuModel
 from discrepancy.model_choice import choose_model
-from discrepancy.models.fmu import FmuModel
-from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.lumped import LumpedModel
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions
 from fe.runtime.patch import LoadGain, LoadPlace, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fmu_asset.packing.contents import build_script_fmu
 from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, integrated, laws

@@ -11,20 +11,12 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, divided, release_of
-from discrepancy.models.interface import (
-    NO_PATCH,
-    Conditions,
-    Model,
-    Outputs,
-    Place,
-    PortedSystem,
-    PortScale,
-    Response,
-    Scales,
-)
-from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.motion import Motion, motion_of
+from discrepancy.system.excitation import Acting, Course, Load, LoadChange, Shown, divided, release_of
+from discrepancy.system.interface import NO_PATCH, Model
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.motion import Motion, motion_of
+from discrepancy.system.response import Conditions, Outputs, Place, PortedSystem, Response
+from discrepancy.system.scales import PortScale, Scales
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
@@ -75,7 +67,7 @@ class Case(NamedTuple):
 
 
 class SystemModel(Model):
-    """A model by its matrices (`discrepancy.models.interface.Model`), in N coordinates of its own.
+    """A model by its matrices (`discrepancy.system.interface.Model`), in N coordinates of its own.
 
     Attributes
     ----------

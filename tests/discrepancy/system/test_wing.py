@@ -16,9 +16,9 @@ from calibration.result.file import save_calibration
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu import FmuModel
-from discrepancy.models.structures import StructureModel, WingModel
-from discrepancy.models.system_model import State, SystemModel
+from discrepancy.fmu_models.model import FmuModel
+from discrepancy.system.structures import StructureModel, WingModel
+from discrepancy.system.system_model import State, SystemModel
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import entry
 from fe.reduction.reduced_basis import reduce_structure

@@ -14,9 +14,9 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Acting, Load
-from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace, state_motion
+from discrepancy.fmu_models.description import FmuModelDescription
+from discrepancy.fmu_models.system import LINEAR, RECORD, Case, FmuPace, state_motion
+from discrepancy.system.excitation import Acting, Load
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import ALIKE, Boundaries, Laws, StaticSolution, static_solution, steps_under

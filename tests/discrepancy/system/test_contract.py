@@ -14,11 +14,12 @@ from scipy.linalg import eigh
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Hold, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu import FmuModel
-from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.structures import StructureModel, WingModel
-from discrepancy.models.system_model import State, SystemModel
+from discrepancy.fmu_models.model import FmuModel
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions
+from discrepancy.system.structures import StructureModel, WingModel
+from discrepancy.system.system_model import State, SystemModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import PRIMITIVES, FreePlay, LoadPlace, PointMass, PowerDamping, PowerStiffness

@@ -9,7 +9,7 @@ from pydantic import ConfigDict
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Model
+from discrepancy.system.interface import Model
 from reporting import toml_file
 from reporting.toml_file import Fault, Name, NotNegative, Number, checked, read_toml
 

@@ -16,8 +16,8 @@ from scipy.linalg import eigh, null_space
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Acting, Shown, by_order
-from discrepancy.models.interface import PortedSystem
+from discrepancy.system.excitation import Acting, Shown, by_order
+from discrepancy.system.response import PortedSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution

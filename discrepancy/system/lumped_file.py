@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError, said
-from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
+from discrepancy.system.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce

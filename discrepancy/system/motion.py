@@ -12,9 +12,9 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray, Hold, Start
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown, by_order, straight
-from discrepancy.models.interface import Response
-from discrepancy.models.linear_system import LinearSystem
+from discrepancy.system.excitation import SMOOTH_PARTS, Acting, Shown, by_order, straight
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.response import Response
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import FADING, LAGGED
 from fe.runtime.motion import Begin, Boundaries, Laws, advance, steps_under, substeps

@@ -8,20 +8,14 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError, said
-from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
-from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_motion import FmuMotion, Sampled
-from discrepancy.models.fmu_system import Case
-from discrepancy.models.interface import (
-    NO_PATCH,
-    Conditions,
-    Outputs,
-    PortedSystem,
-    PortScale,
-    Response,
-    Scales,
-)
-from discrepancy.models.model_file import DescribedModel
+from discrepancy.fmu_models.description import FmuModelDescription
+from discrepancy.fmu_models.motion import FmuMotion, Sampled
+from discrepancy.fmu_models.system import Case
+from discrepancy.system.excitation import Course, LoadChange, divided, place_among, release_of
+from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.model_file import DescribedModel
+from discrepancy.system.response import Conditions, Outputs, PortedSystem, Response
+from discrepancy.system.scales import PortScale, Scales
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 from fmu_asset.door.runs import State
@@ -31,7 +25,7 @@ LATEST = 100.0
 
 
 class FmuModel(DescribedModel):
-    """An FMU (`discrepancy.models.interface.Model`).
+    """An FMU (`discrepancy.system.interface.Model`).
 
     Parameters
     ----------

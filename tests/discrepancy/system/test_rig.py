@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
-from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.sensing import observe
-from discrepancy.models.system_model import FORCES
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
+from discrepancy.system.system_model import FORCES
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import PowerDamping, PowerStiffness, Primitive, Window

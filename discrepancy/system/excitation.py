@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline, PPoly
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import FloatArray, Hold, Start, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Place
+from discrepancy.system.response import Place
 from fe.runtime.expression import Expression
 from fe.runtime.patch import LoadGain, LoadPlace, Primitive
 

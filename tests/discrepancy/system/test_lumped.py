@@ -14,12 +14,12 @@ from scipy.optimize import brentq
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown
-from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
-from discrepancy.models.motion import Motion, motion_of
-from discrepancy.models.system_model import State
+from discrepancy.system.excitation import Acting, Shown
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_file import SHIPPED_MODELS, LumpedDescription
+from discrepancy.system.motion import Motion, motion_of
+from discrepancy.system.system_model import State
 from fe.runtime import patch as patches
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
