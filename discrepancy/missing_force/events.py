@@ -17,7 +17,8 @@ from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 
 from .filtered import Filtered, Process, without
 from .kalman import Steps, discretised, joined
-from .view import SIZE_DOUBT, TIME_DOUBT, View
+from .process_search import SIZE_DEVIATION, TIME_DEVIATION
+from .view import View
 
 CHANGE_PRICE = 4.0
 """ln odds against a change, beside the choice of its place."""
@@ -42,7 +43,7 @@ GROUND = 3.0
 FEW_PASSES, MOST_PASSES, ROUNDS = 30, 60, 5
 LEAST_GAIN = 0.5
 REACH = np.array([0.9, 0.7, 0.9, 0.7])
-DOUBTS = np.array([SIZE_DOUBT, 3.0, SIZE_DOUBT, TIME_DOUBT])
+DOUBTS = np.array([SIZE_DEVIATION, 3.0, SIZE_DEVIATION, TIME_DEVIATION])
 """Prior deviations of the logarithms of sizes and times; an event may be a push that stays as it is."""
 RANGE = 12.0
 """Evidence below the largest [nat] at which a place is out of the question."""

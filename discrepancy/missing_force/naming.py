@@ -23,7 +23,8 @@ from fe.runtime.patch import ModelPatch
 
 from .filtered import Process, Solution
 from .hypotheses import Columns, log_prior, scaled, variants
-from .view import MOST_STEPS, Column, Motion, Processes, View, combined
+from .process_search import MOST_STEPS, Processes
+from .view import Column, Motion, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 WIDE = 3.0
@@ -416,5 +417,5 @@ def seen(
     most: int = MOST_STEPS,
 ) -> Explained:
     """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begin, near=near, most=most)
+    processes, evidence = view.most_probable(about, begin, near=near, most_steps=most)
     return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))

@@ -1,33 +1,19 @@
 """The missing forces of all trials: their processes, their courses, and the motion beside them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 
 from .filtered import LEAST_PRECISION, Filtered, Process, Regression, Solution, regression
+from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
 from .trial import Part, SeenTrial
 
-Processes = Mapping[int, Process]
-"""Missing forces by the numbers of their ports."""
-
-SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
-"""Prior deviations of the logarithms of a process's size and correlation time."""
-DOUBTS = np.array((SIZE_DOUBT, TIME_DOUBT))
-STARTS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
-"""Logarithms of sizes and times, over some, at the best of which Newton's method begins: what is left beside
-a law is a part of what was missing."""
-NEAR, LONGEST, AT_TOP, MOST_STEPS = 0.02, 1.5, 1e-4, 20
-"""Of Newton's method: difference of logarithms by which slopes are found, the longest step that is taken, the
-shortest, and how many are taken."""
 LATER = 200
 """Samples after which more of them tell nothing of a moment."""
-FARTHEST = 5.0
-"""Prior deviations within which processes are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,62 +143,27 @@ class View:
 
     @np.errstate(invalid="ignore")
     def most_probable(
-        self, about: Processes, begin: Processes, *, near: bool = False, most: int = MOST_STEPS
+        self, median: Processes, begin: Processes, *, near: bool = False, most_steps: int = MOST_STEPS
     ) -> tuple[dict[int, Process], float]:
         """Return the processes of the largest evidence times their prior, and its logarithm [nat].
 
-        By Newton's method within `FARTHEST` and `times`. Where a search ends before the top a rounding
-        decides; the top does not depend on it.
-
         Parameters
         ----------
-        about : mapping of int to Process
+        median : mapping of int to Process
             Medians of the prior.
         begin : mapping of int to Process
-            From which they are looked for: port after port from the best of `STARTS`.
+            Processes to begin with; the search begins at the best of a grid around them.
         near : bool
-            From `begin` itself instead.
-        most : int
-            Steps of Newton's method.
+            Begin at `begin` itself instead.
+        most_steps : int
+            Steps of Newton's method, at most.
         """
 
-        def at(logs: FloatArray) -> dict[int, Process]:
-            items = zip(begin.items(), np.exp(logs).tolist(), strict=True)
-            return {port: replace(one, size=size, time=time) for (port, one), (size, time) in items}
+        def log_evidence(processes: Processes) -> float:
+            return self.evidence(median, processes)
 
-        def value(logs: FloatArray) -> float:
-            return self.evidence(about, at(logs))
-
-        median, logs = (np.log([(of[port].size, of[port].time) for port in begin]) for of in (about, begin))
-        low, high = median - FARTHEST * DOUBTS, median + FARTHEST * DOUBTS
-        low[:, 1], high[:, 1] = np.clip((low[:, 1], high[:, 1]), *np.log(self.times))
-        logs = np.clip(logs, low, high)
-        for port in () if near else np.eye(len(logs)):
-            logs = max((np.clip(logs + np.outer(port, start), low, high) for start in STARTS), key=value)
-        top, far, units = value(logs), np.inf, NEAR * np.eye(logs.size).reshape(-1, *logs.shape)
-        for _ in range(most):
-            ahead, back = (np.array([value(logs + step) for step in steps]) for steps in (units, -units))
-            if far > NEAR:
-                bend = np.diag(ahead + back - 2.0 * top)
-                for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-                    both = value(logs + units[i] + units[k])
-                    bend[i, k] = bend[k, i] = both - ahead[i] - ahead[k] + top
-            if not np.isfinite((*bend.flat, *ahead, *back)).all():
-                break
-            up = 0.5 * NEAR * (ahead - back)
-            free = np.flatnonzero(np.where(up > 0.0, np.ravel(logs < high), np.ravel(logs > low)))
-            values, axes = np.linalg.eigh(bend[np.ix_(free, free)])  # uphill where it is hollow, too
-            step = np.zeros(logs.size)
-            step[free] = axes @ (axes.T @ up[free] / np.maximum(np.abs(values), 1e-300))
-            step = step.reshape(logs.shape) / max(1.0, np.abs(step).max() / LONGEST)
-            there, after = logs, -np.inf
-            while after < top and np.abs(step).max() > AT_TOP:
-                there = np.clip(logs + step, low, high)
-                after, step = value(there), 0.5 * step
-            if after < top:
-                break
-            logs, top, far = there, after, np.abs(there - logs).max()
-        return at(logs), top
+        search = ProcessSearch.around(log_evidence, median, begin, self.times)
+        return search.most_probable(from_grid=not near, most_steps=most_steps)
 
     @cached_property
     def times(self) -> tuple[float, float]:
@@ -220,14 +171,9 @@ class View:
         stamps = [trial.time for trial in self.trials]
         return min(float(np.median(np.diff(t))) for t in stamps), max(float(t[-1] - t[0]) for t in stamps)
 
-    def evidence(self, about: Processes, processes: Processes) -> float:
-        """Return the evidence of processes times their prior, as a logarithm [nat]."""
-        away = [
-            np.log((one.size / about[port].size, one.time / about[port].time)) / DOUBTS
-            for port, one in processes.items()
-        ]
-        value = self.solve(processes).evidence
-        return float(value - 0.5 * np.sum(np.square(away)))
+    def evidence(self, median: Processes, processes: Processes) -> float:
+        """Return the logarithm of the evidence of processes times their prior [nat]."""
+        return self.solve(processes).evidence + prior_log_density(median, processes)
 
     def smoothed(
         self, processes: Processes, given: Solution | None = None
