@@ -8,7 +8,15 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 
-from .filtered import LEAST_PRECISION, Filtered, Process, Regression, Solution, regression
+from .filtered import (
+    LEAST_PRECISION,
+    Filtered,
+    Process,
+    Regression,
+    Smoothed,
+    Solution,
+    regression,
+)
 from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
 from .trial import Part, SeenTrial
 
@@ -101,33 +109,40 @@ class View:
     @cached_property
     def parts(self) -> list[dict[int, tuple[Part, float]]]:
         """What a unit of unknowns, by number, does along the motion, and which values are in it; by trial."""
-        found: list[dict[int, tuple[Part, float]]] = [{} for _ in self.trials]
-        for trial, motion, of_trial in zip(self.trials, self.motions, found, strict=False):
-            for k, slope in enumerate(trial.slopes):
+        by_trial: list[dict[int, tuple[Part, float]]] = [{} for _ in self.trials]
+        for trial, motion, parts in zip(self.trials, self.motions, by_trial, strict=False):
+            # calibrated parameters change the system along the motion
+            for unknown, slope in enumerate(trial.slopes):
                 if slope is not None:
-                    of_trial[k] = trial.turned(slope, motion.added, motion.forces), float(trial.about[k])
+                    part = trial.turned(slope, motion.added, motion.forces)
+                    parts[unknown] = (part, float(trial.about[unknown]))
+            # gains change the readings of their channel
             shown = trial.readings(motion.added, motion.forces)
-            for k, channel, scale in trial.gains:
-                of_trial[k] = Part(shown * scale * np.eye(shown.shape[1])[channel]), float(trial.about[k])
-        for k, effect in enumerate(self.effects, start=len(self.shared_precision)):
-            for part, of_trial in zip(effect, found, strict=True):
-                of_trial[k] = part, 0.0
-        return found
+            for unknown, channel, scale in trial.gains:
+                part = Part(shown * scale * np.eye(shown.shape[1])[channel])
+                parts[unknown] = (part, float(trial.about[unknown]))
+        for unknown, effect in enumerate(self.effects, start=len(self.shared_precision)):
+            for part, parts in zip(effect, by_trial, strict=True):
+                parts[unknown] = (part, 0.0)
+        return by_trial
 
     @cached_property
     def rows(self) -> list[FloatArray]:
         """Residuals beside what is known, and what all unknowns do to them (1 + K + L, N, C), by trial."""
-        found, count = [], 1 + len(self.precisions)
+        by_trial = []
+        first_local = 1 + len(self.precisions)
         for number, trial in enumerate(self.trials):
-            rows = np.moveaxis(np.zeros((*trial.residual.shape, count + len(trial.local))), -1, 0)
-            known = [item[number].readings for item in (self.known, self.own) if item is not None]
-            rows[0] = trial.residual - sum(known)
-            rows[1 : 1 + len(trial.shared)], rows[count:] = trial.shared, trial.local
-            for k, (part, there) in self.parts[number].items():
-                rows[1 + k] += part.readings
-                rows[0] += there * part.readings
-            found.append(rows)
-        return found
+            row_count = first_local + len(trial.local)
+            rows = np.moveaxis(np.zeros((*trial.residual.shape, row_count)), -1, 0)
+            acting = [column[number].readings for column in (self.known, self.own) if column is not None]
+            rows[0] = trial.residual - sum(acting)
+            rows[1 : 1 + len(trial.shared)] = trial.shared
+            rows[first_local:] = trial.local
+            for unknown, (part, value) in self.parts[number].items():
+                rows[1 + unknown] += part.readings
+                rows[0] += value * part.readings
+            by_trial.append(rows)
+        return by_trial
 
     def filtered(self, processes: Processes) -> list[Filtered]:
         """Return the filters of missing forces."""
@@ -180,27 +195,52 @@ class View:
     ) -> tuple[Solution, list[FloatArray], list[Motion]]:
         """Return the unknowns, those of the trials alone, and motion and missing forces of each trial."""
         solution = given or self.solve(processes)
-        motions, local = [], []
-        count = len(self.shared_precision)
-        for number, one in enumerate(self.filtered(processes)):
-            trial = one.trial
+        local_values, motions = [], []
+        for number, filtered in enumerate(self.filtered(processes)):
             rows = self.rows[number]
-            left = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
-            products, _ = one.products(np.concatenate((left[None], trial.local)))
-            prior = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
-            values = np.linalg.solve(products[1:, 1:] + prior, products[1:, 0])
-            left = left - np.tensordot(values, trial.local, 1)
-            free, forces, deviations = one.smoothed(left)
-            remaining = dict(zip(processes, forces, strict=True))
-            what = Part(left, free, remaining)
-            for k, (part, there) in self.parts[number].items():
-                what = what.plus(part, float(solution.mean[k] - there))
-            what = what if self.known is None else what.plus(self.known[number], 1.0)
-            moved = what if self.own is None else what.plus(self.own[number], 1.0)
-            assert moved.added is not None
-            moving = trial.port_motion(np.concatenate((solution.mean[:count], values)), moved.added)
-            known = zip(processes, *np.split(deviations, 2), strict=True)
-            doubts = {port: (force, float(speed[-LATER:][0])) for port, force, speed in known}
-            motions.append(Motion(moved.added, what.forces, remaining, moved.added - free, *moving, doubts))
-            local.append(values)
-        return solution, local, motions
+            unexplained = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
+            local = _local_unknowns(filtered, unexplained)
+            unexplained = unexplained - np.tensordot(local, filtered.trial.local, 1)
+            motions.append(self._motion(number, processes, filtered.smoothed(unexplained), solution, local))
+            local_values.append(local)
+        return solution, local_values, motions
+
+    def _motion(
+        self, number: int, processes: Processes, smoothed: Smoothed, solution: Solution, local: FloatArray
+    ) -> Motion:
+        """Return the motion of a trial, with what unknowns, hypothesis and model add to it."""
+        trial = self.trials[number]
+        missing = dict(zip(processes, smoothed.forces, strict=True))
+        unused_readings = np.zeros_like(trial.residual)
+        acting = Part(unused_readings, smoothed.state, missing)
+        for unknown, (part, value) in self.parts[number].items():
+            acting = acting.plus(part, float(solution.mean[unknown] - value))
+        if self.known is not None:
+            acting = acting.plus(self.known[number], 1.0)
+        with_own_laws = acting if self.own is None else acting.plus(self.own[number], 1.0)
+        added = with_own_laws.added
+        assert added is not None
+        unknowns = np.concatenate((solution.mean[: len(self.shared_precision)], local))
+        positions, speeds = trial.port_motion(unknowns, added)
+        force_deviations, speed_deviations = np.split(smoothed.deviations, 2)
+        deviations = {
+            port: (force, float(speed[-LATER:][0]))
+            for port, force, speed in zip(processes, force_deviations, speed_deviations, strict=True)
+        }
+        return Motion(
+            added=added,
+            forces=acting.forces,
+            left=missing,
+            explained=added - smoothed.state,
+            positions=positions,
+            speeds=speeds,
+            deviations=deviations,
+        )
+
+
+def _local_unknowns(filtered: Filtered, unexplained: FloatArray) -> FloatArray:
+    """Return the unknowns (L,) of a trial alone that explain most of its residuals (N, C)."""
+    trial = filtered.trial
+    products, _ = filtered.products(np.concatenate((unexplained[None], trial.local)))
+    prior = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
+    return np.linalg.solve(products[1:, 1:] + prior, products[1:, 0])

@@ -16,8 +16,9 @@ from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
+from discrepancy.missing_force.explained import Explained
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
-from discrepancy.missing_force.naming import Explained, ForceSearch
+from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
 from .other_optima import canonical_relatives, restarts, sets_at_other_places
