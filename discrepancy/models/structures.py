@@ -90,12 +90,7 @@ class StructureModel(SystemModel):
         }
         self.port_rows = self._ports_of_loads(displacements)
         for port, row in self._ports_of_file().items():
-            for other, other_row in self.port_rows.items():
-                if _acts_along(row, other_row):
-                    raise ModelError(
-                        f"The port {port!r} of the structure {model.name} moves as its port {other!r} does, "
-                        f"so that no reading tells their forces apart: take this [[port]] out of the file."
-                    )
+            self._check_moves_otherwise(port, row)
             self.port_rows[port] = row
         self.ports = tuple(self.port_rows)
 
@@ -122,6 +117,15 @@ class StructureModel(SystemModel):
             for name in self.model.displacements
             if _is_at_port(name)
         }
+
+    def _check_moves_otherwise(self, port: str, row: FloatArray) -> None:
+        """Refuse a port of the file whose row (n,) reads what another port reads."""
+        for other, other_row in self.port_rows.items():
+            if _acts_along(row, other_row):
+                raise ModelError(
+                    f"The port {port!r} of the structure {self.name} moves as its port {other!r} does, so "
+                    "that no reading tells their forces apart: take this [[port]] out of the file."
+                )
 
     def _at(self, state: State, controls: Mapping[str, float]) -> FloatArray:
         """Return the values that the structure is made at; controls that are left out are nominal."""
