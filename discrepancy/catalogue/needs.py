@@ -58,7 +58,7 @@ class Asked:
         Campaign and model.
     section : EffectSection
         What its file says. Its `places` are a word of `PLACES`, the places themselves, or none: there is no
-        choice; `preferred` are ports that stand for all where the model has one of them. The port "planform"
+        choice; `preferred` are ports of a wing that stand for its others. The port "planform"
         of a force that is spread over an area is "span" in a model without one.
     primitives : tuple of type
         What it is made of.
@@ -99,12 +99,11 @@ class Asked:
         return tuple(name for name, scale in self.setting.scales.ports.items() if scale.of_state)
 
     def force_ports(self, chosen: Callable[[PortScale], bool] = lambda scale: True) -> Names:
-        """Return the ports where forces act: those of `preferred` that the model has, else all."""
-        flows, scales = self.state_ports, self.setting.scales.ports
-        known = tuple(port for port in self.setting.model.ports if port not in flows)
-        wanted = [
-            "span" if name == PLANFORM and name not in scales else name for name in self.section.preferred
-        ]
+        """Return the ports where forces act: of a wing those of `preferred` that it has, else all."""
+        model, flows, scales = self.setting.model, self.state_ports, self.setting.scales.ports
+        known = tuple(port for port in model.ports if port not in flows)
+        preferred = self.section.preferred if model.has_wing_ports else ()
+        wanted = ["span" if name == PLANFORM and name not in scales else name for name in preferred]
         found = tuple(name for name in wanted if name in known or name == PLANFORM) or known
         return tuple(name for name in found if name not in scales or chosen(scales[name]))
 

@@ -295,6 +295,21 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory():
     assert model.scales(still).ports["air"].turns
 
 
+@pytest.mark.parametrize(
+    ("other", "places"), [("root", ("tip",)), ("span", ("tip", "span")), ("joint", ("tip", "joint"))]
+)
+def test_a_port_stands_for_the_others_of_a_wing_alone(other, places):
+    """A model with a port of another name is no wing: at all of its ports an effect is tried."""
+    ports = f"""
+        port = [{{ name = "tip", vector = [0.0, 1.0] }}, {{ name = "{other}", vector = [1.0, 0.0] }}]
+        """
+    text = INPUTS.text("two_masses.toml", ("[damping]", f"{ports}\n[damping]"))
+    model = model_of(text)
+    load = asked(TrialKind.STATIC, np.zeros(3), force=np.array([0.0, 0.1, 0.2]), load_place="in")
+    setting = setting_of(campaign(load, x=Channel("x", Quantity.DISPLACEMENT, "x", None)), model)
+    assert chosen("cubic_stiffness")[0].places(setting) == places
+
+
 ALL, BOTH = {"all": ("shaker", "laser", "camera")}, {"rack": ("shaker", "laser"), "film": ("camera",)}
 
 
