@@ -47,6 +47,8 @@ OF_ALL_COLUMNS = ("zero", "gain", "hold")
 ASSUMED_ZERO, ASSUMED_GAIN = "1%", "2%"
 """How well a zero (of the largest reading) and a gain are taken to be known where nobody says it."""
 _TIMED = (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN, NOISE)
+_PUSHED = (TrialKind.STATIC, TrialKind.FORCED)
+"""Kinds of trials that have a column `force`."""
 _SI = dict(zip(INPUT_COLUMNS, ("s", "N", "1", "degC", "1", "1", "1", "1"), strict=True))
 _UNTITLED = re.compile(r".*\.xls[mx]#|\.[^.]*$")
 _STRAIN = re.compile(r".*(strain|[εϵ]|m/m)")
@@ -397,12 +399,14 @@ class Understanding:
         return {key: value for key, value in stated.items() if value is not None}
 
     def units(self) -> dict[str, str]:
-        """Return the unit in which each channel was read, of several the first."""
+        """Return the unit in which each channel, input and force was read, of several the first."""
         units: dict[str, str] = {}
         for column in self.columns:
-            if column.is_channel:
+            if column.quantity is not None:
                 is_temperature = column.quantity is Quantity.TEMPERATURE
                 units.setdefault(column.title, column.si if is_temperature else column.read_in)
+            elif column.role == "force" and self.kinds[column.sheet.name] in _PUSHED:
+                units.setdefault("force", column.read_in)
         return units
 
     def _trial(self, file: str) -> dict[str, Any]:

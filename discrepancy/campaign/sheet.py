@@ -149,7 +149,7 @@ def read_sheet(path: Path) -> Sheet:
     heads = [name for name, _ in names]
     earlier = [heads[:at].count(name) for at, name in enumerate(heads)]
     heads = [f"{name} {count + 1}" if count else name for name, count in zip(heads, earlier, strict=True)]
-    between = f", {SEPARATORS[separator]} between cells" if separator else ""
+    between = f", {SEPARATORS[separator]} between cells" if separator and len(head) > 1 else ""
     remark = f"{where.rpartition(' ')[2]}s {lines[0]} to {lines[-1]}{between}{left}{below}"
     return Sheet(
         path.name, hash_file(file), tuple(heads), tuple(unit for _, unit in names), tuple(columns), lines,
@@ -320,10 +320,28 @@ def _excel_text(cell: object) -> str:
     return "" if cell is None else str(cell).strip()
 
 
+def _is_one_column(rows: Rows) -> bool:
+    """Whether rows of one cell each are titles, and numbers under the last of them.
+
+    What looks like several cells with another mark between them is no single column.
+    """
+    cells = [row[0] for _, row in rows]
+    is_number = [_is_value(cell) for cell in cells]
+    first = is_number.index(True) if True in is_number else 0
+    if first == 0 or any(any(row[1:]) for _, row in rows):
+        return False
+    numbers = [cell for cell, is_one in zip(cells, is_number, strict=True) if is_one]
+    has_blanks = any(" " in cell and not _CLOCK.fullmatch(cell) for cell in numbers)
+    is_separated = any(mark in cells[first - 1] and mark in " ".join(numbers) for mark in SEPARATORS)
+    return 2 * len(numbers) > len(cells) - first and not has_blanks and not is_separated
+
+
 def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], Rows, str]:
     """Return head, units and rows of the table, and what was passed over."""
     values = [{at for at, cell in enumerate(row) if _is_value(cell)} for _, row in rows]
     dense = [found for found in values if len(found) > 1]
+    if not dense and _is_one_column(rows):
+        dense = [found for found in values if found]
     often = Counter(at for found in dense for at in found)
     core = sorted(at for at, count in often.items() if 2 * count >= len(dense))
     texts = [
@@ -352,6 +370,11 @@ def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], 
             raise CampaignFileError(
                 said("sheets.no_row", place=f"{where} {line}", name=head[core[0]], came=came)
             )
+    if filled == 1 and (gap := next((at for at in body[1:] if rows[at][0] != rows[at - 1][0] + 1), None)):
+        raise CampaignFileError(
+            f"{where} {rows[gap][0] - 1} is empty, and the only column has numbers above and below: "
+            "remove the line, or give the table a column of times."
+        )
     below = [line for line, _ in rows[last + 1 :]]
     remark = f"; what stands from {below[0]} on is left out" if below else ""
     names = [cell.lstrip("# ") for cell in head[:filled]]
