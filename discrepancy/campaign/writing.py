@@ -29,6 +29,7 @@ class _Layout:
 
     units: Mapping[str, str]
     digits: int
+    left_out_as_empty: bool
 
     def in_unit(self, values: records.FloatArray, name: str, to_si: float) -> records.FloatArray:
         """Return values [SI] of a channel or an input in its unit, of which one is `to_si`."""
@@ -50,6 +51,7 @@ def write_campaign(
     *,
     si: bool = False,
     units: Mapping[str, str] | None = None,
+    left_out_as_empty: bool = False,
 ) -> Path:
     """Write a campaign; `read_campaign` gives it back, equal to rounding but for its hash.
 
@@ -67,6 +69,8 @@ def write_campaign(
     units : mapping of str to str, optional
         Unit of each channel and input in the files, by its name, in the place of these, and of the force of
         static and forced trials by "force"; their values have 15 significant digits then.
+    left_out_as_empty : bool
+        Leave the cells of readings empty that are left out, in the place of `left_out` of the trial.
 
     Returns
     -------
@@ -86,6 +90,7 @@ def write_campaign(
     layout = _Layout(
         units=usual | dict(units or {}),
         digits=_EXACT_DIGITS if units is None else _SHOWN_DIGITS,
+        left_out_as_empty=left_out_as_empty,
     )
     slugs = (re.sub(r"[^a-z0-9]+", "_", trial.name.lower()).strip("_")[:40] for trial in campaign.trials)
     files = [f"{number:02d}_{slug or 'trial'}.csv" for number, slug in enumerate(slugs, start=1)]
@@ -127,7 +132,10 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, layout: _Layo
         columns[item.name] = layout.in_unit(item.values, item.name, to_si)
     for index, name in enumerate(trial.channels):
         to_si = conversion_of(campaign.channels[name].quantity, layout.units[name])
-        columns[name] = layout.in_unit(trial.values[:, index], name, to_si)
+        values = trial.values[:, index]
+        if layout.left_out_as_empty:
+            values = np.where(trial.used[:, index], values, np.nan)
+        columns[name] = layout.in_unit(values, name, to_si)
     return table_text(columns)
 
 
@@ -186,7 +194,7 @@ def _campaign_text(
         accept=campaign.accept,
         channel=tuple(_channel(channel, layout) for channel in campaign.channels.values()),
         input=tuple(_input(item, layout) for item in inputs.values()),
-        trial=tuple(_trial(campaign, *pair) for pair in zip(campaign.trials, files, strict=True)),
+        trial=tuple(_trial(campaign, *pair, layout) for pair in zip(campaign.trials, files, strict=True)),
         event=tuple(placed_events(campaign.events, campaign.trials, source)),
     )
     content = section.model_dump(mode="json", exclude_defaults=True)
@@ -209,12 +217,18 @@ def _input(item: records.RecordedInput, layout: _Layout) -> records.RecordedInpu
     return replace(item, unit=unit, offset_deviation=deviation, column="", reference=reference)
 
 
-def _trial(campaign: records.Campaign, trial: records.Trial, file: str) -> schema.TrialSection:
-    left_out = {
-        name: tuple((np.flatnonzero(~trial.used[:, index]) + 1).tolist())
-        for index, name in enumerate(trial.channels)
-        if not trial.used[:, index].all()
-    }
+def _trial(
+    campaign: records.Campaign, trial: records.Trial, file: str, layout: _Layout
+) -> schema.TrialSection:
+    left_out = (
+        {}
+        if layout.left_out_as_empty
+        else {
+            name: tuple((np.flatnonzero(~trial.used[:, index]) + 1).tolist())
+            for index, name in enumerate(trial.channels)
+            if not trial.used[:, index].all()
+        }
+    )
     driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed
     said = driven or trial.begins is not records.Start.SETTLED
     in_order = list(trial.channels) == [name for name in campaign.channels if name in trial.channels]
