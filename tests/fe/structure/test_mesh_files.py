@@ -274,6 +274,28 @@ def test_a_continuation_of_nastran_goes_to_the_line_with_its_marker(marker, tmp_
     assert not any(point.fields[5:])
 
 
+@pytest.mark.parametrize("end", ["", "+C"])
+def test_a_continuation_of_nastran_may_stand_before_its_line(end, tmp_path):
+    """Also a chain of two, and behind a line that goes on, or not, by itself."""
+    first = "CHEXA          1       1       1       2       3       4       5       6+A"
+    middle = "+A             7       8       9      10      11      12      13      14+B"
+    last = "+B            15      16      17      18      19      20"
+    grid = f"{'GRID           1              0.      0.      0.':72}{end}"
+    lines = [grid, last, middle, first, *(["+C             5"] if end else [])]
+    (tmp_path / "m.bdf").write_text("\n".join(lines))
+    point, hexahedron = cards(tmp_path / "m.bdf")
+    nodes = [field for field in hexahedron.fields[2:] if field]
+    assert nodes == [str(number) for number in range(1, 21)]
+    assert [field for field in point.fields if field] == ["1", "0.", "0.", "0.", *(["5"] if end else [])]
+
+
+def test_a_continuation_of_nastran_that_continues_nothing_is_refused(tmp_path):
+    lines = ["GRID,1,,0.,0.,0.,,,+A", "+B,7,8", "GRID,2,,0.,0.,1."]
+    (tmp_path / "m.bdf").write_text("\n".join(lines))
+    with refused(MeshError, r"line 2: the continuation '\+B' stands behind no line that it continues"):
+        cards(tmp_path / "m.bdf")
+
+
 def test_real_numbers_and_lines_of_nastran(tmp_path):
     """Exponents without E, fields of 8 and 16, lines that go on by a comma, a marker or a blank.
 
