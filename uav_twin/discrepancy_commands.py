@@ -258,7 +258,7 @@ def import_files(
     if asked and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
         raise typer.Exit(1)
-    parts.write_campaign(campaign, folder, si=True, units=found.units())
+    parts.write_campaign(campaign, folder, si=True, units=found.units(), left_out_as_empty=True)
     assumed = []
     if found.assumed:
         remedy = "give --zero and --gain, or correct offset_deviation and gain_deviation"

@@ -265,6 +265,40 @@ def test_a_table_without_a_time_has_the_interval_that_is_stated():
     assert "b.csv has a column of times, and --interval came for it" in sentence
 
 
+def test_a_table_of_one_column_has_the_interval_that_is_stated():
+    cells = [f"{row % 5}.5" for row in range(9)]
+    Path("a.csv").write_text("\n".join(["acc [g]", *cells]) + "\n", "utf-8")
+    printed = said(*IMPORT, "a.csv", "--kind", "driven", "--column", "acc=acc", "--interval", "0.02")
+    assert "a.csv: driven; lines 2 to 10; decimal points" in printed
+    (trial,) = read_campaign("a").trials
+    assert trial.time.tolist() == [0.02 * k for k in range(9)]
+    np.testing.assert_allclose(trial.values[:, 0], [9.80665 * float(cell) for cell in cells], rtol=1e-14)
+
+
+def test_inputs_and_forces_keep_the_units_of_the_file():
+    """Of inputs in `[[input]]`, and of the force of a forced trial in `force_unit`."""
+    rows = "".join(f"{k / 100},{k},{k % 3}\n" for k in range(9))
+    Path("push.csv").write_text(f"time [s],pull [lbf],x [in]\n{rows}", "utf-8")
+    given = (*IMPORT, "push.csv", "--column", "x=x")
+    said(
+        *given, "--kind", "driven", "--column", "pull=input:pull", "--zero", "pull=0.5lbf", "--out", "driven"
+    )
+    said(*given, "--kind", "forced", "--column", "pull=force", "--out", "forced")
+    pounds = 4.4482216152605
+    for kind, word in (("driven", "pull"), ("forced", "force")):
+        head, _, third, *_ = Path(kind, "01_push.csv").read_text("utf-8").splitlines()
+        assert (head, third) == (f"time,{word},x", "0.01,1.0,1.0")
+        (trial,) = read_campaign(kind).trials
+        np.testing.assert_allclose(trial.force, pounds * np.arange(9.0), rtol=1e-14)
+    (pull,) = read_campaign("driven").trials[0].inputs
+    assert (pull.unit, pull.offset_deviation) == ("lbf", pytest.approx(0.5 * pounds, rel=1e-14))
+    assert 'force_unit = "lbf"' in Path("forced/campaign.toml").read_text("utf-8")
+    toml = Path("forced/campaign.toml").read_text("utf-8").replace('"lbf"', '"mm"')
+    Path("forced/campaign.toml").write_text(toml, "utf-8")
+    sentence = refused("discrepancy", "check", "forced", *RIG)
+    assert "force must have a unit such as N, mN or kN, and 'mm' came" in sentence
+
+
 @pytest.mark.parametrize(
     ("scale", "in_newtons"), [("200 N/V", 100.0), ("0.2 kN/V", 100.0), ("200 N/mV", 1e5), ("-2 kN/V", -1e3)]
 )
