@@ -1,4 +1,4 @@
-"""What sensors make of a response: gain, saturation, drift, rotation, thermal strain, high-pass, lines, offset.
+"""What sensors make of a response: gain, saturation, drift, rotation, thermal strain, high-pass, lines, zero.
 
 Pure functions on arrays for the primitives of `fe.runtime.patch.SENSORS`; clocks are not here, because they
 say when the response is taken and so belong to whoever computes it. Without sensors the input comes back
