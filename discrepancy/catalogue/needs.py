@@ -28,6 +28,8 @@ EVERY_PORT = "every port"
 """Place of a law that acts at all ports of states alike."""
 ALL = "all "
 """Begins the place that stands for all channels of a quantity."""
+CHANNELS_OR_ALL_OF_A_QUANTITY = "channels, or all of a quantity"
+"""Word for places that are channels, and all channels of a quantity alike."""
 
 
 USUAL = ("trial", "event", "law", "place")
@@ -136,12 +138,17 @@ class Asked:
         if place == EVERY_PORT:
             return tuple(map(Target, self.state_ports))
         if self.section.places == "mains lines":
-            line, _, name = place.partition(", ")
-            frequency = float(line.split()[0])
-            if name.startswith(ALL) and name not in self.setting.campaign.channels:
-                return (Target(EVERY_CHANNEL, name.removeprefix(ALL), frequency),)
-            return (Target(name, number=frequency),)
+            line, _, channels = place.partition(", ")
+            return (replace(self._channels_at(channels), number=float(line.split()[0])),)
+        if self.section.places == CHANNELS_OR_ALL_OF_A_QUANTITY:
+            return (self._channels_at(place),)
         return (Target(place or EVERY_CHANNEL),)
+
+    def _channels_at(self, place: str) -> "Target":
+        """Return what a place stands for that is a channel, or "all strain" and the like."""
+        if place.startswith(ALL) and place not in self.setting.campaign.channels:
+            return Target(EVERY_CHANNEL, place.removeprefix(ALL))
+        return Target(place)
 
 
 @dataclass(frozen=True)
@@ -214,11 +221,16 @@ def mains_lines(setting: Setting) -> Names:
     return tuple(" or ".join(f"{frequency:g}" for frequency in group) + " Hz" for group in groups)
 
 
-def _seen_lines(asked: Asked) -> Names:
-    """Return the mains lines at channels, and at "all strain" and the like for several of a quantity."""
+def _channels_or_all_of_a_quantity(asked: Asked) -> Names:
+    """Return the channels, and "all strain" and the like before them where several have a quantity."""
     quantities = [channel.quantity.value for channel in asked.channels]
     several = dict.fromkeys(ALL + quantity for quantity in quantities if quantities.count(quantity) > 1)
-    seen = (*several, *asked.channels_of())
+    return (*several, *asked.channels_of())
+
+
+def _seen_lines(asked: Asked) -> Names:
+    """Return the mains lines at channels, and at all channels of a quantity."""
+    seen = _channels_or_all_of_a_quantity(asked)
     return tuple(f"{line}, {name}" for line in mains_lines(asked.setting) for name in seen)
 
 
@@ -226,6 +238,7 @@ PLACES: dict[str, Callable[[Asked], Names]] = {
     "ports": lambda asked: asked.setting.model.ports,
     "channels": Asked.channels_of,
     "channels, or all": lambda asked: _or_all(asked.channels_of()),
+    CHANNELS_OR_ALL_OF_A_QUANTITY: _channels_or_all_of_a_quantity,
     "strain channels": lambda asked: asked.strain_channels,
     "strain channels, or all": lambda asked: _or_all(asked.strain_channels),
     "runs": lambda asked: tuple(dict.fromkeys(trial.run for trial in asked.setting.campaign.fitted)),

@@ -172,8 +172,28 @@ def test_sizes_in_closed_form(setting):
          patches.RunOffset("B", pytest.approx(0.02 * 30.0 / scales.tip_stiffness))),
         ("gauge_zero_drift", {"drift_ratio": 0.1}, "g1",
          patches.SensorDrift("g1", pytest.approx(0.1 * largest), scales.campaign_time)),
+        ("sensor_saturation", {"lost_share": 1.0 / 12.0}, "g1",
+         patches.SensorSaturation("g1", pytest.approx(2.0 * largest))),
     ):  # fmt: skip
         assert only(setting, identifier, values, place) == primitive
+
+
+def test_saturation_loses_its_share_and_all_channels_of_a_quantity_have_one_limit(setting):
+    (saturation,) = chosen("sensor_saturation")
+    assert saturation.places(setting) == ("all strain", "tip", "g0", "g1", "g2")
+    every = only(setting, "sensor_saturation", {"lost_share": 0.01}, "all strain")
+    strains = [trial.values[:, 1:] for trial in setting.campaign.trials]
+    largest = max(float(np.abs(values).max()) for values in strains)
+    assert (every.channel, every.quantity) == (patches.EVERY_CHANNEL, "strain")
+    assert every.limit == pytest.approx(largest / np.sqrt(0.03))
+    lost = 1.0 - every.limit * np.tanh(largest / every.limit) / largest
+    assert lost == pytest.approx(0.01, rel=0.02)
+    for trial in setting.campaign.trials:
+        values = shown(setting, trial, ModelPatch((every,)))
+        np.testing.assert_array_equal(values[:, 0], trial.values[:, 0])
+        wanted = every.limit * np.tanh(trial.values[:, 1:] / every.limit)
+        np.testing.assert_allclose(values[:, 1:], wanted, rtol=1e-12, atol=1e-18)
+    assert saturation.patch(setting, {"lost_share": 0.0}, "g0") == ModelPatch()
 
 
 def test_observations_are_responses_through_the_sensors_of_a_patch(setting):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fe.runtime.patch import SensorGain
+from fe.runtime.patch import SensorGain, SensorSaturation
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
 from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
@@ -334,6 +334,17 @@ def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_pat
     observed = taught.sensor_model.mean[0, 0]
     rewards, _ = taught.rewards.expectation(known_control(taught.model.prior, 0, 2), observed)
     assert rewards[2] > -0.2  # readings are compared with readings
+
+
+def test_gauges_taught_to_saturate_make_no_wing_healthier(base, tmp_path):
+    """What is expected of the gauges saturates; health, rewards and policy go by the strain itself."""
+    record = json.dumps(patch_record(SensorSaturation("*", 4e-3, "strain")))
+    file = written(tmp_path, record, name="saturation.json")
+    known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
+    strains, shown = known.sensor_model.value_per_draw, taught.sensor_model.value_per_draw
+    np.testing.assert_allclose(shown, 4e-3 * np.tanh(strains / 4e-3), rtol=1e-9)
+    np.testing.assert_allclose(taught.rewards.health_per_draw, known.rewards.health_per_draw, rtol=1e-9)
+    np.testing.assert_array_equal(taught.plan.policy, known.plan.policy)
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
