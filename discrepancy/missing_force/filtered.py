@@ -16,7 +16,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray
 
-from .kalman import Steps, discretised, forward, later
+from .backward import later
+from .kalman import Steps, discretised, forward
 from .trial import SeenTrial
 
 
