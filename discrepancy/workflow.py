@@ -34,6 +34,7 @@ from discrepancy.judgement.conclusion import (
     look_alike_remark,
     with_untested,
 )
+from discrepancy.judgement.exact_sensors import exact_sensor_remarks
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
@@ -224,6 +225,8 @@ def _remarks(
 ) -> list[str]:
     """Return what has to be said beside a verdict."""
     remarks = [*problem.campaign.remarks, *strained(problem, fit), *without_port(problem.setting, catalogue)]
+    if verdict.kind not in NO_GAP:
+        remarks += exact_sensor_remarks(problem, search.none)
     alike = look_alike_remark(verdict, search.effects)
     remarks += [] if alike is None else [alike]
     if not problem.model.parameters:
