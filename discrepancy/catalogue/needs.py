@@ -11,10 +11,13 @@ from pydantic import Field
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import SENTENCES, said
+from discrepancy.system.interface import Model
 from discrepancy.system.response import ACROSS
 from discrepancy.system.scales import PortScale
+from discrepancy.system.structures import StructureModel
 from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
+from fe.runtime.wing_rows import PORTS
 
 from .entry import ROW, EffectKeys, Number, Setting
 
@@ -48,6 +51,11 @@ class EffectSection(EffectKeys):
     preferred: tuple[str, ...] = ()
     needs: tuple[str, ...] = USUAL
     events: tuple[str, ...] = ()
+
+
+def _has_ports_of_a_wing(model: Model) -> bool:
+    """Return whether one port of a model may stand for the others; the file of a structure names its own."""
+    return set(model.ports) <= set(PORTS) and not isinstance(model, StructureModel)
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,7 @@ class Asked:
         """Return the ports where forces act: of a wing those of `preferred` that it has, else all."""
         model, flows, scales = self.setting.model, self.state_ports, self.setting.scales.ports
         known = tuple(port for port in model.ports if port not in flows)
-        preferred = self.section.preferred if model.has_wing_ports else ()
+        preferred = self.section.preferred if _has_ports_of_a_wing(model) else ()
         wanted = ["span" if name == PLANFORM and name not in scales else name for name in preferred]
         found = tuple(name for name in wanted if name in known or name == PLANFORM) or known
         return tuple(name for name in found if name not in scales or chosen(scales[name]))

@@ -17,7 +17,6 @@ from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
-from fe.runtime.wing_rows import PORTS
 from reporting.memory import Memory
 from reporting.words import brief, capital, counted
 
@@ -89,11 +88,6 @@ class Model(ABC):
     def what(self) -> str:
         """What it is called in a sentence."""
         return f"the model {self.name!r}"
-
-    @property
-    def has_wing_ports(self) -> bool:
-        """Whether its ports are those of a wing, of which one may stand for the others in an effect."""
-        return set(self.ports) <= set(PORTS)
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""

@@ -96,11 +96,6 @@ class StructureModel(SystemModel):
             self.port_rows[port] = row
         self.ports = tuple(self.port_rows)
 
-    @property
-    def has_wing_ports(self) -> bool:
-        """Whether its ports are those of a wing: never, as it is the file that names them."""
-        return False
-
     def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
         """Return the rows of the displacements along which a force acts, by name."""
         mean = State(tuple(self.prior_mean().tolist()))
