@@ -192,8 +192,8 @@ def caveats_of(verdict: Mapping[str, Any]) -> list[str]:
         caveats.append("Whether it leaves noise alone was not tested.")
     if verdict["kind"] == GROUP and has_some_saturating_members(verdict):
         caveats.append(
-            "A sensor that saturates and the other effects of the group differ at other loads, and these turns "
-            "do not tell them apart; more turns at more than one load may."
+            "A sensor that saturates and the other effects of the group differ at other loads, and these "
+            "turns do not tell them apart; more turns at more than one load may."
         )
     return caveats
 
