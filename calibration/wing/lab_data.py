@@ -7,12 +7,22 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from reporting.choices import require_one_of
+from reporting.files import atomic_write_text, hash_file, hash_record
+from reporting.table_file import table_text
 
+from calibration.dynamics.extremes import refine_by_extremes
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_records, read_records
-from calibration.dynamics.trials import Fits, fit_trials, refine_by_extremes
+from calibration.dynamics.trials import Fits, fit_trials
 from calibration.errors import ExperimentDataError, ExperimentFileError, said
-from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths, published_lengths, read_lengths
-from calibration.joint.posterior import PUBLISHED_MODES, measured_modes
+from calibration.geometry import (
+    GEOMETRY_FILE,
+    PUBLISHED_NAMES,
+    Lengths,
+    published_lengths,
+    read_lengths,
+)
+from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed
 from calibration.lab_folder import lab_place, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
@@ -23,9 +33,6 @@ from calibration.static.experiments import (
     published_measurements,
     read_measurements,
 )
-from reporting.choices import one_of
-from reporting.files import atomic_write_text, hash_file, hash_record
-from reporting.table_file import table_text
 
 WEIGHED_MASS_FILE = STEP_FOLDER / "weighed_mass.csv"
 """The weighed total of servos and pitot tube [g]; the authors give theirs in the paper alone."""
@@ -70,11 +77,16 @@ def write_lab_folder(
 
     def write(name: Path, **columns: Iterable[float | str]) -> Path:
         cells = [
-            [item if isinstance(item, str) else f"{item:.10g}" for item in of] for of in columns.values()
+            [item if isinstance(item, str) else f"{item:.10g}" for item in of]
+            for of in columns.values()
         ]
-        return atomic_write_text(Path(folder) / name, table_text(dict(zip(columns, cells, strict=True))))
+        return atomic_write_text(
+            Path(folder) / name, table_text(dict(zip(columns, cells, strict=True)))
+        )
 
-    designed, measured = ([1e3 * getattr(item, of) for item in lengths] for of in ("designed", "measured"))
+    designed, measured = (
+        [1e3 * getattr(item, of) for item in lengths] for of in ("designed", "measured")
+    )
     files = [
         write(GEOMETRY_FILE, parameter=PUBLISHED_NAMES, designed=designed, manufactured=measured),
         write(MEASUREMENTS_FILE, load=load_test.load, displacement=load_test.displacement * 1e3),
@@ -107,9 +119,13 @@ def read_weighed_mass(file: Path) -> Reading:
     )
     for wrong, unit in ((mass < 10.0, "kg"), (mass > 1e5, "mg")):
         if wrong:
-            raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like {unit}: give it in g.")
+            raise ExperimentDataError(
+                f"{file}: mass is {mass:g} g, which looks like {unit}: give it in g."
+            )
     if deviation >= mass:
-        raise ExperimentDataError(said("readings.mass_deviation", file=file, given=(deviation, mass)))
+        raise ExperimentDataError(
+            said("readings.mass_deviation", file=file, given=(deviation, mass))
+        )
     return weighed(1e-3 * mass, 1e-3 * deviation)
 
 
@@ -193,7 +209,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         If `targets` is another word.
     """
     if targets is not None:
-        one_of(targets, get_args(Targets), "targets")
+        require_one_of(targets, get_args(Targets), "targets")
     path = Path(path)
     if not path.is_dir():
         what = "no folder" if path.exists() else "not there"
@@ -215,7 +231,9 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
     if 2 in steps:
         found["pairs"] = pairs = read_measurements(path)
         hashes["load_test"] = pairs.sha256
-        origins[2] = StepOrigin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
+        origins[2] = StepOrigin(
+            2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs"
+        )
     if records and targets != "published":
         trials = fit_trials(read_records(path), free=free)
         if all(fit.record.lowest is not None for fit in trials):
@@ -223,7 +241,9 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
             trials = refine_by_extremes(trials)
         found["trials"] = trials
         modes = measured_modes(trials)
-        hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
+        hashes |= {
+            f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)
+        }
         names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
         origins[3] = StepOrigin(3, True, f"{names} read")
     elif records:
@@ -231,7 +251,9 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
     if (file := lab_place(path, WEIGHED_MASS_FILE)) is not None:
         mass = read_weighed_mass(file)
         hashes["weighed_mass"] = hash_record([mass.value, mass.deviation])
-        origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
+        origins[3] = origins[3]._replace(
+            text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read"
+        )
     if (file := lab_place(path, STEP_FOLDER / RESULTS_FILE)) is not None:
         found["authors"] = read_published_results(file)
     return replace(lab, readings=(mass, *modes), origins=tuple(origins.values()), **found)

@@ -35,7 +35,7 @@ from discrepancy.campaign.units import (
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import hash_record
 from reporting.table_file import TextTable
-from reporting.words import be, counted, listing
+from reporting.words import counted, is_or_are, listing
 
 KINDS = (*TrialKind, NOISE)
 OF_COLUMNS = ("column", "unit", "quantity", "scale", "zero", "gain", "hold")
@@ -363,7 +363,7 @@ class Understanding:
                 f"--{option} {f'NAME=... for {listing(map(repr, of))}' if of[0] else '...'} ({expected})"
                 for (option, expected), of in self.questions.items()
             ]
-            missing = f"{counted(count, 'answer')} {be(count)} missing, and nothing was written"
+            missing = f"{counted(count, 'answer')} {is_or_are(count)} missing, and nothing was written"
             raise CampaignFileError(f"{missing}: give {'; '.join(options)}.")
         channels: dict[str, dict[str, Any]] = {}
         inputs: dict[str, dict[str, Any]] = {}
@@ -444,5 +444,5 @@ class Understanding:
             for item in used
         )
         empty = sum(sheet.columns[sheet.heads.index(item.head)].count("") for item in used)
-        left = f"; {counted(empty, 'cell')} {be(empty)} empty" if empty else ""
+        left = f"; {counted(empty, 'cell')} {is_or_are(empty)} empty" if empty else ""
         return f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: {columns}{left}."

@@ -15,7 +15,7 @@ import numpy as np
 
 from fe.elements.kinds import KINDS
 from fe.runtime.arrays import FloatArray
-from reporting.toml_file import shown
+from reporting.toml_file import short_repr
 
 from .deck import FLAT, GLOBAL, Deck, System, fail, frame, lines_of, real, whole, words_of
 
@@ -64,7 +64,9 @@ def read_abaqus(path: Path) -> Deck:
             deck.word(block.keyword, block.where)
             continue
         for key in (key for key in block.parameters if key not in words.read[block.keyword]):
-            fail(block.where, f"*{block.keyword} with {shown(key)} is not read; write what it makes out.")
+            fail(
+                block.where, f"*{block.keyword} with {short_repr(key)} is not read; write what it makes out."
+            )
         if block.keyword == "NODE":
             _add_nodes(deck, block, system)
         elif block.keyword == "ELEMENT":
@@ -137,7 +139,7 @@ def _add_elements(deck: Deck, block: _Block) -> None:
         )
     if plain not in _TYPES:
         readable = ", ".join(kind.calculix for kind in KINDS.values())
-        fail(block.where, f"elements of type {shown(name)} cannot be read; {readable} and variants can.")
+        fail(block.where, f"elements of type {short_repr(name)} cannot be read; {readable} and variants can.")
     kind, width = _TYPES[plain]
     numbers = [(where, whole(where, text)) for where, row in block.data for text in row if text]
     if len(numbers) % (width + 1):
@@ -161,7 +163,7 @@ def _add_members(deck: Deck, block: _Block) -> None:
             continue
         first, last, step = [*(whole(where, value) for value in given), 1, 0, 0][:3]
         if len(given) not in (2, 3) or first < 1 or step < 1:
-            fail(where, f"first, last and step are expected, but {shown(','.join(given))} came.")
+            fail(where, f"first, last and step are expected, but {short_repr(','.join(given))} came.")
         members.extend(deck.counted(where, range(first, last + 1, step)))
 
 
@@ -296,7 +298,7 @@ def cards(path: Path) -> list[_Card]:
         else:
             name = head[1:].upper()
             if not found or (name and marker and name != marker and name not in awaiting):
-                fail(where, f"the continuation {shown(head)} stands behind no line that it continues.")
+                fail(where, f"the continuation {short_repr(head)} stands behind no line that it continues.")
             card = awaiting.pop(name, found[-1])
             card.fields.extend(fields)
         marker = end.lstrip("+*").upper()

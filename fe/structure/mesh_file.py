@@ -28,7 +28,7 @@ from fe.full.factorisation import analyse
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from fe.sentences import said
-from reporting.memory import memory_left
+from reporting.memory import available_memory
 from reporting.text_file import read_text
 
 from .deck import FLAT, Deck, fail
@@ -252,7 +252,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     MeshError
         If it would take more.
     """
-    allowed = memory_left() if limit is None else limit
+    allowed = available_memory() if limit is None else limit
     entries = 9 * mesh.cells.size * mesh.cells.shape[1]  # four times those that are left of them
     bulky = _PROGRAM + _MATRICES * _ENTRY * entries / 4.0 + _BULKY * mesh.unknowns ** (4.0 / 3.0)
     if bulky > allowed and (needed := memory_estimate(mesh)) > allowed:
