@@ -22,7 +22,7 @@ from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
 from fmu_asset.door.runs import FmuRuns, Run, State, StateSpace, realised
 from fmu_asset.errors import FmuError
-from reporting.memory import Memory
+from reporting.memory import ResultCache
 
 NONE: Any = np.zeros(0, dtype=np.int64)
 KEPT = 64
@@ -185,7 +185,7 @@ class FmuPace(FmuRuns):
         self.release = [names.parameter(name) for name in ways if name is not None]
         self.release += [names.variable(way.hold)] if way.hold is not None else []
         self._linear, self._sizes = dict[Hashable, bool](), dict[str, float]()
-        self._systems, self._paces = Memory(KEPT), Memory()
+        self._systems, self._paces = ResultCache(KEPT), ResultCache()
 
     def refusals(self) -> AbstractContextManager[None]:
         """Return the context that says of which model it is what the FMU refuses."""

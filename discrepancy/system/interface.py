@@ -17,7 +17,7 @@ from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
-from reporting.memory import Memory
+from reporting.memory import ResultCache
 from reporting.words import brief, capital, counted
 
 KEPT = 400
@@ -78,7 +78,7 @@ class Model(ABC):
     shows_ports: ClassVar[bool] = True
     linear: bool = False
     _declared: tuple[ParameterPrior, ...] | None = None
-    _kept: Memory | None = None
+    _kept: ResultCache | None = None
 
     def __repr__(self) -> str:
         parameters = [parameter.name for parameter in self.parameters]
@@ -236,7 +236,7 @@ class Model(ABC):
 
     def remembering(self) -> Self:
         """Return the model as one that keeps responses: sensors are tried by the dozen on one motion."""
-        return self if self._kept is not None else self._changed(_kept=Memory(KEPT))
+        return self if self._kept is not None else self._changed(_kept=ResultCache(KEPT))
 
     def patched(
         self, patch: ModelPatch, calibrated: Mapping[str, tuple[float, float]] = MappingProxyType({})

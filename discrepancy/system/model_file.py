@@ -11,7 +11,7 @@ from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.system.interface import Model
 from reporting import toml_file
-from reporting.toml_file import Fault, Name, NotNegative, Number, checked, read_toml
+from reporting.toml_file import Fault, Name, NotNegative, Number, read_toml, validate
 
 
 class Section(toml_file.Section):
@@ -60,7 +60,7 @@ class ModelDescription(Section):
         ModelError
             One sentence that names `source`, the place, what came and what was expected.
         """
-        return checked(cls, content, source, ModelError, what=cls.what)
+        return validate(cls, content, source, ModelError, what=cls.what)
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
