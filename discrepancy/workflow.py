@@ -48,7 +48,7 @@ from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
