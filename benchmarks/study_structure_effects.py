@@ -127,11 +127,10 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     rows = np.vstack([part.toarray() for part in (structure.displacement_output, structure.gauge_output)])
     names = (PORT, *structure.gauges)
     quantities = [Quantity.DISPLACEMENT, *[Quantity.STRAIN] * len(structure.gauges)]
-    damping = structure.damping_alpha * mass + structure.damping_beta * stiffness
+    rayleigh = structure.design.damping
+    damping = rayleigh.alpha * mass + rayleigh.beta * stiffness
     end = rows[0]
-    system = LinearSystem(
-        mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, structure.damping_beta
-    )
+    system = LinearSystem(mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, rayleigh.beta)
     laws = laws_of(ModelPatch(hidden.laws), system.ports)
     channels = {
         name: Channel(

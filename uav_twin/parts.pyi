@@ -70,6 +70,8 @@ from discrepancy.system.interface import Model as Model
 from discrepancy.verdict import VerdictKind as VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder as check_verdict_folder
 from discrepancy.verdict_folder import write_verdict_folder as write_verdict_folder
+from discrepancy.verdict_so_far import SearchInProgress as SearchInProgress
+from discrepancy.verdict_so_far import write_so_far as write_so_far
 from discrepancy.workflow import checked as checked
 from discrepancy.workflow import investigate as investigate
 from fe.reduction.model_cache import reduced_model as reduced_model

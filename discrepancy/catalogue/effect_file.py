@@ -24,7 +24,7 @@ A TOML file describes one effect at its top level, or several as tables `[[effec
     station = "0.5 * length"
 
 Keys that may be left out: `confusable` (identifiers), `places` (names, or a word of `PLACES` such as
-"ports"), `preferred` (ports that stand for all where the model has them), `needs` (words of `NEEDS`),
+"ports"), `preferred` (ports of a wing that stand for its others), `needs` (words of `NEEDS`),
 `spectral` (see `Effect`), `[[shape]]` (as a parameter, with `canonical` in place of `unit` and `magnitude`),
 `levels` of a parameter. Names in arithmetic are the parameters and `SCALES`. Text values of a primitive
 (port, channel, run) are taken as they are; "place" stands for the place, "quantity of the place" for what it

@@ -1,7 +1,6 @@
 """Motion of an FMU with laws at its ports: by its system where it is linear, else step by step."""
 
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from math import ceil
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +9,6 @@ import numpy as np
 from fe.compilation import compiled_kernel
 from fe.runtime.motion import ALIKE, Laws, static_solution
 from fmu_asset.door.runs import Run, StateSpace
-from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
@@ -18,6 +16,7 @@ from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.fmu_models.fmu_excitation import FmuExcitation
 from discrepancy.fmu_models.fmu_rest import FmuAtRest
 from discrepancy.fmu_models.port_coupling import PortCoupling
+from discrepancy.fmu_models.readout import Readout, SampledOutputs, sample
 from discrepancy.fmu_models.system_motion import LawPorts, system_motion
 from discrepancy.system.excitation import Excitation, Load
 
@@ -25,32 +24,6 @@ CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the motion."""
 MOST_REFINEMENT = 64
 """Steps that do not converge at this refinement are given up."""
-
-
-class SampledOutputs(NamedTuple):
-    """Values and rates (N, C) of outputs at the samples of a trial."""
-
-    values: FloatArray
-    rates: FloatArray
-
-
-@dataclass(frozen=True)
-class Readout:
-    """Which outputs of an FMU are read, and when.
-
-    Attributes
-    ----------
-    columns : sequence of int
-        Columns of the outputs, C of them.
-    derivatives : sequence of int
-        How many times each is differentiated in time.
-    times : (N,) ndarray
-        Times of the samples [s].
-    """
-
-    columns: Sequence[int]
-    derivatives: Sequence[int]
-    times: FloatArray
 
 
 class FmuSimulator(FmuAtRest):
@@ -166,21 +139,7 @@ class FmuSimulator(FmuAtRest):
         is_even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
         if not is_even:
             stamps = excitation.step * np.arange(ceil(end / excitation.step - 1e-6) + 1.0)
-        # the state at the begin
-        start = self._start_state(system, excitation, amounts)
-        memory = None
-        if len(laws) and excitation.force is not None:
-            # it has settled under the first force
-            first_forces = excitation.first_force * excitation.lever_values
-            gain = system.gain
-            without_laws = (undisturbed + gain @ first_forces)[ports.columns]
-            compliance = gain[np.ix_(ports.columns, ports.force_numbers)]
-            solution = static_solution(
-                laws, without_laws[None], compliance, kernel=compiled_kernel()
-            )
-            law_forces = np.bincount(ports.force_numbers, solution.forces[0], len(first_forces))
-            start = system.at_rest(first_forces - law_forces)
-            memory = solution.memory
+        start, memory = self._start_with_laws(system, excitation, laws, ports, amounts)
         # motion and outputs
         loads = []
         if excitation.force is not None:
@@ -217,6 +176,40 @@ class FmuSimulator(FmuAtRest):
         rates[is_before] = 0.0
         values[np.ix_(is_before, is_derivative)] = 0.0
         return SampledOutputs(values, rates)
+
+    def _start_with_laws(
+        self,
+        system: StateSpace,
+        excitation: FmuExcitation,
+        laws: Laws,
+        ports: LawPorts,
+        amounts: Mapping[str, float],
+    ) -> "StartState":
+        """Return the state at the begin: under a force at rest with the laws, else as released.
+
+        Parameters
+        ----------
+        system : StateSpace
+            The linear system.
+        excitation : FmuExcitation
+            What moves the FMU.
+        laws : Laws
+            Internal forces.
+        ports : LawPorts
+            Where they act.
+        amounts : mapping of str to float
+            What releases the FMU.
+        """
+        if not len(laws) or excitation.force is None:
+            return StartState(self._start_state(system, excitation, amounts), None)
+        first_forces = excitation.first_force * excitation.lever_values
+        gain = system.gain
+        outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
+        without_laws = outputs[ports.columns]
+        compliance = gain[np.ix_(ports.columns, ports.force_numbers)]
+        solution = static_solution(laws, without_laws[None], compliance, kernel=compiled_kernel())
+        law_forces = np.bincount(ports.force_numbers, solution.forces[0], len(first_forces))
+        return StartState(system.at_rest(first_forces - law_forces), solution.memory)
 
     # ------------------------------------------------------------ step by step
 
@@ -416,6 +409,13 @@ class Refinement(NamedTuple):
     strength: float
 
 
+class StartState(NamedTuple):
+    """State (n,) of a linear system at the begin, and the memory of laws loaded before."""
+
+    state: FloatArray
+    memory: FloatArray | None
+
+
 class SteppedOutputs(NamedTuple):
     """Values (K, C) of outputs on an even grid from zero, and its step [s]."""
 
@@ -437,36 +437,3 @@ def _relative_change(coarse: FloatArray, fine: FloatArray) -> float:
         largest = np.max(np.abs(fine - fine.mean(axis=0)), axis=0)
         difference = np.sqrt(np.mean((coarse[:rows] - fine[:rows]) ** 2, axis=0))
         return float(np.max(difference / np.where(largest == 0.0, np.inf, largest)))
-
-
-def sample(
-    values: FloatArray, step: float, readout: Readout, still_to_derive: Sequence[int]
-) -> SampledOutputs:
-    """Return values and rates at the times of a readout, from values on an even grid.
-
-    Parameters
-    ----------
-    values : (K, C) array
-        Values at 0, `step`, 2 `step`, ...
-    step : float
-        Step of the grid [s].
-    readout : Readout
-        Outputs and times; before zero the first value holds.
-    still_to_derive : sequence of int
-        For each column, how many times the values are still to be differentiated.
-    """
-    grid = step * np.arange(len(values))
-    curve = CubicSpline(grid, values)
-    inside = np.clip(readout.times, 0.0, grid[-1])
-    sampled = curve(inside)
-    rates = curve(inside, 1)
-    for column, order in enumerate(still_to_derive):
-        if order > 0:
-            # derivatives of the derivative's own spline keep the order of the first one
-            derivative = CubicSpline(grid, curve(grid, 1)[:, column])
-            sampled[:, column] = derivative(inside, order - 1)
-            rates[:, column] = derivative(inside, order)
-    is_before = readout.times < 0.0
-    rates[is_before] = 0.0
-    sampled[np.ix_(is_before, np.array(readout.derivatives) > 0)] = 0.0
-    return SampledOutputs(np.ascontiguousarray(sampled), np.ascontiguousarray(rates))

@@ -13,10 +13,16 @@ from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError, name_list
 from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.fmu_models.fmu_excitation import FmuExcitation
-from discrepancy.fmu_models.fmu_motion import FmuSimulator, Readout, SampledOutputs
-from discrepancy.fmu_models.trials import bare_trial, effect_parameters, first_trial
+from discrepancy.fmu_models.fmu_motion import FmuSimulator
+from discrepancy.fmu_models.readout import OutputColumns, Readout, SampledOutputs
+from discrepancy.fmu_models.trials import (
+    bare_trial,
+    effect_parameters,
+    first_trial,
+    release_amounts,
+)
 from discrepancy.system.interface import NO_PATCH
-from discrepancy.system.load_change import LoadChange, choose_load_place, require_release
+from discrepancy.system.load_change import LoadChange, choose_load_place
 from discrepancy.system.model_file import DescribedModel
 from discrepancy.system.response import Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import PortScale, Scales
@@ -33,13 +39,6 @@ class PortStiffness(NamedTuple):
 
     modal: float
     static: float
-
-
-class OutputColumns(NamedTuple):
-    """Columns of outputs of the FMU, and how many times each is differentiated."""
-
-    columns: list[int]
-    derivatives: list[int]
 
 
 class FmuModel(DescribedModel):
@@ -378,33 +377,11 @@ class FmuModel(DescribedModel):
         state = self._state(trial, conditions, patch)
         if trial.kind is TrialKind.RINGDOWN:
             excitation = self.fmu.excitation(trial, state, laws.ports)
-            return excitation._replace(releases=self._releases(trial, conditions))
+            return excitation._replace(releases=release_amounts(self.fmu, trial, conditions))
         levers = self._levers(trial, patch)
         excitation = self.fmu.excitation(trial, state, laws.ports, levers)
         force = self._load_change(patch).apply_to(trial.force, trial.force)
         return excitation._replace(force=RecordedHistory(trial.time, force, trial.hold))
-
-    def _releases(self, trial: Trial, conditions: Conditions) -> dict[str, float]:
-        """Return what releases the FMU in a ring-down, with displacement [m] and velocity [m/s]."""
-        release = require_release(trial)
-        variables = self.fmu.release_variables
-        if not variables:
-            raise ModelError(
-                f"The FMU model {self.name!r} cannot ring down: state in [release] the FMU's "
-                "parameter of the release displacement, or the force that holds it."
-            )
-        first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
-        if release.at_rest:
-            return {variables[0]: release.displacement * float(1.0 + first_mode[0])}
-        if len(variables) < 2:
-            raise ModelError(
-                f"The ring-down {trial.name!r} does not begin at rest, which the FMU model "
-                f"{self.name!r} can follow only if [release] names parameters of displacement and "
-                "velocity."
-            )
-        frequency = self.fmu.nominal_pace(trial).angular_frequency
-        amplitudes = release.displacement * first_mode * (1.0, frequency)
-        return dict(zip(variables, amplitudes.tolist(), strict=True))
 
     def _levers(self, trial: Trial, patch: ModelPatch) -> dict[str, float]:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""

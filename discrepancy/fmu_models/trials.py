@@ -7,6 +7,9 @@ from fe.runtime.patch import ModelPatch
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.fmu_models.fmu_motion import FmuSimulator
+from discrepancy.system.load_change import require_release
+from discrepancy.system.response import Conditions
 
 
 def effect_parameters(
@@ -61,3 +64,26 @@ def bare_trial(kind: TrialKind, interval: float) -> Trial:
     """Return a trial without readings, for scales without a campaign."""
     count = 1 if kind is TrialKind.STATIC else 400
     return Trial.plain("", kind, (), interval * np.arange(float(count)))
+
+
+def release_amounts(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> dict[str, float]:
+    """Return what releases an FMU, with displacement [m] and velocity [m/s]."""
+    release = require_release(trial)
+    variables = fmu.release_variables
+    if not variables:
+        raise ModelError(
+            f"The FMU model {fmu.description.name!r} cannot ring down: state in [release] the "
+            "FMU's parameter of the release displacement, or the force that holds it."
+        )
+    first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
+    if release.at_rest:
+        return {variables[0]: release.displacement * float(1.0 + first_mode[0])}
+    if len(variables) < 2:
+        raise ModelError(
+            f"The ring-down {trial.name!r} does not begin at rest, which the FMU model "
+            f"{fmu.description.name!r} can follow only if [release] names parameters of "
+            "displacement and velocity."
+        )
+    frequency = fmu.nominal_pace(trial).angular_frequency
+    amplitudes = release.displacement * first_mode * (1.0, frequency)
+    return dict(zip(variables, amplitudes.tolist(), strict=True))

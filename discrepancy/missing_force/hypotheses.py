@@ -31,8 +31,9 @@ from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of
 
 from .filtered import Process
+from .process_search import Processes
 from .trial import Part, SeenTrial, seen_trial
-from .view import Column, Motion, Processes, View, combined
+from .view import Column, Motion, View, combined
 
 LEVELS = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which the numbers of an effect that are no magnitudes are tried."""

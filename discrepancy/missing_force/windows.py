@@ -19,10 +19,12 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
-from .events import GROUND, MOST_EVENTS, Events, changes, events, throughout
+from .events import GROUND, MOST_EVENTS, Events, events, throughout
+from .explained import Explained, seen
 from .filtered import Process
-from .naming import Explained, ForceSearch, seen
+from .naming import ForceSearch
 from .shares import of_nothing
+from .switched_record import changes
 from .trial import SeenTrial
 from .view import View
 

@@ -298,41 +298,49 @@ def _advance(
     refinement : int
         Steps are this many times smaller.
     """
-    modal = system.modal
-    is_late = stamps[0] - first > LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
-    # in closed form, if nothing acts
+    tolerance = LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
+    is_late = stamps[0] - first > tolerance
     is_excited = excitation.loads or excitation.prescribed_motions
     if not is_excited and laws.linear:
         since_begin = stamps - (first if is_late else stamps[0])
-        free = modal.free(begin.q, begin.v, since_begin)
+        free = system.modal.free(begin.q, begin.v, since_begin)
         if free is not None:
             q, v = free
             no_forces = np.zeros((len(stamps), 0))
             return ModalMotion(q, v, no_forces, no_forces, laws.memory())
-    # in steps
-    is_smooth = excitation.is_smooth or bool(excitation.prescribed_motions)
-    boundaries = substeps(
-        modal,
-        laws,
-        np.append(first, stamps) if is_late else stamps,
-        refinement,
-        SMOOTH_PARTS if is_smooth else 1,
-        (*laws.edges, *excitation.edges),
-    )
-    port_displacements = np.zeros((len(boundaries.time), len(laws)))
-    if system.is_truncated and len(laws) and excitation.loads:
-        residual = system.residual(system.rows_of_laws(laws).T)
-        port_displacements = excitation.loads_at(boundaries.time, residual)
-    steps = _steps(system, excitation, boundaries, port_displacements)
-    motion = advance(modal, laws, steps, begin, compiled_kernel())
     if not is_late:
-        return motion
+        return _advance_in_steps(system, excitation, laws, stamps, begin, refinement)
+    from_begin = np.append(first, stamps)
+    motion = _advance_in_steps(system, excitation, laws, from_begin, begin, refinement)
     return motion._replace(
         q=motion.q[1:],
         v=motion.v[1:],
         port_forces=motion.port_forces[1:],
         lagged=motion.lagged[1:],
     )
+
+
+def _advance_in_steps(
+    system: LinearSystem,
+    excitation: Excitation,
+    laws: Laws,
+    stamps: FloatArray,
+    begin: Begin,
+    refinement: int,
+) -> ModalMotion:
+    """Return the motion at stamps (N,) [s] from a state at the first of them, step by step."""
+    modal = system.modal
+    is_smooth = excitation.is_smooth or bool(excitation.prescribed_motions)
+    least_parts = SMOOTH_PARTS if is_smooth else 1
+    edges = (*laws.edges, *excitation.edges)
+    boundaries = substeps(modal, laws, stamps, refinement, least_parts, edges)
+    # what loads add to the ports beyond the modes
+    port_displacements = np.zeros((len(boundaries.time), len(laws)))
+    if system.is_truncated and len(laws) and excitation.loads:
+        residual = system.residual(system.rows_of_laws(laws).T)
+        port_displacements = excitation.loads_at(boundaries.time, residual)
+    steps = _steps(system, excitation, boundaries, port_displacements)
+    return advance(modal, laws, steps, begin, compiled_kernel())
 
 
 def _steps(

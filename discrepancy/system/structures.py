@@ -34,6 +34,7 @@ from fe.runtime.patched_wing import PatchedState, PatchedWing
 from fe.runtime.reduced import ReducedModel, ReducedState
 from fe.runtime.state import wing_names
 from fe.runtime.wing_rows import LOAD_PLACE, PORTS, PatchArrays, strain_gauge
+from fe.structure.affine import PORT_PREFIX
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
 
@@ -53,18 +54,19 @@ class StructureModel(SystemModel):
     """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
 
     A control in N is a force, and where a load of it acts along a displacement output, in either direction,
-    there is a port, which has the name and the sign of that output. Other controls are nominal but for the
-    load factor, which is zero where none is recorded; constant loads always act.
+    there is a port, which has the name and the sign of that output. Ports of the file come behind these.
+    Other controls are nominal but for the load factor, which is zero where none is recorded; constant loads
+    always act.
 
     Parameters
     ----------
     model : ReducedModel
-        The structure.
+        The structure, with the ports of its file (`reduced_structure(..., with_ports=True)`).
 
     Raises
     ------
     ModelError
-        If no control is a force or a load factor.
+        If no control is a force or a load factor, or a port of the file moves as another port does.
     """
 
     def __init__(self, model: ReducedModel) -> None:
@@ -77,7 +79,7 @@ class StructureModel(SystemModel):
             for low, high in [model.validity[name]]
         )
         units = zip(model.controls, model.control_units, strict=True)
-        self.forces = tuple(name for name, unit in units if unit == "N")
+        self.forces = tuple(name for name, unit in units if unit == "N" and not _is_at_port(name))
         if not self.forces and LOAD_FACTOR not in model.controls:
             raise ModelError(said("models.no_load", model=model))
         if LOAD_FACTOR not in model.controls:
@@ -85,21 +87,47 @@ class StructureModel(SystemModel):
         self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
         self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
         _, outputs, accelerations = model.rows
+        names = (*model.gauges, *model.displacements, *model.accelerations)
+        self._rows = dict(zip(names, (*outputs, *accelerations), strict=True))
+        displacements = [name for name in model.displacements if not _is_at_port(name)]
         self.quantities = {
             **dict.fromkeys(model.gauges, Quantity.STRAIN),
-            **dict.fromkeys(model.displacements, Quantity.DISPLACEMENT),
+            **dict.fromkeys(displacements, Quantity.DISPLACEMENT),
             **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
         }
-        self._rows = dict(zip(self.quantities, (*outputs, *accelerations), strict=True))
+        self.port_rows = self._ports_of_loads(displacements)
+        for port, row in self._ports_of_file().items():
+            self._check_moves_otherwise(port, row)
+            self.port_rows[port] = row
+        self.ports = tuple(self.port_rows)
+
+    def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
+        """Return the rows of the displacements along which a force acts, by name."""
         mean = State(tuple(self.prior_mean().tolist()))
-        along = [self._load(mean, force) for force in self.forces]
-        self.port_rows = {
+        pushes = [self._load(mean, force) for force in self.forces]
+        return {
             name: self._rows[name]
-            for push in along
-            for name in model.displacements
+            for push in pushes
+            for name in displacements
             if _acts_along(push, self._rows[name])
         }
-        self.ports = tuple(self.port_rows)
+
+    def _ports_of_file(self) -> dict[str, FloatArray]:
+        """Return the rows of the ports that the structure file declares, by name."""
+        return {
+            name.removeprefix(PORT_PREFIX): self._rows[name]
+            for name in self.model.displacements
+            if _is_at_port(name)
+        }
+
+    def _check_moves_otherwise(self, port: str, row: FloatArray) -> None:
+        """Refuse a port of the file whose row (n,) reads what another port reads."""
+        for other, other_row in self.port_rows.items():
+            if _acts_along(row, other_row):
+                raise ModelError(
+                    f"The port {port!r} of the structure {self.name} moves as its port {other!r} does, so "
+                    "that no reading tells their forces apart: take this [[port]] out of the file."
+                )
 
     def _at(self, state: State, controls: Mapping[str, float]) -> FloatArray:
         """Return the values that the structure is made at; controls that are left out are nominal."""
@@ -160,6 +188,11 @@ class StructureModel(SystemModel):
             If a value lies outside the validity box of the reduced model.
         """
         return _system(self.model.at(self._at(state, {})), self.model.damping, self.port_rows)
+
+
+def _is_at_port(name: str) -> bool:
+    """Return whether a control or a displacement is that of a port of the structure file."""
+    return name.startswith(PORT_PREFIX)
 
 
 def _acts_along(push: FloatArray, row: FloatArray) -> bool:

@@ -19,6 +19,7 @@ from discrepancy.system.interface import NO_PATCH, Model
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.load_change import LoadChange, require_release
 from discrepancy.system.motion import Motion, motion_of
+from discrepancy.system.natural_state import natural_state
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.port_scales import (
     GlobalScales,
@@ -37,9 +38,6 @@ from discrepancy.system.system_state import (
     SystemState,
 )
 from discrepancy.system.time_history import RecordedHistory, subdivide
-
-SMALLEST_SIZE = 1e-9
-"""Natural size of an initial state where nothing tells one."""
 
 
 class SystemModel(Model):
@@ -325,36 +323,10 @@ class SystemModel(Model):
         parameters = self.prior_mean(campaign)
         case = self.patched_trial(replace(trial, begins=Start.STILL), Conditions(parameters))
         motion = self.motion(case, self.laws(parameters))
-        system = motion.system
-        mode_count = len(system.angular_frequency)
-        count = system.displacement_modes
-        position_sizes = np.max(np.abs(motion.q[:, :mode_count]), axis=0)
-        speed_sizes = np.max(np.abs(motion.velocity[:, :mode_count]), axis=0)
-        duration = float(trial.time[-1] - trial.time[0])
-        pace = np.maximum(system.angular_frequency[:count], 1.0 / duration)
         outputs = campaign.outputs(trial)
         self.check_outputs(outputs)
         equations = self.output_equations(case, outputs, motion.excitation)
-        for column, equation in enumerate(equations):
-            is_used = trial.used[:, column]
-            readings = trial.values[is_used, column] - equation.constant
-            if equation.feedthrough is not None or not readings.size:
-                continue
-            largest = float(np.max(np.abs(readings)))
-            rows = equation.rows @ system.shapes
-            displacement_rows = rows[:, :count]
-            state_rows = rows[:, count:]
-            if np.any(displacement_rows):
-                derivative = np.argmax(np.any(rows, axis=1))
-                amplitude = largest / float(np.linalg.norm(displacement_rows)) / pace**derivative
-                position_sizes[:count] = np.maximum(position_sizes[:count], amplitude)
-                speed_sizes[:count] = np.maximum(speed_sizes[:count], amplitude * pace)
-            if np.any(state_rows):
-                level = largest / float(np.linalg.norm(state_rows))
-                speed_sizes[count:] = np.maximum(speed_sizes[count:], level)
-        sizes = np.concatenate((position_sizes[:count], speed_sizes))
-        usual = max(float(sizes.max(initial=0.0)), SMALLEST_SIZE)
-        return np.asarray(np.where(sizes > 0.0, sizes, usual))
+        return natural_state(motion, equations, trial)
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, at the prior mean and without a patch.

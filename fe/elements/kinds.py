@@ -8,7 +8,7 @@ takes the points of the stiffness for it.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -193,6 +193,17 @@ KINDS = {
     for kind in (TETRAHEDRA_4, TETRAHEDRA_10, HEXAHEDRA_8, HEXAHEDRA_20, WEDGES_6, WEDGES_15)
 }
 """The kinds by their names in meshio."""
+
+
+HEXAHEDRA_20_REDUCED = replace(
+    HEXAHEDRA_20,
+    name="20-node hexahedra of reduced integration",
+    calculix="C3D20R",
+    stiffness_rule=gauss_points(2),
+)
+REDUCED = "hexahedron20 reduced"
+DECK_KINDS = KINDS | {REDUCED: HEXAHEDRA_20_REDUCED}
+"""The kinds that decks can ask for, by their names in a `Deck`; meshio knows cells, not their integration."""
 
 
 def meshio_with_wedges() -> Any:

@@ -173,7 +173,11 @@ def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> 
 
 
 def reduced_structure(
-    file: Path | str, progress: Progress | None = None, *, memory_limit: float | None = None
+    file: Path | str,
+    progress: Progress | None = None,
+    *,
+    memory_limit: float | None = None,
+    with_ports: bool = False,
 ) -> ReducedModel:
     """Return the reduced model of a structure file, from the cache if it is there.
 
@@ -185,6 +189,9 @@ def reduced_structure(
         Where a build reports.
     memory_limit : float, optional
         As of `fe.structure.operators.load_and_assemble`.
+    with_ports : bool
+        Whether the model also holds the force and the displacement at each port of the file, see
+        `AffineStructure.pushed_at_ports`. Its `design_hash` is the one of the model without them.
 
     Raises
     ------
@@ -197,9 +204,11 @@ def reduced_structure(
 
         with reporter(progress).stage("Reading the mesh and assembling"):
             structure = assemble_structure(file, memory_limit)
+        if with_ports:
+            structure = structure.pushed_at_ports()
         return reduce_structure(structure, progress=progress).model
 
-    return _once(ReducedModel, "structure", *_asked(Path(file)), build)
+    return _once(ReducedModel, "structure", *_asked(Path(file), with_ports=with_ports), build)
 
 
 def check_structure(file: Path | str) -> None:
@@ -214,10 +223,10 @@ def check_structure(file: Path | str) -> None:
         assemble_structure(file)
 
 
-def _asked(file: Path) -> tuple[str, object]:
+def _asked(file: Path, *, with_ports: bool = False) -> tuple[str, object]:
     """Return the hash of a structure file with its mesh, and how it is to be reduced."""
     design = load_structure(file)
-    return structure_hash(design, file.parent), design.reduction
+    return structure_hash(design, file.parent, with_ports=with_ports), design.reduction
 
 
 def field_basis(operators: AffineOperators, reduction: "Reduction") -> WingFields:

@@ -229,7 +229,7 @@ def _named(terms: ReductionTerms) -> dict[str, Any]:
         "design_hash": structure.design_hash,
         "name": structure.design.name,
         **{kind: tuple(getattr(structure, kind)) for kind in kinds},
-        "control_units": tuple(part.unit for part in structure.design.control),
+        "control_units": tuple(structure.control_units.values()),
         "validity_box": np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
         "nominal": np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
         "damping": np.array((structure.design.damping.alpha, structure.design.damping.beta)),

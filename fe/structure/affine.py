@@ -6,7 +6,7 @@ where acceleration fields act on the free masses too.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -15,13 +15,18 @@ from scipy import sparse
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
-from fe.runtime.errors import InvalidStateError, SolutionError
+from fe.runtime.errors import InvalidDesignError, InvalidStateError, SolutionError
 from fe.runtime.state import losses_of
 from fe.sentences import said
 
 from .tables import StructureDesign
 
 Values = Mapping[str, float]
+PORT_PREFIX = "port."
+"""Begins the names of the force and the displacement at a port, see `AffineStructure.pushed_at_ports`.
+
+No name in a structure file has a dot.
+"""
 
 
 def affine_sum(coefficients: ArrayLike, terms: tuple[Any, ...]) -> Any:
@@ -56,6 +61,8 @@ class AffineStructure:
         What was asked for.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
+    control_units : dict of str to str
+        Unit of each control.
     ranges : dict of str to (float, float)
         Least and largest value for which a reduced model is to hold, of these and of the losses, by name.
     regions : tuple of str
@@ -70,10 +77,14 @@ class AffineStructure:
         What they are made of.
     gauges, displacements, accelerations : tuple of str
         Names of the outputs.
+    ports : tuple of str
+        Names of the ports where a force that the model lacks may act.
     gauge_output : csr (gauges, n) 1/m
         Strain of each gauge, positive in tension.
     displacement_output, acceleration_output : csr (m, n) 1
         Rows that give a displacement, or with second derivatives an acceleration.
+    port_output : csr (ports, n) 1
+        Rows that give the displacement of a port; transposed, a force of 1 N there.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
     design_hash : str
@@ -84,6 +95,7 @@ class AffineStructure:
     parameters: dict[str, float]
     masses: dict[str, float]
     controls: dict[str, float]
+    control_units: dict[str, str]
     ranges: dict[str, tuple[float, float]]
     regions: tuple[str, ...]
     stiffness_terms: tuple[StiffnessTerm, ...]
@@ -93,9 +105,11 @@ class AffineStructure:
     gauges: tuple[str, ...]
     displacements: tuple[str, ...]
     accelerations: tuple[str, ...]
+    ports: tuple[str, ...]
     gauge_output: sparse.csr_array
     displacement_output: sparse.csr_array
     acceleration_output: sparse.csr_array
+    port_output: sparse.csr_array
     expansion: sparse.csr_array
     design_hash: str
 
@@ -179,6 +193,24 @@ class AffineStructure:
         kinds = (self.parameters, self.regions, self.masses)
         return tuple({name: values[name] for name in names if name in values} for names in kinds)
 
+    def pushed_at_ports(self) -> "AffineStructure":
+        """Return the structure with a force [N] and a displacement [m] at each port, named `port.NAME`.
+
+        The force is a control whose nominal value is zero, so that it acts only where something asks for it.
+        """
+        names = tuple(f"{PORT_PREFIX}{port}" for port in self.ports)
+        forces = zip(names, self.port_output.toarray(), strict=True)
+        return replace(
+            self,
+            controls=self.controls | dict.fromkeys(names, 0.0),
+            control_units=self.control_units | dict.fromkeys(names, "N"),
+            ranges=self.ranges | dict.fromkeys(names, (-1.0, 1.0)),
+            loads=self.loads | dict(zip(names, names, strict=True)),
+            load_terms=(*self.load_terms, *(LoadTerm(name, vector) for name, vector in forces)),
+            displacements=(*self.displacements, *names),
+            displacement_output=sparse.vstack((self.displacement_output, self.port_output), format="csr"),
+        )
+
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
         return np.asarray(self.expansion @ free).reshape(-1, 3)
@@ -208,7 +240,12 @@ def designed(
         Of each of its loads the forces [N], or the field [m/s^2] of an acceleration, which acts on the free
         masses, too.
     outputs : mapping of str to csr (m, full)
-        Rows of the tables `gauge`, `displacement` and `acceleration`.
+        Rows of the tables `gauge`, `displacement`, `acceleration` and `port`.
+
+    Raises
+    ------
+    InvalidDesignError
+        If a port lies where nothing can move.
     """
     restriction = expansion.T.tocsr()
     masses: dict[str | None, sparse.csr_array] = {None: mass}
@@ -223,11 +260,16 @@ def designed(
             terms.append(LoadTerm(load.name, restriction @ vector))
         else:
             terms += [LoadTerm(load.name, restriction @ (own @ vector), name) for name, own in masses.items()]
+    rows_on_free = {key: (rows @ expansion).tocsr() for key, rows in outputs.items()}
+    for (where, port), row in zip(design.numbered("port"), rows_on_free["port"].toarray(), strict=True):
+        if not row.any():
+            raise InvalidDesignError(said("structure.held_port", where=where, port=port))
     return {
         "design": design,
         "parameters": {part.name: part.nominal for part in design.parameter},
         "masses": {part.name: part.mass for part in design.mass if part.free},
         "controls": {part.name: part.nominal for part in design.control},
+        "control_units": {part.name: part.unit for part in design.control},
         "ranges": design.ranges,
         "regions": tuple(part.name for part in design.damage),
         "mass_terms": tuple((restriction @ (own @ expansion)).tocsr() for own in masses.values()),
@@ -236,7 +278,8 @@ def designed(
         "gauges": tuple(part.name for part in design.gauge),
         "displacements": tuple(part.name for part in design.displacement),
         "accelerations": tuple(part.name for part in design.acceleration),
-        **{f"{key}_output": (rows @ expansion).tocsr() for key, rows in outputs.items()},
+        "ports": tuple(part.name for part in design.port),
+        **{f"{key}_output": rows for key, rows in rows_on_free.items()},
         "expansion": expansion,
     }
 

@@ -16,7 +16,7 @@ from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
 from fe.sentences import said
 
-from .design import Gauge, Load, Rosette
+from .design import Gauge, Load, Port, Rosette
 from .mesh import StructureMesh, Surface
 
 FARTHEST = 0.1
@@ -208,16 +208,44 @@ def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
         return np.tile(load.acceleration, (len(mesh.points), 1))
     if load.pressure is not None:
         return -load.pressure * face_areas(mesh, mesh.faces_of(str(load.set), where))[0]
-    force = np.asarray(load.force)
-    if load.point is not None:
-        return np.outer(point_shares(mesh, load.point, where), force)
-    nodes = mesh.nodes_of(str(load.set), where)
-    surface = mesh.faces_between(str(load.set), nodes)
+    return np.outer(_force_shares(mesh, load, where), np.asarray(load.force))
+
+
+def port_row(mesh: StructureMesh, port: Port, where: str) -> FloatArray:
+    """Return the row (nodes, 3) that reads the displacement of a port.
+
+    Transposed, the row is a force of 1 N at the port.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    port : Port
+        The port.
+    where : str
+        What names the port in sentences.
+
+    Raises
+    ------
+    MeshError
+        If its set is missing or empty.
+    InvalidDesignError
+        If its point lies outside.
+    """
+    return np.outer(_force_shares(mesh, port, where), unit_vector(port.direction))
+
+
+def _force_shares(mesh: StructureMesh, part: Load | Port, where: str) -> FloatArray:
+    """Return the share (nodes,) of each node in a force at a point or on a set, which together are one."""
+    if part.point is not None:
+        return point_shares(mesh, part.point, where)
+    nodes = mesh.nodes_of(str(part.set), where)
+    surface = mesh.faces_between(str(part.set), nodes)
     shares = np.zeros(len(mesh.points))
     shares[nodes] = 1.0
     if len(surface):
         _, shares = face_areas(mesh, surface)
-    return np.outer(shares / shares.sum(), force)
+    return np.asarray(shares / shares.sum())
 
 
 def point_shares(mesh: StructureMesh, point: tuple[float, float, float], where: str) -> FloatArray:

@@ -1,7 +1,7 @@
 """From matrices and a structure file to affine operators, and what is said of matrices that are no structure.
 
-Unknowns stay in the unit of length of the matrices, so that these are taken as they are; rows that read a
-displacement, and masses and accelerations, are turned into SI units.
+Matrices are turned into SI units as they are read: stiffness in N/m, mass in kg, unknowns in metres (turns
+times the unit of length). A row that reads a displacement is then, transposed, a force of 1 N there.
 """
 
 import itertools
@@ -58,10 +58,13 @@ class Matrices:
         Where the files are.
     places : list of (int, int)
         Node and component of each row.
+    unit : float
+        Metres in the unit of length of the matrices.
     """
 
     folder: Path
     places: list[Place]
+    unit: float
 
     @cached_property
     def rows(self) -> dict[Place, list[int]]:
@@ -112,7 +115,7 @@ class Matrices:
         return read_vector(self.folder, name, lambda place: self.at(place, where, shares), len(self.places))
 
     def matrix(self, name: str, where: str, *, partial: bool = False) -> sparse.csr_array:
-        """Symmetric matrix (n, n) of a file, its rows in the order of the places.
+        """Return the symmetric matrix (n, n) of a file [N/m or kg], its rows in the order of the places.
 
         A `partial` one may end before them, as a table does whose last rows are zero.
 
@@ -139,7 +142,7 @@ class Matrices:
             worst = int(skew.data.argmax())
             both = [_named(self.places[int(axis[worst])]) for axis in skew.coords]
             raise MeshError(said("matrices.skew", where=place, both=both, apart=skew.data[worst]))
-        return sparse.csr_array(0.5 * (matrix + matrix.T))
+        return sparse.csr_array(0.5 * (matrix + matrix.T) / self.unit)
 
 
 def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> AffineStructure:
@@ -151,7 +154,7 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
         If a file cannot be read, does not fit the others, lacks what the design names, or is no structure's:
         unsymmetric, indefinite, not held, or with mass that nothing holds.
     """
-    files = Matrices(folder, _places(design, folder))
+    files = Matrices(folder, _places(design, folder), design.unit)
     stiffness, mass = (
         sum(files.matrix(name, key) for name in getattr(design, key))
         for key in ("stiffness_matrix", "mass_matrix")
@@ -169,15 +172,15 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
         design,
         sparse.eye_array(len(moves), format="csc")[:, free].tocsr(),
         mass,
-        (_point_mass(part, design.unit, files, where) for where, part in design.numbered("mass")),
-        (_load(part, design.unit, files, where) for where, part in design.numbered("load")),
+        (_point_mass(part, files, where) for where, part in design.numbered("mass")),
+        (_load(part, files, where) for where, part in design.numbered("load")),
         {
             key: sparse.csr_array(np.array([*_rows(design, files, key)]).reshape(-1, len(moves)))
-            for key in ("gauge", "displacement", "acceleration")
+            for key in ("gauge", "displacement", "acceleration", "port")
         },
     )
     return AffineStructure(
-        **fields | {"expansion": design.unit * _expansion(files)[:, free]},
+        **fields | {"expansion": _expansion(files)[:, free]},
         stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free)),
         design_hash=design_hash,
     )
@@ -195,29 +198,30 @@ def _places(design: MatrixDesign, folder: Path) -> list[Place]:
     return sorted(found)
 
 
-def _point_mass(part: MatrixMass, unit: float, files: Matrices, where: str) -> sparse.csr_array:
-    """Return the mass matrix (n, n) of 1 kg, in the unit of the matrices."""
+def _point_mass(part: MatrixMass, files: Matrices, where: str) -> sparse.csr_array:
+    """Return the mass matrix (n, n) of 1 kg."""
     if part.matrix is not None:
         return files.matrix(part.matrix, where, partial=True)
     assert part.node is not None
     known = [axis for axis in (1, 2, 3) if (part.node, axis) in files.rows] or [1]
     column = sparse.csr_array(np.array([files.at((part.node, axis), where) for axis in known]).T)
-    return sparse.csr_array(unit * (column @ column.T))
+    return sparse.csr_array(column @ column.T)
 
 
-def _load(load: MatrixLoad, unit: float, files: Matrices, where: str) -> FloatArray:
-    """Return the vector (n,) of a load, or of the field of an acceleration in the unit of the matrices."""
+def _load(load: MatrixLoad, files: Matrices, where: str) -> FloatArray:
+    """Return the vector (n,) of a load [N], or of the field of an acceleration [m/s^2]."""
     if load.acceleration is not None:
-        return files.everywhere(load.acceleration, where) / unit
+        return files.everywhere(load.acceleration, where)
     if load.node is not None and load.force is not None:
         return files.along(load.node, load.force, where, PUSHED)
     return files.vector(str(load.vector), where, PUSHED)
 
 
 def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArray]:
-    """Yield the rows (n,) of outputs, displacements and accelerations in metres."""
+    """Yield the rows (n,) of strains [1/m], or of displacements, accelerations or ports [1]."""
+    scale = 1.0 / design.unit if key == "gauge" else 1.0
     for place, part in design.numbered(key):
-        where, scale = f"{place} ({part.name})", 1.0 if key == "gauge" else design.unit
+        where = f"{place} ({part.name})"
         if part.vector is not None:
             yield scale * files.vector(part.vector, where)
             continue
@@ -225,9 +229,9 @@ def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArra
         direction = tuple(unit_vector(part.direction))
         if isinstance(part, Extension):
             first, last = (files.along(node, direction, where) for node in part.nodes or ())
-            yield (last - first) / (part.length or 1.0)
+            yield scale * (last - first) / (part.length or 1.0)
         elif part.node is not None:
-            yield scale * files.along(part.node, direction, where)
+            yield files.along(part.node, direction, where)
 
 
 def _expansion(files: Matrices) -> sparse.csr_array:

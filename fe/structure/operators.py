@@ -18,7 +18,7 @@ from reporting.files import atomic_file
 
 from .affine import AffineStructure, static_response
 from .design import MatrixDesign, MeshDesign, load_structure, structure_hash
-from .location import gauge_rows, nodal_load, point_shares
+from .location import gauge_rows, nodal_load, point_shares, port_row
 from .matrices import assemble_matrices
 from .mesh import Body, PointMass, StructureMesh, supported
 from .mesh_file import check_memory, read_mesh
@@ -157,8 +157,10 @@ def load_and_assemble(
     gauges, moved = gauge_rows(mesh, design.gauge)
     loads = (nodal_load(mesh, load, where).ravel() for where, load in design.numbered("load"))
     points = {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")}
+    ports = [port_row(mesh, port, where).ravel() for where, port in design.numbered("port")]
+    port_rows = sparse.csr_array(np.reshape(ports, (-1, mesh.unknowns)))
     return Structure(
-        **body.assembled(design, loads, {"gauge": gauges} | points),
+        **body.assembled(design, loads, {"gauge": gauges, **points, "port": port_rows}),
         design_hash=structure_hash(design, file.parent),
         material_of=material_of,
         region_of=region_of,

@@ -122,7 +122,8 @@ def stiffness_parts(regions: Iterable[str]) -> tuple[tuple[str | None, str | Non
 def outputs(gauges: sparse.csr_array, tip: FloatArray) -> dict[str, sparse.csr_array]:
     """Name the rows of gauges, positive in compression, and of the upward displacement (full,) at the tip."""
     nothing = sparse.csr_array((0, len(tip)))
-    return {"gauge": gauges, "displacement": sparse.csr_array(tip[np.newaxis]), "acceleration": nothing}
+    displacement = sparse.csr_array(tip[np.newaxis])
+    return {"gauge": gauges, "displacement": displacement, "acceleration": nothing, "port": nothing}
 
 
 @dataclass(frozen=True)

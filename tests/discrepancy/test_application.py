@@ -20,7 +20,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.model_choice import choose_model
 from discrepancy.report.figures import ReportInput
-from discrepancy.search.strategy import search
+from discrepancy.search.whole_search import search
 from discrepancy.sources.examples import example_campaign, plan_of
 from discrepancy.system.lumped_file import SHIPPED_MODELS
 from discrepancy.system.response import Conditions

@@ -24,7 +24,8 @@ from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence
-from discrepancy.search.strategy import Search, search
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.verdict import VerdictKind
