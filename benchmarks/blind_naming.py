@@ -24,7 +24,7 @@ from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.structures import WingModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import Investigation, investigate, patch_draws

@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
-from discrepancy.system.excitation import Acting, Course, Load, Shown, release_of
+from discrepancy.system.excitation import Excitation, Load, ReleasePoint
 from discrepancy.system.interface import Model
 from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.load_change import require_release
 from discrepancy.system.motion import motion_of
+from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.response import ACROSS, Conditions, Outputs, Response
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.sensing import observe
+from discrepancy.system.time_history import RecordedHistory
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import (
     INTERNAL_FORCES,
@@ -215,13 +218,15 @@ def _motion(
     laws = laws_of(patch.of(*INTERNAL_FORCES), PORTS)
     if trial.is_dynamic:
         system = _system(float(modulus[0]), structural)
-        acting = Acting(trial.time, conditions.stamps(trial.time))
+        excitation = Excitation(trial.time, conditions.stamps(trial.time))
         if trial.kind is TrialKind.RINGDOWN:
-            acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
+            point = ReleasePoint(TIP, require_release(trial))
+            excitation = replace(excitation, release=point, initial=conditions.initial)
         else:
-            acting = replace(acting, loads=[Load(row, Course(trial.time, force, trial.hold))])
-        moved = motion_of(system, acting, laws, conditions.refinement)
-        response = moved.seen([Shown.of(row) for row in rows])
+            history = RecordedHistory(trial.time, force, trial.hold)
+            excitation = replace(excitation, loads=[Load(row, history)])
+        motion = motion_of(system, excitation, laws, conditions.refinement)
+        response = motion.response([OutputEquation.of_row(row) for row in rows])
         return response.values, response.rates, behind * force
     loads = np.outer(force, row)
     for n in range(len(force)):
@@ -233,7 +238,7 @@ def _motion(
     values = np.empty((len(force), len(rows)))
     for level in np.unique(modulus):
         chosen = modulus == level
-        values[chosen] = (_system(float(level), structural).static(loads, laws)[0] @ rows.T)[chosen]
+        values[chosen] = (_system(float(level), structural).static_path(loads, laws).values @ rows.T)[chosen]
     return values, None, behind * force
 
 

@@ -19,8 +19,8 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Trial, 
 from discrepancy.errors import DiscrepancyError
 from discrepancy.model_choice import ModelChoice, ModelKind
 from discrepancy.parameters.calibration import calibrate_parameters
-from discrepancy.system.lumped import LumpedModel
 from discrepancy.system.lumped_file import LumpedDescription
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 
 DEVIATION = {"spring": 0.05, "damping": 0.3, "mass": 0.05}

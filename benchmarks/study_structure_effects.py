@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.model_choice import load_model
-from discrepancy.system.excitation import Acting, Shown
+from discrepancy.system.excitation import Excitation, ReleasePoint
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.motion import motion_of
+from discrepancy.system.output_equation import OutputEquation
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.model_cache import reduced_structure
@@ -147,9 +148,9 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
-            acting = Acting(time, time, initial=initial, release=(end, release))
-            moved = motion_of(system, acting, laws)
-            values = moved.seen([Shown.of(row) for row in rows]).values
+            excitation = Excitation(time, time, initial=initial, release=ReleasePoint(end, release))
+            moved = motion_of(system, excitation, laws)
+            values = moved.response([OutputEquation.of_row(row) for row in rows]).values
         else:
             values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws)[0] @ rows.T
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):

@@ -16,8 +16,8 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.catalogue.entry import Setting
-from discrepancy.system.lumped import LumpedModel
 from discrepancy.system.lumped_file import LumpedDescription
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch

@@ -11,8 +11,8 @@ from discrepancy.files.verdict import StoredPatch, read_patch
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.sources.from_run import run_model
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
 from discrepancy.system.lumped_file import SHIPPED_MODELS
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.structures import StructureModel, WingModel
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError

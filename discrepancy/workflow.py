@@ -50,7 +50,7 @@ from discrepancy.search.whole_search import OnSearch, nobody_looks
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter

@@ -1,27 +1,45 @@
-"""Any FMU with a binding as a model: its inputs loaded, its outputs read, internal forces at its ports."""
+"""An FMU as a model: loads on its inputs, internal forces at its ports, its outputs read."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
-from discrepancy.errors import ModelError, said
+from discrepancy.errors import ModelError
 from discrepancy.fmu_models.description import FmuModelDescription
-from discrepancy.fmu_models.motion import FmuMotion, Sampled
-from discrepancy.fmu_models.system import Case
-from discrepancy.system.excitation import Course, LoadChange, divided, place_among, release_of
+from discrepancy.fmu_models.fmu_excitation import FmuExcitation
+from discrepancy.fmu_models.fmu_motion import FmuSimulator
+from discrepancy.fmu_models.readout import OutputColumns, Readout, SampledOutputs
+from discrepancy.fmu_models.trials import (
+    bare_trial,
+    effect_parameters,
+    first_trial,
+    release_amounts,
+)
 from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.load_change import LoadChange, choose_load_place
 from discrepancy.system.model_file import DescribedModel
 from discrepancy.system.response import Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import PortScale, Scales
+from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
-from fmu_asset.door.runs import State
+from fmu_asset.door.runs import State, StateSpace
+from reporting.words import comma_list
 
 LATEST = 100.0
 """Lengths of a record after which its stamps count from elsewhere than the trial's start."""
+TURN = 0.3
+"""Turn of the first mode in an interval that suits it [rad]."""
+
+
+class PortStiffness(NamedTuple):
+    """Stiffness of the most flexible mode at a port, and that at rest [N/m or N m/rad]."""
+
+    modal: float
+    static: float
 
 
 class FmuModel(DescribedModel):
@@ -41,29 +59,40 @@ class FmuModel(DescribedModel):
 
     Notes
     -----
-    The FMU knows one release, so that only the first entry of `Conditions.initial` acts; deviations of single
-    modes are passed over. `transverse` and `shear` are never known.
+    The FMU has one release, so that only the first entry of `Conditions.initial` acts; deviations
+    of single modes are ignored. `transverse` and `shear` are never known.
     """
 
     holds_inputs: ClassVar[bool] = True
 
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
-        self.fmu = fmu = FmuMotion(description, Path(folder))
-        self.names = names = fmu.names
-        super().__init__(description, names.quantities)
-        self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
+        self.fmu = FmuSimulator(description, Path(folder))
+        self.names = self.fmu.names
+        super().__init__(description, self.names.quantities)
+        inputs = description.inputs
+        self.length = description.scales.length
         self.stations = None if self.length is None else (0.0, self.length)
-        flies = description.inputs.load_factor is not None
-        self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
-        self._keys = [names.parameter(item.variable) for item in description.parameter]
-        self._forces = {place: names.variable(name) for place, name in description.inputs.force.items()}
-        self._inputs = {item.name: names.variable(item.variable) for item in description.input}
-        self.load_places = tuple(self._forces)
-        limits = (fmu.asset.input_range("load", name)[1] for name in self._forces.values())
+        self.regions = tuple(inputs.regions)
+        self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
+        if inputs.load_factor is None:
+            self.kinds -= {TrialKind.FLIGHT}
+        self._parameter_keys = [
+            self.names.parameter(section.variable) for section in description.parameter
+        ]
+        self._force_inputs = {
+            place: self.names.variable(name) for place, name in inputs.force.items()
+        }
+        self._held_inputs = {
+            section.name: self.names.variable(section.variable) for section in description.input
+        }
+        self.load_places = tuple(self._force_inputs)
+        limits = [
+            self.fmu.asset.input_range("load", name)[1] for name in self._force_inputs.values()
+        ]
         self.largest_force = 0.5 * min(limits, default=np.inf)
         mean = Conditions(self.prior_mean())
-        fmu.nominal = self._state(_any_trial(TrialKind.RINGDOWN, 1.0), mean)
+        self.fmu.nominal = self._state(bare_trial(TrialKind.RINGDOWN, 1.0), mean)
 
     @classmethod
     def load(cls, path: Path | str) -> "FmuModel":
@@ -75,199 +104,336 @@ class FmuModel(DescribedModel):
         self.fmu.close()
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the model can carry a primitive."""
-        inputs, effects = self.description.inputs, self.description.effects
-        if primitive in SENSORS or primitive.kind in effects:
+        """Return whether the model can carry a primitive."""
+        inputs = self.description.inputs
+        if primitive in SENSORS or primitive.kind in self.description.effects:
             return True
-        if primitive in (LoadGain, LoadPlace):
-            return bool(inputs.force) and (primitive is LoadGain or inputs.bending_moment is not None)
+        if primitive is LoadGain:
+            return bool(inputs.force)
+        if primitive is LoadPlace:
+            return bool(inputs.force) and inputs.bending_moment is not None
         return issubclass(primitive, PortForce) and bool(self.ports)
 
+    # ------------------------------------------------------------ scales
+
     def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
-        given, fmu, trials = self.description.scales, self.fmu, campaign.trials
-        conditions, largest = Conditions(self.prior_mean(campaign)), np.zeros(len(fmu.ports))
-        for trial in trials:
-            if trial.is_dynamic:
-                moved, _ = self._moving(trial, conditions, NO_PATCH, fmu.x, [0] * len(fmu.x))
-            else:
-                own = replace(conditions, health=trial.health)
-                moved = self._at_rest(trial, own, NO_PATCH)[:, fmu.x]
-            largest = np.maximum(largest, np.max(np.abs(moved), axis=0))
-        still = next((item for item in trials if not item.is_dynamic), _any_trial(TrialKind.STATIC, 1.0))
-        flexible = np.diag(fmu.flexibility(self._state(still, conditions)))
-        pairs = [(1.0 / own, 1.0 / own) for own in flexible.tolist()]
-        frequency, moving = given.angular_frequency, next((item for item in trials if item.is_dynamic), None)
-        if moving is not None:
-            state = self._state(moving, conditions)
-            frequency = frequency or fmu.pace(moving, state)[0]
-            if (system := fmu.system(fmu.case(moving, state, self.ports))) is not None:
-                pairs = [system.stiffness(column, number) for number, column in enumerate(fmu.x)]
-        interval = 0.01
-        for _ in range(0 if trials or frequency else 3):  # until the interval suits it
-            frequency = fmu.pace(_any_trial(TrialKind.RINGDOWN, interval), fmu.nominal)[0]
-            interval = 0.3 / frequency
-        loaded = (
-            pair for force, pair in zip(fmu.forces, pairs, strict=True) if force in self._forces.values()
-        )
-        modal, tip = next(loaded, (*pairs, (1.0, 1.0))[0])
-        frequency = frequency or 1.0
+        """Return the natural scales under a campaign: those of the file, else of the FMU."""
+        conditions = Conditions(self.prior_mean(campaign))
+        largest = self._largest_displacements(campaign, conditions)
+        stiffnesses = self._port_stiffnesses(campaign, conditions)
+        frequency = self._first_frequency(campaign, conditions)
+        load_point = self._load_point_stiffness(stiffnesses)
+        ports = {}
+        for port, displacement, stiffness in zip(self.ports, largest, stiffnesses, strict=True):
+            ports[port] = PortScale(
+                displacement=float(displacement) or 1.0,
+                stiffness=stiffness.modal,
+                angular_frequency=frequency,
+                static_stiffness=stiffness.static,
+            )
+        of_file = self.description.scales
+        sizes = campaign.sizes
         return Scales(
-            length=given.length or 1.0,
-            tip_stiffness=given.tip_stiffness or tip,
-            modal_mass=given.modal_mass or modal / frequency**2,
+            length=of_file.length or 1.0,
+            tip_stiffness=of_file.tip_stiffness or load_point.static,
+            modal_mass=of_file.modal_mass or load_point.modal / frequency**2,
             angular_frequency=frequency,
-            **campaign.sizes,
-            ports={
-                port: PortScale(float(most) or 1.0, own, frequency, rest)
-                for port, most, (own, rest) in zip(self.ports, largest, pairs, strict=True)
-            },
+            force=sizes["force"],
+            load_factor=sizes["load_factor"],
+            duration=sizes["duration"],
+            campaign_time=sizes["campaign_time"],
+            ports=ports,
         )
+
+    def _largest_displacements(self, campaign: Campaign, conditions: Conditions) -> FloatArray:
+        """Return the largest displacement of each port (P,) in the trials of a campaign."""
+        largest = np.zeros(len(self.ports))
+        for trial in campaign.trials:
+            if trial.is_dynamic:
+                moved = self._motion(trial, conditions, NO_PATCH, self._port_columns()).values
+            else:
+                at_health = replace(conditions, health=trial.health)
+                outputs = self._outputs_at_rest(trial, at_health, NO_PATCH)
+                moved = outputs[:, self.fmu.displacement_columns]
+            largest = np.maximum(largest, np.max(np.abs(moved), axis=0))
+        return largest
+
+    def _port_stiffnesses(self, campaign: Campaign, conditions: Conditions) -> list[PortStiffness]:
+        """Return the stiffness of each port: of the linear system if there is one, else at rest."""
+        at_rest = first_trial(campaign, is_dynamic=False) or bare_trial(TrialKind.STATIC, 1.0)
+        compliance = np.diag(self.fmu.flexibility(self._state(at_rest, conditions)))
+        in_motion = first_trial(campaign, is_dynamic=True)
+        if in_motion is not None:
+            state = self._state(in_motion, conditions)
+            system = self.fmu.system(self.fmu.excitation(in_motion, state, self.ports))
+            if system is not None:
+                return self._stiffnesses_of_system(system)
+        return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]
+
+    def _stiffnesses_of_system(self, system: StateSpace) -> list[PortStiffness]:
+        """Return the stiffness of each port of a linear system."""
+        stiffnesses = []
+        for port, column in enumerate(self.fmu.displacement_columns):
+            modal, static = system.stiffness(column, port)
+            stiffnesses.append(PortStiffness(modal, static))
+        return stiffnesses
+
+    def _first_frequency(self, campaign: Campaign, conditions: Conditions) -> float:
+        """Return the angular frequency of the first mode [rad/s]; 1 if no trial shows it."""
+        frequency = self.description.scales.angular_frequency
+        if frequency:
+            return frequency
+        in_motion = first_trial(campaign, is_dynamic=True)
+        if in_motion is not None:
+            state = self._state(in_motion, conditions)
+            return self.fmu.pace(in_motion, state).angular_frequency or 1.0
+        if campaign.trials:
+            return 1.0
+        # without a campaign, until the interval suits the mode
+        interval = 0.01
+        for _ in range(3):
+            trial = bare_trial(TrialKind.RINGDOWN, interval)
+            frequency = self.fmu.pace(trial, self.fmu.nominal).angular_frequency
+            interval = TURN / frequency
+        return frequency or 1.0
+
+    def _load_point_stiffness(self, stiffnesses: list[PortStiffness]) -> PortStiffness:
+        """Return the stiffness of the first port with a load input, else of the first port."""
+        force_inputs = self._force_inputs.values()
+        for port_input, stiffness in zip(self.fmu.port_inputs, stiffnesses, strict=True):
+            if port_input in force_inputs:
+                return stiffness
+        return stiffnesses[0] if stiffnesses else PortStiffness(1.0, 1.0)
 
     # ------------------------------------------------------------ response
 
-    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial; `transverse` and `shear` are never known.
+    def _respond(
+        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
+    ) -> Response:
+        """Return the response of a trial.
 
-        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
+        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not
+        zero.
         """
-        columns, orders = self._read(outputs)
+        columns = self._output_columns(outputs)
         if trial.is_dynamic:
-            return Response(*self._moving(trial, conditions, patch, columns, orders))
+            sampled = self._motion(trial, conditions, patch, columns)
+            return Response(sampled.values, sampled.rates)
         if any(quantity.order > 0 for _, quantity in outputs):
-            raise ModelError(said("models.speed_at_rest", trial=trial))
-        return Response(self._at_rest(trial, conditions, patch)[:, columns])
+            raise ModelError(
+                f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
+                "acceleration."
+            )
+        return Response(self._outputs_at_rest(trial, conditions, patch)[:, columns.columns])
 
-    def _read(self, outputs: Outputs) -> tuple[list[int], list[int]]:
-        """Return the columns of outputs, and how often each is derived."""
-        orders = [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
-        return [self.names.columns[output] for output, _ in outputs], orders
+    def _output_columns(self, outputs: Outputs) -> OutputColumns:
+        """Return the columns of outputs, and how many times each is differentiated."""
+        derivatives = [
+            quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs
+        ]
+        return OutputColumns([self.names.columns[output] for output, _ in outputs], derivatives)
 
-    def _moving(
-        self, trial: Trial, conditions: Conditions, patch: ModelPatch, columns: list[int], orders: list[int],
+    def _port_columns(self) -> OutputColumns:
+        """Return the columns of the ports' displacements."""
+        columns = self.fmu.displacement_columns
+        return OutputColumns(columns, [0] * len(columns))
+
+    def _motion(
+        self,
+        trial: Trial,
+        conditions: Conditions,
+        patch: ModelPatch,
+        columns: OutputColumns,
         parts: int = 1,
-    ) -> Sampled:  # fmt: skip
-        """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates.
+    ) -> SampledOutputs:
+        """Return outputs of the FMU in a dynamic trial, and their rates.
 
-        At samples that are so many times as dense as those of the trial.
+        Parameters
+        ----------
+        trial : Trial
+            The trial.
+        conditions, patch : Conditions, ModelPatch
+            What the motion depends on besides.
+        columns : OutputColumns
+            The outputs.
+        parts : int
+            Samples are so many times as dense as those of the trial.
         """
-        laws, times = self._laws(patch), divided(conditions.stamps(trial.time), parts)
-        first, last = trial.time[[0, -1]].tolist()
+        laws = self._laws(patch)
+        times = subdivide(conditions.stamps(trial.time), parts)
+        first = float(trial.time[0])
+        length = float(trial.time[-1]) - first
         # an FMU begins at zero, and cannot be followed for hours to where a clock of the day begins
-        if trial.kind is not TrialKind.RINGDOWN and not 0.0 <= first <= LATEST * (last - first):
-            trial, times = replace(trial, time=trial.time - first), times - first
-        case = self._case(trial, conditions, patch, laws)
-        return self.fmu.motion(case, trial, times, laws, columns, orders, conditions.refinement)
+        begins_near_zero = 0.0 <= first <= LATEST * length
+        if trial.kind is not TrialKind.RINGDOWN and not begins_near_zero:
+            trial = replace(trial, time=trial.time - first)
+            times = times - first
+        excitation = self._excitation(trial, conditions, patch, laws)
+        readout = Readout(columns.columns, columns.derivatives, times)
+        return self.fmu.motion(excitation, trial, laws, readout, conditions.refinement)
 
-    def _at_rest(self, trial: Trial, conditions: Conditions, patch: ModelPatch) -> FloatArray:
+    def _outputs_at_rest(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch
+    ) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
-        offsets, given = conditions.offset or (0.0,) * len(trial.inputs), dict[str, FloatArray]()
-        for item, offset in zip(trial.inputs, offsets, strict=True):
-            if item.name not in self._inputs:
-                known = self._inputs
-                raise ModelError(said("models.no_input", trial=trial, item=item, model=self, known=known))
-            variable = self._inputs[item.name]
-            given[variable] = self.names.input_factors[variable] * (item.values + offset)
+        loads = self._loads_at_rest(trial, conditions, patch)
+        rows = range(len(trial.time))
+        states = [self._state(trial, conditions, patch, row) for row in rows]
+        return self.fmu.at_rest(states, loads, self._laws(patch), trial.name)
+
+    def _loads_at_rest(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch
+    ) -> dict[str, FloatArray]:
+        """Return the inputs (N,) that a trial at rest sets in each row."""
+        offsets = conditions.offset or (0.0,) * len(trial.inputs)
+        loads: dict[str, FloatArray] = {}
+        for recorded, offset in zip(trial.inputs, offsets, strict=True):
+            if recorded.name not in self._held_inputs:
+                raise ModelError(
+                    f"The trial {trial.name!r} holds the input {recorded.name!r}, which the FMU "
+                    f"model {self.name!r} does not have; it has {comma_list(self._held_inputs)}: "
+                    "name it in [[input]]."
+                )
+            variable = self._held_inputs[recorded.name]
+            loads[variable] = self.names.input_factors[variable] * (recorded.values + offset)
         if trial.kind is TrialKind.FLIGHT:
-            given = {self.names.variable(str(self.description.inputs.load_factor)): trial.load_factor}
-        elif not given or np.any(trial.force):
-            acting = self._load(patch).changed(trial.force, trial.force)
-            given |= {name: acting * lever for name, lever in self._levers(trial, patch).items()}
-        states = [self._state(trial, conditions, patch, row) for row in range(len(trial.time))]
-        return self.fmu.at_rest(states, given, self._laws(patch), trial.name)
+            load_factor = str(self.description.inputs.load_factor)
+            return {self.names.variable(load_factor): trial.load_factor}
+        if not loads or np.any(trial.force):
+            force = self._load_change(patch).apply_to(trial.force, trial.force)
+            for name, lever in self._levers(trial, patch).items():
+                loads[name] = force * lever
+        return loads
 
     # ------------------------------------------------------------ ports
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in the state of that of the prior means.
+        """Return the system by which outputs see missing forces, in the state at the prior means.
 
         Raises
         ------
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        fmu = self.fmu
-        base, found = (
-            fmu.system(fmu.case(trial, self._state(trial, conditions, self.patch), self.ports))
-            for values in (self.prior_mean(), parameters)
-            for conditions in [Conditions(values, health=trial.health[:1])]
+        at_mean = self._system_at(trial, self.prior_mean())
+        system = self._system_at(trial, parameters)
+        displacement_columns = self.fmu.displacement_columns
+        is_usable = (
+            at_mean is not None
+            and system is not None
+            and len(at_mean.push) == len(system.push)
+            and not system.jumps(
+                np.array(displacement_columns, dtype=np.int64), np.arange(len(displacement_columns))
+            )
         )
-        columns, numbers = np.array(fmu.x, dtype=np.int64), np.arange(len(fmu.x))
-        same = base and found and len(base.push) == len(found.push)
-        if not (base and found and same) or found.jumps(columns, numbers):
-            raise ModelError(said("models.unseen_ports", model=self))
-        found = found.in_state_of(base)
-        (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
-        rows, at_once = found.rows(*self._read(outputs))
-        return PortedSystem(found.generator, self.ports, found.push.T, position, speed, rows, at_once.T)
+        if at_mean is None or system is None or not is_usable:
+            raise ModelError(
+                f"The FMU model {self.name!r} does not tell by its answers to single forces how "
+                "its ports move; it is not linear, or they are too few or too rough, or speeds "
+                "jump with forces."
+            )
+        system = system.in_state_of(at_mean)
+        positions, _ = system.rows(displacement_columns, 0)
+        speeds, _ = system.rows(displacement_columns, 1)
+        columns = self._output_columns(outputs)
+        rows, direct = system.rows(columns.columns, columns.derivatives)
+        return PortedSystem(
+            generator=system.generator,
+            ports=self.ports,
+            actions=system.push.T,
+            positions=positions,
+            speeds=speeds,
+            outputs=rows,
+            through=direct.T,
+        )
+
+    def _system_at(self, trial: Trial, parameters: FloatArray) -> StateSpace | None:
+        """Return the linear system at values of the parameters; None if the FMU is not linear."""
+        conditions = Conditions(parameters, health=trial.health[:1])
+        state = self._state(trial, conditions, self.patch)
+        return self.fmu.system(self.fmu.excitation(trial, state, self.ports))
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        linear, x = self.patch.without(PortForce), self.fmu.x
-        return self._moving(trial, conditions, linear, x, [0] * len(self.fmu.x), parts)
+        without_laws = self.patch.without(PortForce)
+        return self._motion(trial, conditions, without_laws, self._port_columns(), parts)
 
-    # ------------------------------------------------------------ trials in its names and units
+    # ------------------------------------------------------------ trials in the FMU's terms
 
     def _laws(self, patch: ModelPatch) -> Laws:
+        """Return the laws of a patch at the ports."""
         return laws_of(patch.of(PortForce), self.ports)
 
-    def _load(self, patch: ModelPatch) -> LoadChange:
-        return LoadChange.of(item for item in patch if item.kind not in self.description.effects)
+    def _load_change(self, patch: ModelPatch) -> LoadChange:
+        """Return the change of loads by what the FMU does not carry itself."""
+        effects = self.description.effects
+        return LoadChange.of_patch(item for item in patch if item.kind not in effects)
 
-    def _case(self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: Laws) -> Case:
+    def _excitation(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: Laws
+    ) -> FmuExcitation:
         """Return what moves the FMU in a dynamic trial."""
-        fmu, state = self.fmu, self._state(trial, conditions, patch)
-        if trial.kind is not TrialKind.RINGDOWN:
-            acting = self._load(patch).changed(trial.force, trial.force)
-            case = fmu.case(trial, state, laws.ports, self._levers(trial, patch))
-            return case._replace(course=Course(trial.time, acting, trial.hold))
-        case = fmu.case(trial, state, laws.ports)
-        release = release_of(trial)
-        if not fmu.release:
-            raise ModelError(said("models.no_release", model=self))
-        first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
-        if release.at_rest:
-            return case._replace(starts={fmu.release[0]: release.displacement * float(1.0 + first_mode[0])})
-        if len(fmu.release) < 2:
-            raise ModelError(said("models.moving_release", trial=trial, model=self))
-        first = release.displacement * first_mode * (1.0, fmu.usual(trial)[0])
-        return case._replace(starts=dict(zip(fmu.release, first.tolist(), strict=True)))
+        state = self._state(trial, conditions, patch)
+        if trial.kind is TrialKind.RINGDOWN:
+            excitation = self.fmu.excitation(trial, state, laws.ports)
+            return excitation._replace(releases=release_amounts(self.fmu, trial, conditions))
+        levers = self._levers(trial, patch)
+        excitation = self.fmu.excitation(trial, state, laws.ports, levers)
+        force = self._load_change(patch).apply_to(trial.force, trial.force)
+        return excitation._replace(force=RecordedHistory(trial.time, force, trial.hold))
 
     def _levers(self, trial: Trial, patch: ModelPatch) -> dict[str, float]:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
-        inputs, load = self.description.inputs, self._load(patch)
-        if load.along_chord and inputs.torque is None:
-            raise ModelError(said("models.no_torque", model=self))
-        moments = ((inputs.bending_moment, load.along_span), (inputs.torque, load.along_chord))
-        place = place_among([*self._forces], trial.load_place, self.what, f"the trial {trial.name!r}")
-        levers = {self.names.variable(name): lever for name, lever in moments if name is not None and lever}
-        return {self._forces[place]: 1.0} | levers
+        inputs = self.description.inputs
+        change = self._load_change(patch)
+        if change.along_chord and inputs.torque is None:
+            raise ModelError(
+                f"The FMU model {self.name!r} names no torque in [inputs], so no load moves along "
+                "the chord."
+            )
+        where = f"the trial {trial.name!r}"
+        place = choose_load_place([*self._force_inputs], trial.load_place, self.what, where)
+        levers = {self._force_inputs[place]: 1.0}
+        if inputs.bending_moment is not None and change.along_span:
+            levers[self.names.variable(inputs.bending_moment)] = change.along_span
+        if inputs.torque is not None and change.along_chord:
+            levers[self.names.variable(inputs.torque)] = change.along_chord
+        return levers
 
     def _state(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH, row: int = 0
     ) -> State:
-        """Return parameters and constant inputs of a row of a trial, with what the FMU carries of a patch."""
-        names, wanted, effects = self.names, self.description.inputs, self.description.effects
+        """Return parameters and constant inputs of a row of a trial, with effects of a patch.
+
+        Parameters
+        ----------
+        trial : Trial
+            Any trial.
+        conditions : Conditions
+            Parameters and health.
+        patch : ModelPatch
+            Primitives, of which the FMU may carry some itself.
+        row : int
+            Row of a trial at rest; a dynamic trial is in the state of its first sample.
+        """
+        names = self.names
+        # inputs
+        sections = self.description.inputs
         losses = self.losses(trial, conditions.health)
-        health = zip(wanted.regions.values(), losses[min(row, len(losses) - 1)], strict=True)
-        inputs = {names.variable(name): value for name, value in health}
-        if wanted.temperature is not None:
-            warm = float(trial.temperature[0 if trial.is_dynamic else row])
-            inputs[names.variable(wanted.temperature)] = (wanted.temperature_reference or 0.0) + warm
+        row_losses = losses[min(row, len(losses) - 1)]
+        inputs: dict[str, float] = {}
+        for name, loss in zip(sections.regions.values(), row_losses, strict=True):
+            inputs[names.variable(name)] = loss
+        if sections.temperature is not None:
+            rise = float(trial.temperature[0 if trial.is_dynamic else row])
+            reference = sections.temperature_reference or 0.0
+            inputs[names.variable(sections.temperature)] = reference + rise
+        # parameters
         table = self.description.motion if trial.is_dynamic else self.description.static
         parameters = {names.parameter(name): value for name, value in table.parameters.items()}
-        parameters |= dict(zip(self._keys, conditions.parameters.tolist(), strict=True))
-        for item in (item for item in patch if item.kind in effects):
-            effect = f"effect.{effects[item.kind]}"
-            if f"{effect}.active" in parameters:
-                raise ModelError(f"Of the two primitives {item.kind!r} {self.what} carries one ({effect}).")
-            values = {"active": 1.0, **item.to_mapping()}
-            parameters |= {f"{effect}.{key}": float(value) for key, value in values.items() if key != "kind"}
+        values = conditions.parameters.tolist()
+        parameters |= dict(zip(self._parameter_keys, values, strict=True))
+        parameters |= effect_parameters(patch, self.description.effects, parameters, self.what)
         return State((), tuple(sorted(inputs.items()))).having(parameters)
-
-
-def _any_trial(kind: TrialKind, interval: float) -> Trial:
-    """Return a trial that asks for nothing, for scales without a campaign."""
-    return Trial.plain("", kind, (), interval * np.arange(1.0 if kind is TrialKind.STATIC else 400.0))

@@ -19,9 +19,9 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
-from discrepancy.system.excitation import divided
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.sensing import in_own_clock
+from discrepancy.system.time_history import subdivide
 from fe.runtime.patch import ModelPatch
 
 from .kalman import driven
@@ -162,7 +162,7 @@ class SeenTrial:
     @cached_property
     def fine_time(self) -> FloatArray:
         """Fine stamps (F,) [s]."""
-        return divided(self.time, self.parts)
+        return subdivide(self.time, self.parts)
 
     def port_motion(self, unknowns: FloatArray, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (F, P) of the ports.

@@ -1,4 +1,4 @@
-"""What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
+"""What the workflow asks of a model: its response under a patch, before any sensor acts on it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -11,17 +11,17 @@ import numpy as np
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
-from discrepancy.errors import ModelError, said
+from discrepancy.errors import ModelError
 from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
 from reporting.memory import ResultCache
-from reporting.words import brief, capital, counted
+from reporting.words import brief, capital, comma_list, counted
 
-KEPT = 400
-"""Responses that a model keeps; the oldest goes first."""
+MOST_RESPONSES = 400
+"""Number of responses that a model keeps; the oldest goes first."""
 NO_PATCH = ModelPatch()
 
 
@@ -31,7 +31,7 @@ class Model(ABC):
     Attributes
     ----------
     name : str
-        For people.
+        Name for people.
     parameters : tuple of ParameterPrior
         Calibrated parameters: the posterior of a calibration is the prior here.
     quantities : mapping of str to Quantity
@@ -43,23 +43,23 @@ class Model(ABC):
     stations : tuple of float, optional
         Least and largest station [m] along the structure, if it has a length.
     patch : ModelPatch
-        What is added to every question: a known addition, or an effect that was found.
+        Primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
         Damage regions.
     kinds : frozenset of TrialKind
-        Trials that it can follow.
+        Kinds of trials that it can follow.
     load_places : tuple of str, optional
-        Where forces can act, by name; None: anywhere along it.
+        Names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
-        Force there that it takes with ease [N].
+        Force that it takes there with ease [N].
     holds_inputs : bool
         Whether static trials can hold other inputs than a force.
     follows_windows : bool
         Whether it can follow laws that act in windows only.
     linear : bool
-        Whether its own laws at ports are left out.
+        Whether the laws that it has at ports are left out.
     shows_ports : bool
-        Whether it tells how its ports move (`ported` and `port_motion`).
+        Whether it can say how its ports move (`ported` and `port_motion`).
     """
 
     name: str
@@ -77,8 +77,8 @@ class Model(ABC):
     follows_windows: ClassVar[bool] = False
     shows_ports: ClassVar[bool] = True
     linear: bool = False
-    _declared: tuple[ParameterPrior, ...] | None = None
-    _kept: ResultCache | None = None
+    _unpatched_parameters: tuple[ParameterPrior, ...] | None = None
+    _responses: ResultCache | None = None
 
     def __repr__(self) -> str:
         parameters = [parameter.name for parameter in self.parameters]
@@ -86,42 +86,68 @@ class Model(ABC):
 
     @property
     def what(self) -> str:
-        """What it is called in a sentence."""
+        """The model as it is called in a sentence."""
         return f"the model {self.name!r}"
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""
         return self.quantities.get(output)
 
-    @abstractmethod
-    def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the model can carry a primitive; sensors are not asked for: they need no model."""
-
     @property
     def shown_outputs(self) -> tuple[str, ...]:
-        """Its outputs, for a sentence."""
+        """The outputs as they are listed in a sentence."""
         return tuple(f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
+
+    # ------------------------------------------------------------ what each kind of model defines
+
+    @abstractmethod
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Return whether the model can carry a primitive; sensors need no model."""
 
     @abstractmethod
     def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign, without what is added."""
+        """Return the natural scales under a campaign, without the model's patch."""
 
     @abstractmethod
-    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return what `respond` does, of a patch that holds what is added; outputs and patch are checked."""
+    def _respond(
+        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
+    ) -> Response:
+        """Return the response of a trial, given checked outputs and the whole patch.
+
+        Parameters
+        ----------
+        trial : Trial
+            Inputs and sample times.
+        outputs : tuple of (str, Quantity)
+            Outputs that the model has, and the quantity wanted of each.
+        patch : ModelPatch
+            All primitives that act, those of the model too.
+        conditions : Conditions
+            Parameters, initial state, clock and health.
+        """
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
-        """Return natural sizes (L,) of the state at the begin of a trial; empty: it is never unknown."""
+        """Return natural sizes (L,) of the state at the begin of a trial; empty if it is known."""
         return np.zeros(0)
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds of the ports without laws, (N, P) at so many times as dense samples."""
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws.
+
+        Parameters
+        ----------
+        trial : Trial
+            A dynamic trial.
+        conditions : Conditions
+            What the motion depends on besides.
+        parts : int
+            Samples are this many times as dense as those of the trial.
+        """
         raise NotImplementedError
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return what `ported` does."""
+        """Return the system by which outputs see missing forces; outputs are checked."""
         raise NotImplementedError
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
@@ -129,141 +155,258 @@ class Model(ABC):
         return forces
 
     def port_units(self, port: str) -> tuple[str, str]:
-        """Return the units of a force at a port and of what it acts on, `EITHER` if it does not say."""
+        """Return the units of force and motion at a port; `EITHER` if they are not known."""
         return EITHER
 
-    def check(self, trial: Trial) -> None:
-        """Refuse a trial that it cannot follow."""
-        for kind, why in ((TrialKind.FLIGHT, "models.flight"), (TrialKind.RINGDOWN, "models.free_ringdown")):
-            if trial.kind is kind and kind not in self.kinds:
-                raise ModelError(said(why, trial=trial, model=self))
-        driven = trial.kind is TrialKind.DRIVEN
-        if TrialKind.DRIVEN not in self.kinds and (driven or trial.begins is not Start.SETTLED):
-            how = "is driven" if driven else f"begins {trial.begins.value}"
-            raise ModelError(said("models.driven", trial=trial, how=how, model=self))
-        if trial.kind is TrialKind.STATIC and trial.inputs and not self.holds_inputs:
-            names = ", ".join(map(repr, trial.input_names))
-            raise ModelError(said("models.static_inputs", trial=trial, names=names, model=self))
-
-    def check_outputs(self, outputs: Outputs) -> None:
-        """Refuse outputs that it does not have, or that no channel can measure so."""
-        for output, quantity in outputs:
-            own = self.output_quantity(output)
-            if own is None:
-                known = ", ".join(self.shown_outputs)
-                raise ModelError(f"{capital(self.what)} has no output {output!r}; it has {known}.")
-            if not quantity.shows(own):
-                raise ModelError(said("models.measured", output=output, model=self, own=own, by=quantity))
-
-    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
-        """Return the losses of its regions in each row from those (N, K) that a trial names.
-
-        Raises `ModelError` if one is of a region that it does not have.
-        """
-        losses = np.zeros((len(health), len(self.regions)))
-        for name, column in zip(trial.regions, health.T, strict=False):
-            if name in self.regions:
-                losses[:, self.regions.index(name)] = column
-            elif np.any(column):
-                raise ModelError(said("models.no_region", trial=trial, name=name, model=self))
-        return [tuple(row) for row in losses.tolist()]
+    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+        """Return the laws that the model itself has at ports."""
+        return NO_PATCH
 
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
         return True
 
-    @property
-    def sensors(self) -> ModelPatch:
-        """Sensors that are built in, for channels or for outputs of those names.
+    # ------------------------------------------------------------ checks
 
-        They are no part of its responses: `discrepancy.system.sensing.observe` applies them, since what
-        sensors show of a response depends on all of them together.
+    def check(self, trial: Trial) -> None:
+        """Refuse a trial that the model cannot follow.
+
+        Raises
+        ------
+        ModelError
+            If the model cannot follow trials of that kind, begin as the trial does, or hold its
+            inputs.
         """
-        return self.patch.of(*SENSORS)
+        if trial.kind is TrialKind.FLIGHT and TrialKind.FLIGHT not in self.kinds:
+            raise ModelError(
+                f"The trial {trial.name!r} is a flight, but {self.what} has no input load_factor: "
+                "give it one."
+            )
+        if trial.kind is TrialKind.RINGDOWN and TrialKind.RINGDOWN not in self.kinds:
+            raise ModelError(
+                f"The trial {trial.name!r} is a ring-down, which {self.what} cannot begin, since "
+                'it is free, driven or has states; say kind = "driven" and begins = "unknown".'
+            )
+        is_driven = trial.kind is TrialKind.DRIVEN
+        if TrialKind.DRIVEN not in self.kinds and (is_driven or trial.begins is not Start.SETTLED):
+            how = "is driven" if is_driven else f"begins {trial.begins.value}"
+            raise ModelError(
+                f"The trial {trial.name!r} {how}, which {self.what} cannot follow: describe the "
+                "rig as a lumped model, or record it forced from rest."
+            )
+        if trial.kind is TrialKind.STATIC and trial.inputs and not self.holds_inputs:
+            inputs = ", ".join(map(repr, trial.input_names))
+            raise ModelError(
+                f"The trial {trial.name!r} is static under the inputs {inputs}, which {self.what} "
+                "does not have at rest: describe the asset as an FMU model with [[input]], or "
+                'record the trial as "driven".'
+            )
 
-    def stated(self, campaign: Campaign) -> list[tuple[float, float]]:
-        """Return mean and deviation of each parameter, those of a campaign where it says them."""
-        return [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in self.parameters]
+    def check_outputs(self, outputs: Outputs) -> None:
+        """Refuse outputs that the model does not have, or that no channel can measure so."""
+        for output, measured in outputs:
+            quantity = self.output_quantity(output)
+            if quantity is None:
+                raise ModelError(
+                    f"{capital(self.what)} has no output {output!r}; it has "
+                    f"{', '.join(self.shown_outputs)}."
+                )
+            if not measured.shows(quantity):
+                raise ModelError(
+                    f"The output {output!r} of {self.what} is a {quantity.value}, but a channel "
+                    f"measures {measured.value}."
+                )
 
-    def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
-        """Return the means (P,) of what is `declared`, those of a campaign where it says them."""
-        known = {} if campaign is None else campaign.parameters
-        return np.array([known.get(item.name, (item.mean, 0.0))[0] for item in self.declared])
+    def _check_primitives(self, patch: ModelPatch) -> None:
+        """Refuse a patch with a primitive that the model cannot carry."""
+        for primitive in patch:
+            if isinstance(primitive, SENSORS) or self.supports(type(primitive)):
+                continue
+            lacks_port = isinstance(primitive, INTERNAL_FORCES) and not self.ports
+            reason = " (it has no port)" if lacks_port else ""
+            raise ModelError(
+                f"{capital(self.what)} cannot carry the primitive {primitive.kind!r}{reason}."
+            )
+
+    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+        """Return the losses of the model's regions in each row.
+
+        Parameters
+        ----------
+        trial : Trial
+            Trial that names regions.
+        health : (N, K) array
+            Losses of these regions.
+
+        Raises
+        ------
+        ModelError
+            If a loss that is not zero is of a region that the model does not have.
+        """
+        losses = np.zeros((len(health), len(self.regions)))
+        for name, column in zip(trial.regions, health.T, strict=False):
+            if name in self.regions:
+                losses[:, self.regions.index(name)] = column
+            elif np.any(column):
+                raise ModelError(
+                    f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
+                    f"{self.what} has {comma_list(self.regions)}."
+                )
+        return [tuple(row) for row in losses.tolist()]
+
+    # ------------------------------------------------------------ parameters
 
     @property
     def declared(self) -> tuple[ParameterPrior, ...]:
         """Calibrated parameters as they are without what is added."""
-        return self.parameters if self._declared is None else self._declared
+        if self._unpatched_parameters is None:
+            return self.parameters
+        return self._unpatched_parameters
 
-    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial without sensors; those in `patch` are ignored here.
+    def stated(self, campaign: Campaign) -> list[tuple[float, float]]:
+        """Return mean and standard deviation of each parameter, of the campaign or the model."""
+        of_campaign = campaign.parameters
+        return [of_campaign.get(item.name, (item.mean, item.deviation)) for item in self.parameters]
 
-        Velocity and acceleration are derivatives of displacement, and a signal is the output itself. Raises
-        `ModelError` if the model lacks an output or cannot carry a primitive.
+    def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
+        """Return the means (P,) of the declared parameters: of the campaign, else of the model."""
+        means = [parameter.mean for parameter in self.declared]
+        if campaign is not None:
+            for index, parameter in enumerate(self.declared):
+                if parameter.name in campaign.parameters:
+                    means[index] = campaign.parameters[parameter.name][0]
+        return np.array(means)
+
+    # ------------------------------------------------------------ response
+
+    @property
+    def sensors(self) -> ModelPatch:
+        """Sensors that are built in, for channels or for outputs of those names.
+
+        They are no part of the model's responses: `discrepancy.system.sensing.observe` applies
+        them, since what sensors show of a response depends on all of them together.
         """
+        return self.patch.of(*SENSORS)
 
-        def answer() -> tuple[Trial, Response]:  # the trial lives as long, so that its id stays its own
-            count = len(self.parameters)
-            if conditions.parameters.shape != (count,):
-                came, has = conditions.parameters.size, counted(count, "parameter")
-                raise ModelError(f"{capital(self.what)} has {has}, but {came} came.")
-            whole = (self.patch + patch).in_trial(trial.name)
-            self.check(trial)
-            self.check_outputs(outputs)
-            for item in whole:
-                if not (isinstance(item, SENSORS) or self.supports(type(item))):
-                    portless = isinstance(item, INTERNAL_FORCES) and not self.ports
-                    port = " (it has no port)" if portless else ""
-                    raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
-            with ModelError.instead_of(FiniteElementError):
-                return trial, self._respond(trial, outputs, whole, conditions)
+    def respond(
+        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
+    ) -> Response:
+        """Return the response of a trial without sensors; those in the patch are ignored here.
 
-        if self._kept is None:
-            return answer()[1]
+        Velocity and acceleration are derivatives of displacement, and a signal is the output
+        itself.
+
+        Parameters
+        ----------
+        trial : Trial
+            Inputs and sample times.
+        outputs : tuple of (str, Quantity)
+            Outputs, and the quantity wanted of each.
+        patch : ModelPatch
+            Primitives beside those of the model.
+        conditions : Conditions
+            Parameters, initial state, clock and health.
+
+        Raises
+        ------
+        ModelError
+            If the model lacks an output, cannot follow the trial or cannot carry a primitive.
+        """
+        if self._responses is None:
+            return self._checked_response(trial, outputs, patch, conditions)
+        # the trial is kept with its response, so that no other one gets its id
         key = (id(trial), outputs, patch.primitives, conditions.key)
-        return self._kept.get(key, answer)[1]
+        _, response = self._responses.get(
+            key, lambda: (trial, self._checked_response(trial, outputs, patch, conditions))
+        )
+        return response
+
+    def _checked_response(
+        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
+    ) -> Response:
+        """Return the response of a trial after all checks; see `respond`."""
+        count = len(self.parameters)
+        if conditions.parameters.shape != (count,):
+            raise ModelError(
+                f"{capital(self.what)} has {counted(count, 'parameter')}, but "
+                f"{conditions.parameters.size} came."
+            )
+        whole_patch = (self.patch + patch).in_trial(trial.name)
+        self.check(trial)
+        self.check_outputs(outputs)
+        self._check_primitives(whole_patch)
+        with ModelError.instead_of(FiniteElementError):
+            return self._respond(trial, outputs, whole_patch, conditions)
 
     def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces, see `PortedSystem`.
+        """Return the system by which outputs see missing forces; see `PortedSystem`.
 
-        Raises `ModelError` if sensors are built in: what they make of a missing force is not known here.
+        Parameters
+        ----------
+        trial : Trial
+            A dynamic trial.
+        outputs : tuple of (str, Quantity)
+            Outputs, and the quantity wanted of each.
+        parameters : (P,) array
+            Values of the model's parameters.
+
+        Raises
+        ------
+        ModelError
+            If sensors are built in: what they make of a missing force is not known here.
         """
         self.check_outputs(outputs)
         if len(self.sensors):
-            raise ModelError(f"{self.name} has sensors built in, which hide a missing force; leave them out.")
+            raise ModelError(
+                f"{self.name} has sensors built in, which hide a missing force; leave them out."
+            )
         return self._ported(trial, outputs, parameters)
 
+    # ------------------------------------------------------------ the model with changes
+
     def remembering(self) -> Self:
-        """Return the model as one that keeps responses: sensors are tried by the dozen on one motion."""
-        return self if self._kept is not None else self._changed(_kept=ResultCache(KEPT))
+        """Return the model as one that keeps responses: many sensors are tried on one motion."""
+        if self._responses is not None:
+            return self
+        return self._copy_with(_responses=ResultCache(MOST_RESPONSES))
 
     def patched(
-        self, patch: ModelPatch, calibrated: Mapping[str, tuple[float, float]] = MappingProxyType({})
+        self,
+        patch: ModelPatch,
+        calibrated: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     ) -> Self:
-        """Return the model with a patch added to every question.
+        """Return the model with a patch that acts in every response.
 
-        Its sensors name channels of a campaign, or outputs of the model, and come before those of a question.
-        `calibrated` has means and standard deviations of parameters, where they are not those of the model.
+        Parameters
+        ----------
+        patch : ModelPatch
+            Its sensors name channels of a campaign, or outputs of the model; they come before those
+            of a response's patch.
+        calibrated : mapping of str to (float, float)
+            Means and standard deviations of parameters, where they are not those of the model.
         """
-        told = tuple(
-            replace(item, mean=mean, deviation=deviation)
-            for item in self.parameters
-            for mean, deviation in [calibrated.get(item.name, (item.mean, item.deviation))]
+        parameters = []
+        for parameter in self.parameters:
+            mean, deviation = calibrated.get(parameter.name, (parameter.mean, parameter.deviation))
+            parameters.append(replace(parameter, mean=mean, deviation=deviation))
+        return self._copy_with(
+            patch=self.patch + patch,
+            parameters=tuple(parameters),
+            _unpatched_parameters=self.declared,
+            _responses=None,
         )
-        return self._changed(patch=self.patch + patch, parameters=told, _declared=self.declared, _kept=None)
-
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
-        """Return the laws of ports that it has as it is."""
-        return NO_PATCH
 
     def apart(self) -> tuple[Self, ModelPatch]:
-        """Return the model without laws at its ports, and these at the prior means."""
+        """Return the model without laws at its ports, and these laws at the prior means."""
         laws = self.own_laws(self.prior_mean()) + self.patch.of(PortForce)
-        return self._changed(patch=self.patch.without(PortForce), linear=True, _kept=None), laws
+        without_laws = self._copy_with(
+            patch=self.patch.without(PortForce), linear=True, _responses=None
+        )
+        return without_laws, laws
 
-    def _changed(self, **attributes: object) -> Self:
-        """Return the model with other attributes."""
-        found = copy(self)
-        vars(found).update(attributes)
-        return found
+    def _copy_with(self, **attributes: object) -> Self:
+        """Return a copy of the model with other attributes."""
+        model = copy(self)
+        vars(model).update(attributes)
+        return model

@@ -1,45 +1,96 @@
-"""A linear system with ports: M z'' + C z' + K z = loads, its modes and its rest; `motion` moves it.
+"""A linear system with ports, M z'' + C z' + K z = loads: its modes and its rest.
 
-Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u' + H u + d(t): a state is the
-speed of a coordinate that has no stiffness, x = s', so that both are one equation in z = (u, s).
-A motion that is prescribed takes its direction out of u; what is left moves in its modes. For the laws at
-ports the prescribed motion is a coordinate of its own, so heavy that they do not move it (`HEAVY`), and it is
-put right at every step. The wing, a structure on springs and a lumped rig are such systems.
+Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u' + H u + d(t): a
+state is the speed of a coordinate that has no stiffness, x = s', so that both are one equation in z
+= (u, s). A prescribed motion (a drive) takes its direction out of u; what remains moves in its
+modes. For the laws at ports the drive is a coordinate of its own, so heavy that the laws do not
+move it (`HEAVY`), and it is corrected at every step. The wing, a structure on springs and a lumped
+rig are such systems.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.linalg import eigh, null_space
-
-from discrepancy.campaign.records import FloatArray
-from discrepancy.errors import ModelError, said
-from discrepancy.system.excitation import Acting, Shown, by_order
-from discrepancy.system.response import PortedSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
-from fe.runtime.patched_wing import PatchedState
-from fe.runtime.reduced import ReducedState
+from scipy.linalg import eigh, null_space
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.errors import ModelError
+from discrepancy.system.excitation import Excitation
 
 HEAVY = 1e12
-"""Mass of a prescribed coordinate over the largest of the system."""
+"""Mass of a prescribed coordinate over the largest mass of the system."""
 LEAST_PIVOT = 1e-9
-"""A system whose equilibrium is determined worse than this has none of its own."""
+"""A system whose equilibrium is determined worse than this has none."""
 ROUNDING = 1e-10
-"""Share of the largest entry below which what couples modes is rounding."""
+"""Share of the largest entry below which the coupling of modes is rounding."""
 
 
-Modes = tuple[FloatArray, FloatArray, int]
-"""Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
+class Modes(NamedTuple):
+    """Modes of a system; coordinates of states come after those of displacements.
+
+    Attributes
+    ----------
+    angular_frequency : (M,) ndarray
+        Angular frequencies [rad/s], rising; zero for rigid motions and states.
+    shapes : (N, M) ndarray
+        Mass-normalised shapes.
+    displacement_count : int
+        Number of the coordinates that are displacements.
+    """
+
+    angular_frequency: FloatArray
+    shapes: FloatArray
+    displacement_count: int
+
+
+class ModalFrequencies(Protocol):
+    """Modes of a structure, as far as their frequencies are asked for."""
+
+    @property
+    def frequency(self) -> FloatArray:
+        """Frequencies (M,) [Hz]."""
+
+
+class SolvedStructure(Protocol):
+    """A structure that knows its modes and its flexibility: a reduced or a patched one."""
+
+    @property
+    def modes(self) -> ModalFrequencies:
+        """Modes with inertia."""
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Mass-normalised shapes (n, M) of these modes."""
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, for loads (n,) or (n, k)."""
+
+
+class StaticPath(NamedTuple):
+    """Rest under load levels that follow one another.
+
+    Attributes
+    ----------
+    values : (L, N) or (L, C) ndarray
+        Displacements and states, or what rows show of them, at each level.
+    memory : ndarray, optional
+        Memory of the laws at the last level; None without laws.
+    """
+
+    values: FloatArray
+    memory: FloatArray | None
 
 
 def _differs(matrix: FloatArray, other: FloatArray) -> bool:
-    """Whether two matrices differ by more than rounding."""
-    size = np.abs(matrix).max(initial=1e-300)
-    return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * size)
+    """Return whether two matrices differ by more than rounding."""
+    largest = np.abs(matrix).max(initial=1e-300)
+    return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,25 +100,28 @@ class LinearSystem:
     Attributes
     ----------
     mass, damping, stiffness : (N, N) ndarray
-        Of (u, s): diag(M, T), [[C, -F], [-G, R]], [[K, 0], [-H, 0]].
+        Matrices of (u, s): diag(M, T), [[C, -F], [-G, R]], [[K, 0], [-H, 0]].
     ports : mapping of str to (N,) ndarray
-        Rows of the ports where internal forces act: a displacement [m] or rotation [rad] is row . u, or a
-        state row . x.
+        Rows of the ports where internal forces act: a displacement [m] or rotation [rad] is row .
+        u, or a state is row . x.
     mode_count : int or None
-        Modes that move of a structure that springs hold, with mass and stiffness positive definite; the
-        others follow without inertia. None: all, and nothing need hold it.
+        For a structure that springs hold, with positive definite mass and stiffness: the number of
+        modes that have inertia; the other modes follow without it. None: all modes have inertia,
+        and nothing need hold the system.
     relaxation : float
-        Factor of the part of the damping that goes with the stiffness, for the modes without inertia [s].
+        Factor of the part of the damping that is proportional to the stiffness, for the modes
+        without inertia [s].
     on_modes : frozenset of str
-        Ports whose position is that of the modes that move alone.
-    states : int
-        N - n.
+        Ports whose position is that of the modes with inertia alone.
+    state_count : int
+        Number of states, N - n.
     drives : (P, N) ndarray
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
-        Rows along which laws at all ports act, where that is not how they see.
-    solved : ReducedState or PatchedState, optional
-        The structure that it is, which knows its modes and K^-1.
+        Directions in which laws at ports act, for all ports; empty if they are the rows of the
+        ports.
+    solved : SolvedStructure, optional
+        The structure with its modes and K^-1, if they are known.
     """
 
     mass: FloatArray
@@ -77,148 +131,204 @@ class LinearSystem:
     mode_count: int | None = None
     relaxation: float = 0.0
     on_modes: frozenset[str] = frozenset()
-    states: int = 0
+    state_count: int = 0
     drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     actions: Mapping[str, FloatArray] = field(default_factory=dict)
-    solved: ReducedState | PatchedState | None = None
+    solved: SolvedStructure | None = None
 
     @property
-    def displacements(self) -> int:
-        """Displacements n."""
-        return len(self.mass) - self.states
+    def size(self) -> int:
+        """Number N of unknowns."""
+        return len(self.mass)
+
+    @property
+    def displacement_count(self) -> int:
+        """Number n of displacements."""
+        return self.size - self.state_count
+
+    @property
+    def law_directions(self) -> Mapping[str, FloatArray]:
+        """Directions (N,) in which laws act, by port."""
+        return self.actions or self.ports
 
     # ------------------------------------------------------------ modes
 
     @cached_property
-    def lift(self) -> FloatArray:
-        """Displacements (N, P) by unit motions of the drives."""
-        found = np.zeros((len(self.mass), len(self.drives)))
+    def drive_shapes(self) -> FloatArray:
+        """Displacements (N, P) under a unit motion of each drive."""
+        shapes = np.zeros((self.size, len(self.drives)))
         if len(self.drives):
-            found[: self.displacements] = np.linalg.pinv(self.drives[:, : self.displacements])
-        return found
+            n = self.displacement_count
+            shapes[:n] = np.linalg.pinv(self.drives[:, :n])
+        return shapes
 
     @cached_property
     def modes(self) -> Modes:
-        """Its modes."""
+        """Modes of what no drive prescribes."""
         if self.solved is not None:
             frequency = 2.0 * np.pi * self.solved.modes.frequency
-            return frequency, np.ascontiguousarray(self.solved.shapes), len(frequency)
-        n, most = self.displacements, self.mode_count
-        mass, stiffness = self.mass[:n, :n], 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
+            return Modes(frequency, np.ascontiguousarray(self.solved.shapes), len(frequency))
+        squares, displacement_shapes = self._displacement_modes()
+        n = self.displacement_count
+        count = len(squares)
+        shapes = np.zeros((self.size, count + self.state_count))
+        shapes[:n, :count] = displacement_shapes
+        if self.state_count:
+            capacity, axes = np.linalg.eigh(self.mass[n:, n:])
+            shapes[n:, count:] = axes / np.sqrt(capacity)
+        frequency = np.sqrt(np.maximum(squares, 0.0))
+        return Modes(np.concatenate((frequency, np.zeros(self.state_count))), shapes, count)
+
+    def _displacement_modes(self) -> tuple[FloatArray, FloatArray]:
+        """Return squared angular frequencies (K,) [1/s^2] and shapes (n, K) of displacements."""
+        n = self.displacement_count
+        mass = self.mass[:n, :n]
+        stiffness = 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
+        # motions that the drives leave free
         free = np.eye(n)
         if len(self.drives):
             free = null_space(self.drives[:, :n])
-            mass, stiffness = free.T @ mass @ free, free.T @ stiffness @ free
-        square, shapes = np.zeros(0), np.zeros((0, 0))
+            mass = free.T @ mass @ free
+            stiffness = free.T @ stiffness @ free
+        # eigenvalue problem
+        squares = np.zeros(0)
+        shapes = np.zeros((0, 0))
         if len(mass):
-            chosen = [0, most - 1] if most and most < len(mass) else None
+            subset = None
+            if self.mode_count and self.mode_count < len(mass):
+                subset = [0, self.mode_count - 1]
             try:
-                square, shapes = eigh(stiffness, mass, subset_by_index=chosen)
+                squares, shapes = eigh(stiffness, mass, subset_by_index=subset)
             except np.linalg.LinAlgError as cause:
                 raise ModelError(f"The mass matrix must be positive definite ({cause}).") from cause
-        if most is None:
-            square = np.where(np.abs(square) <= ROUNDING * np.max(np.abs(square), initial=0.0), 0.0, square)
-        elif square[0] <= 0.0:
-            raise ModelError(said("models.indefinite", least=square[0]))
-        moving = len(square)
-        found = np.zeros((len(self.mass), moving + self.states))
-        found[:n, :moving] = free @ shapes
-        if self.states:
-            capacity, axes = np.linalg.eigh(self.mass[n:, n:])
-            found[n:, moving:] = axes / np.sqrt(capacity)
-        none = np.zeros(self.states)
-        return np.concatenate((np.sqrt(np.maximum(square, 0.0)), none)), found, moving
+        # rigid motions, or none
+        if self.mode_count is None:
+            is_rounding = np.abs(squares) <= ROUNDING * np.max(np.abs(squares), initial=0.0)
+            squares = np.where(is_rounding, 0.0, squares)
+        elif squares[0] <= 0.0:
+            raise ModelError(
+                f"The stiffness must be positive definite, but an eigenvalue is {squares[0]:g} "
+                "1/s^2."
+            )
+        return squares, free @ shapes
 
     @property
     def angular_frequency(self) -> FloatArray:
-        """Angular frequencies (M,) [rad/s] of what is free, rising; zero for rigid motions and states."""
-        return self.modes[0]
+        """Angular frequencies (M,) [rad/s], rising; zero for rigid motions and states."""
+        return self.modes.angular_frequency
 
     @property
     def shapes(self) -> FloatArray:
-        """Mass-normalised shapes (N, M) of what is free."""
-        return self.modes[1]
+        """Mass-normalised shapes (N, M) of the modes."""
+        return self.modes.shapes
 
     @property
-    def moving(self) -> int:
-        """How many of the coordinates are displacements; the others are states."""
-        return self.modes[2]
+    def displacement_modes(self) -> int:
+        """Number of the modes that are of displacements; the others are states."""
+        return self.modes.displacement_count
 
     @property
-    def truncated(self) -> bool:
-        """Whether modes are left out."""
-        return self.mode_count is not None and self.mode_count < len(self.mass)
+    def is_truncated(self) -> bool:
+        """Whether some modes have no inertia."""
+        return self.mode_count is not None and self.mode_count < self.size
 
     @cached_property
-    def heaviness(self) -> float:
-        """Square root of the mass of the drives."""
+    def root_drive_mass(self) -> float:
+        """Square root of the mass of the drives, which normalises their shapes."""
         return float(np.sqrt(HEAVY * np.max(np.abs(self.mass))))
 
     @cached_property
     def all_shapes(self) -> FloatArray:
-        """Shapes (N, M + P) of what is free and of the drives, mass-normalised."""
-        return np.hstack((self.shapes, self.lift / self.heaviness)) if len(self.drives) else self.shapes
+        """Mass-normalised shapes (N, M + P) of the modes and of the drives."""
+        if not len(self.drives):
+            return self.shapes
+        return np.hstack((self.shapes, self.drive_shapes / self.root_drive_mass))
 
     @cached_property
     def modal(self) -> ModalSystem:
-        """What is free and the drives, with ports; what couples modes by rounding only does not."""
-        count, drives = len(self.angular_frequency), len(self.drives)
-        frequency, shapes = np.pad(self.angular_frequency, (0, drives)), self.all_shapes
-        damping, stiffness = (shapes.T @ matrix @ shapes for matrix in (self.damping, self.stiffness))
-        damping[count:] = stiffness[count:] = 0.0  # nothing moves a drive
+        """Modes and drives as a modal system with ports; coupling that is rounding is left out."""
+        mode_count = len(self.angular_frequency)
+        drive_count = len(self.drives)
+        frequency = np.pad(self.angular_frequency, (0, drive_count))
+        shapes = self.all_shapes
+        damping = shapes.T @ self.damping @ shapes
+        stiffness = shapes.T @ self.stiffness @ shapes
+        # nothing moves a drive
+        damping[mode_count:] = 0.0
+        stiffness[mode_count:] = 0.0
+        # a diagonal where the modes are coupled by rounding only
         diagonal = np.diag(np.diag(damping))
-        damping = damping if drives or _differs(damping, diagonal) else diagonal
-        loose = self.mode_count is None and (drives > 0 or _differs(stiffness, np.diag(frequency**2)))
-        ports, actions = (
-            {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
-            for rows in (self.ports, self.acts)
+        if not drive_count and not _differs(damping, diagonal):
+            damping = diagonal
+        is_coupled = drive_count > 0 or _differs(stiffness, np.diag(frequency**2))
+        return ModalSystem(
+            frequency,
+            damping,
+            {name: np.asarray(row @ shapes) for name, row in self.ports.items()},
+            self._port_residuals(),
+            self.relaxation,
+            stiffness if self.mode_count is None and is_coupled else None,
+            {name: np.asarray(row @ shapes) for name, row in self.law_directions.items()},
         )
-        whole, left_out = stiffness if loose else None, None
-        if self.truncated and ports:
-            rows = np.array(list(self.ports.values()))
-            left_out = np.einsum("pn,np->p", rows, self.residual(rows.T))
-            all_of_it = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
-            flexible = [name not in self.on_modes for name in ports]
-            left_out = np.where((left_out > 1e-9 * all_of_it) & flexible, left_out, 0.0)  # less is rounding
-        return ModalSystem(frequency, damping, ports, left_out, self.relaxation, whole, actions)
 
-    def forces(self, acting: Acting, time: FloatArray) -> FloatArray:
-        """Return the modal forces (T, M + P) by what acts at times, that on a drive by its acceleration."""
-        found = acting.load_at(time, self.all_shapes)
-        if acting.drives:
-            given, count = (
-                [drive.at(time, 2) for drive in acting.drives.values()],
-                len(self.angular_frequency),
-            )
-            found[:, :count] -= np.transpose(given) @ (self.lift.T @ self.mass @ self.shapes)
-            found[:, count:] = self.heaviness * np.transpose(given)
-        return found
+    def _port_residuals(self) -> FloatArray | None:
+        """Return the flexibility (P,) of the ports in modes without inertia, if there are any."""
+        if not self.is_truncated or not self.ports:
+            return None
+        rows = np.array(list(self.ports.values()))
+        residual = np.einsum("pn,np->p", rows, self.residual(rows.T))
+        whole = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
+        is_flexible = [name not in self.on_modes for name in self.ports]
+        is_above_rounding = residual > 1e-9 * whole
+        return np.where(is_above_rounding & is_flexible, residual, 0.0)
 
-    def port_rows(self, laws: Laws, time: float | None = None) -> FloatArray:
-        """Return the rows (J, N) of the laws' ports, see `Laws.rows`."""
-        return laws.rows(self.ports, len(self.mass), time)
+    def modal_forces(self, excitation: Excitation, time: FloatArray) -> FloatArray:
+        """Return modal forces (T, M + P) at times [s]; those of drives accelerate the drives."""
+        forces = excitation.loads_at(time, self.all_shapes)
+        if excitation.prescribed_motions:
+            motions = excitation.prescribed_motions.values()
+            accelerations = np.transpose([motion.values_at(time, 2) for motion in motions])
+            mode_count = len(self.angular_frequency)
+            inertia = self.drive_shapes.T @ self.mass @ self.shapes
+            forces[:, :mode_count] -= accelerations @ inertia
+            forces[:, mode_count:] = self.root_drive_mass * accelerations
+        return forces
+
+    def rows_of_laws(self, laws: Laws, time: float | None = None) -> FloatArray:
+        """Return the rows (J, N) of the laws' ports; see `Laws.rows`."""
+        return laws.rows(self.ports, self.size, time)
 
     # ------------------------------------------------------------ rest
 
     @cached_property
-    def _root(self) -> FloatArray:
+    def _inverse_cholesky(self) -> FloatArray:
         """L^-1 of the stiffness L L^T."""
         try:
             return np.linalg.inv(np.linalg.cholesky(self.stiffness))
         except np.linalg.LinAlgError as cause:
-            raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
+            raise ModelError(
+                f"The structure has no stiffness left in some direction ({cause})."
+            ) from cause
 
     def flexibility(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, (N,) or (N, k), where springs hold all; raises `ModelError` if they do not."""
+        """Return K^-1 loads, for loads (N,) or (N, k) on a structure that springs hold.
+
+        Raises
+        ------
+        ModelError
+            If the stiffness is not positive definite.
+        """
         if self.solved is not None:
             return self.solved.static(loads)
-        return np.asarray(self._root.T @ (self._root @ loads))
+        inverse = self._inverse_cholesky
+        return np.asarray(inverse.T @ (inverse @ loads))
 
     def residual(self, loads: FloatArray) -> FloatArray:
-        """Return what the modes leave out of K^-1 loads, for loads (N,) or (N, k)."""
-        return self.flexibility(loads) - (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
+        """Return the part of K^-1 loads, for loads (N,) or (N, k), in the modes without inertia."""
+        in_modes = (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
+        return self.flexibility(loads) - in_modes
 
-    def resting(self, loads: FloatArray) -> FloatArray:
+    def rest_under(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) at rest under loads (L, N).
 
         Raises
@@ -228,97 +338,99 @@ class LinearSystem:
         """
         if self.mode_count is not None:
             return self.flexibility(loads.T).T
-        free, moving, force = len(self.angular_frequency), self.moving, loads @ self.shapes
-        restoring = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
-        found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
-        left = np.max(np.abs(restoring @ found - force.T), initial=0.0)
-        if left > 1e-6 * np.max(np.abs(force), initial=1e-300):
-            raise ModelError(said("models.unheld", most=np.max(np.abs(restoring), initial=0.0)))
-        return np.asarray(found.T @ self.shapes.T)
+        # least squares, since rigid motions need not be held where no load is
+        mode_count = len(self.angular_frequency)
+        count = self.displacement_modes
+        modal_loads = loads @ self.shapes
+        restoring = np.hstack(
+            (
+                self.modal.whole[:mode_count, :count],
+                self.modal.damping[:mode_count, count:mode_count],
+            )
+        )
+        amplitudes = np.linalg.lstsq(restoring, modal_loads.T, rcond=LEAST_PIVOT)[0]
+        unbalanced = np.max(np.abs(restoring @ amplitudes - modal_loads.T), initial=0.0)
+        if unbalanced > 1e-6 * np.max(np.abs(modal_loads), initial=1e-300):
+            largest = np.max(np.abs(restoring), initial=0.0)
+            raise ModelError(
+                "the rig has no rest under what acts at the first sample (nothing holds it): "
+                'say `begins` = "still" or "unknown" '
+                f"(its largest restoring coefficient is {largest:.3g})"
+            )
+        return np.asarray(amplitudes.T @ self.shapes.T)
 
-    def static(
-        self, units: FloatArray, laws: Laws = NO_LAWS, amounts: FloatArray | None = None,
-        memory: FloatArray | None = None, before: FloatArray | None = None,
-        held: FloatArray | float = 0.0, fixed: FloatArray | None = None, seen: FloatArray | None = None,
+    def static_path(
+        self,
+        directions: FloatArray,
+        laws: Laws = NO_LAWS,
+        *,
+        levels: FloatArray | None = None,
+        memory: FloatArray | None = None,
+        previous_level: FloatArray | None = None,
+        offset: FloatArray | float = 0.0,
+        fixed_row: FloatArray | None = None,
+        output_rows: FloatArray | None = None,
         time: float | None = None,
-    ) -> tuple[FloatArray, FloatArray | None]:  # fmt: skip
-        """Return the rest (L, N) under load levels that follow one another from zero, and the laws' memory.
+    ) -> StaticPath:
+        """Return the rest under load levels that follow one another from zero.
 
         Parameters
         ----------
-        units : (k, N) ndarray
-            Loads.
+        directions : (k, N) array
+            Loads of a value of one.
         laws : Laws
-            Internal forces; ports of states are at no position. Without any there is no memory.
-        amounts : (L, k) ndarray, optional
-            How much of each acts at each level; by default they follow one another.
-        memory, before : ndarray, optional
-            Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
-        held : (N,) ndarray, optional
-            Where something holds the system.
-        fixed : (N,) ndarray, optional
+            Internal forces; ports of states are at no position.
+        levels : (L, k) array, optional
+            The value of each load at each level; by default each load is a level of its own.
+        memory, previous_level : arrays, optional
+            Memory of the laws, and the values (k,) from which the first level is reached; by
+            default the laws were never loaded.
+        offset : (N,) array, optional
+            Displacements at which drives hold the system.
+        fixed_row : (N,) array, optional
             Row of a point that laws do not move.
-        seen : (C, N) ndarray, optional
-            What these rows show (L, C) is returned instead.
+        output_rows : (C, N) array, optional
+            Rows whose values are returned instead of displacements and states.
         time : float, optional
-            Of laws in windows those act that do then [s].
+            Time [s] at which laws in windows act, or do not.
+
+        Returns
+        -------
+        StaticPath
 
         Raises
         ------
-        ModelError, SolutionError
-            If nothing holds the system, or a law takes more than it has.
+        ModelError
+            If nothing holds the system.
+        SolutionError
+            If a law takes more than the system has.
         """
-        rows, levels = self.port_rows(laws, time), np.eye(len(units)) if amounts is None else amounts
-        rows[:, self.displacements :] = 0.0
-        answers, flexible = self.resting(units) + held, self.resting(rows)
-        if fixed is not None:
-            own = self.resting(fixed[None])
-            flexible = flexible - np.outer(flexible @ fixed, own) / float(own[0] @ fixed)
-        at_ports, compliance = answers @ rows.T, rows @ flexible.T
-        if seen is not None:
-            answers, flexible = answers @ seen.T, flexible @ seen.T
+        rows = self.rows_of_laws(laws, time)
+        rows[:, self.displacement_count :] = 0.0
+        if levels is None:
+            levels = np.eye(len(directions))
+        # answers to unit loads and to unit forces of the laws
+        displacements = self.rest_under(directions) + offset
+        flexibility = self.rest_under(rows)
+        if fixed_row is not None:
+            at_point = self.rest_under(fixed_row[None])
+            flexibility = flexibility - np.outer(flexibility @ fixed_row, at_point) / float(
+                at_point[0] @ fixed_row
+            )
+        port_displacements = displacements @ rows.T
+        port_compliance = rows @ flexibility.T
+        if output_rows is not None:
+            displacements = displacements @ output_rows.T
+            flexibility = flexibility @ output_rows.T
         if not len(laws):
-            return levels @ answers, None
-        start = None if before is None else before @ at_ports
+            return StaticPath(levels @ displacements, None)
+        # the laws along the path
         solution = static_solution(
-            laws, levels @ at_ports, compliance, memory=memory, start=start, kernel=compiled_kernel()
+            laws,
+            levels @ port_displacements,
+            port_compliance,
+            memory=memory,
+            start=None if previous_level is None else previous_level @ port_displacements,
+            kernel=compiled_kernel(),
         )
-        return levels @ answers - solution.forces @ flexible, solution.memory
-
-    # ------------------------------------------------------------ what acts, and what is seen
-
-    @property
-    def acts(self) -> Mapping[str, FloatArray]:
-        """Rows along which laws at all ports act."""
-        return self.actions or self.ports
-
-    def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.
-
-        M q'' + D q' + K q = -sum_p acts_p g_p; of coordinates that are states only the speeds are kept.
-        """
-        ports, size = tuple(self.ports), len(self.mass)
-        sees, acts = (
-            np.array([rows[port] for port in ports]).reshape(len(ports), size)
-            for rows in (self.ports, self.acts)
-        )
-        force = np.zeros((len(ports), len(shown)))
-        for number, item in enumerate(shown):
-            if item.felt is not None:
-                force[:, number] = acts @ item.felt
-            elif self.truncated:
-                force[:, number] = -acts @ self.residual(item.rows[0])
-        mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
-        sees, acts = sees @ shapes, acts @ shapes
-        push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))
-        position, speed, acceleration, _ = by_order(shown, shapes)
-        count, moving, none = len(mass), self.moving, np.zeros((len(ports), len(mass)))
-        generator = np.zeros((moving + count, moving + count))
-        generator[:moving, moving : 2 * moving] = np.eye(moving)
-        generator[moving:, :moving] = -by_stiffness[:, :moving]
-        generator[moving:, moving:] = -by_damping
-        outputs = (position - acceleration @ by_stiffness)[:, :moving], speed - acceleration @ by_damping
-        return PortedSystem(
-            generator, ports, np.hstack((none[:, :moving], push.T)), np.hstack((sees[:, :moving], none)),
-            np.hstack((none[:, :moving], sees)), np.hstack(outputs), push.T @ acceleration.T - force,
-        )  # fmt: skip
+        return StaticPath(levels @ displacements - solution.forces @ flexibility, solution.memory)

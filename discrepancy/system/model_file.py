@@ -38,14 +38,17 @@ class ParameterSection(NamedSection):
     def faults(self) -> Iterator[Fault]:
         """Yield a mean out of its range."""
         where = f"low {self.low:g} and high {self.high:g}"
-        yield not self.low <= self.mean <= self.high, f"the mean {self.mean:g} is not between {where}"
+        yield (
+            not self.low <= self.mean <= self.high,
+            f"the mean {self.mean:g} is not between {where}",
+        )
 
 
 class ModelDescription(Section):
-    """What every description of a model has: version of the format, name for people, parameters, ports."""
+    """What every model file has: version of the format, name for people, parameters and ports."""
 
     what: ClassVar[str]
-    """What it is, with its article, for sentences."""
+    """The model with its article, for sentences."""
     format: Literal[1]
     name: Name
     parameter: tuple[ParameterSection, ...] = ()
@@ -64,17 +67,19 @@ class ModelDescription(Section):
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
-        """Read a file; raises `ModelError` if it is not there, not TOML, or its content is no such model."""
-        return cls.parse(read_toml(path, ModelError, what=cls.what.partition(" ")[2]), str(path))
+        """Read a file; raises `ModelError` if it is missing, not TOML, or not such a model."""
+        _, _, noun = cls.what.partition(" ")
+        return cls.parse(read_toml(path, ModelError, what=noun), str(path))
 
     @staticmethod
     def repeated(kind: str, names: list[str]) -> Iterator[Fault]:
-        """Yield the names that are there twice."""
-        yield from ((names.count(name) > 1, f"there are two of {kind} {name!r}") for name in names)
+        """Yield the faults of names that are there twice."""
+        for name in names:
+            yield names.count(name) > 1, f"there are two of {kind} {name!r}"
 
 
 class DescribedModel(Model):
-    """What models of a file know of themselves.
+    """A model that is described by a file: its name, outputs, parameters and ports.
 
     Parameters
     ----------
@@ -85,9 +90,17 @@ class DescribedModel(Model):
     """
 
     def __init__(self, description: ModelDescription, quantities: Mapping[str, Quantity]) -> None:
-        self.name, self.quantities = description.name, quantities
+        self.name = description.name
+        self.quantities = quantities
         self.parameters = tuple(
-            ParameterPrior(item.name, item.unit, item.mean, item.deviation, item.low, item.high)
-            for item in description.parameter
+            ParameterPrior(
+                section.name,
+                section.unit,
+                section.mean,
+                section.deviation,
+                section.low,
+                section.high,
+            )
+            for section in description.parameter
         )
-        self.ports = tuple(item.name for item in description.port)
+        self.ports = tuple(port.name for port in description.port)

@@ -1,4 +1,4 @@
-"""What a model is asked for and what it answers: conditions, response, a linear system with ports."""
+"""What a model is asked for and what it returns: conditions, response, a system with ports."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -8,8 +8,11 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray, Quantity
 
 Place = str | tuple[float, float]
-MOVES, TURNS, EITHER = ("N", "m"), ("N m", "rad"), ("N or N m", "m or rad")
-"""Units of a force and of a motion at a port."""
+"""Where a force acts: the name of a load place, or station [m] and chord fraction [1]."""
+MOVES = ("N", "m")
+TURNS = ("N m", "rad")
+EITHER = ("N or N m", "m or rad")
+"""Units of a force and of a motion at a port that moves, that turns, or may do either."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +24,11 @@ class Conditions:
     parameters : (P,) ndarray
         Values of `Model.parameters`, in order.
     initial : (R, 2) ndarray
-        Ring-downs. At rest: column 0 holds deviations from the static release shape, in units of the release
-        displacement, by mode, row 0 that of the whole shape (so the motion starts at (1 + initial[0, 0])
-        times the static shape plus initial[r, 0] of mode r); column 1 is zero. Not at rest: displacement and
-        velocity / w_r of mode r, in units of the release displacement, at the release point.
+        Initial state of a ring-down by mode. At rest: column 0 is the deviation from the static
+        release shape, in units of the release displacement, with that of the whole shape in row 0
+        (so the motion starts at (1 + initial[0, 0]) times the static shape plus initial[r, 0] of
+        mode r); column 1 is zero. Not at rest: displacement and velocity / w_r of mode r, in units
+        of the release displacement, at the release point.
     clock : tuple of float
         (rate, zero): a sample stamped t shows the motion at (1 + rate) t + zero [1], [s].
     health : (N, 2) ndarray
@@ -48,9 +52,15 @@ class Conditions:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """All of it as a value that can be looked up."""
-        values = vars(self).values()
-        return tuple(item.tobytes() if isinstance(item, np.ndarray) else item for item in values)
+        """All conditions as a hashable value."""
+        return (
+            self.parameters.tobytes(),
+            self.initial.tobytes(),
+            self.clock,
+            self.health.tobytes(),
+            self.offset,
+            self.refinement,
+        )
 
 
 class Response(NamedTuple):
@@ -59,9 +69,9 @@ class Response(NamedTuple):
     Attributes
     ----------
     values : (N, C) ndarray
-        By output, SI units.
+        Value of each output [SI].
     rates : (N, C) ndarray or None
-        Their time derivatives, for dynamic trials.
+        Time derivatives of the values, for dynamic trials.
     """
 
     values: FloatArray
@@ -70,21 +80,21 @@ class Response(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PortedSystem:
-    """A model in motion as a linear system with ports: what a force that nobody knows of does to readings.
+    """A model in motion as a linear system with ports: what a missing force does to readings.
 
-    s' = A s - sum_p b_p g_p, y = C s - sum_p e_p g_p, in the coordinates s = (q, q') of the modes. What is
-    known to act is in the model's own response; s is what a missing force adds to it.
+    s' = A s - sum_p b_p g_p, y = C s - sum_p e_p g_p, in the coordinates s = (q, q') of the modes.
+    What is known to act is in the model's own response; s is what a missing force g adds to it.
 
     Attributes
     ----------
     generator : (n, n) ndarray
         A [1/s].
     ports : tuple of str
-        Names, P of them.
+        Names of the P ports.
     actions : (P, n) ndarray
-        b of each port: what takes its force from the state.
+        b of each port: what a force there takes from the rate of the state.
     positions, speeds : (P, n) ndarray
-        Rows by which a port moves. A port of a state moves at the speed that the state is.
+        Rows of the ports' positions and speeds. A port of a state has the state as its speed.
     outputs : (C, n) ndarray
         Rows of the outputs.
     through : (P, C) ndarray
@@ -101,6 +111,6 @@ class PortedSystem:
 
 
 Outputs = tuple[tuple[str, Quantity], ...]
-"""Outputs, and the quantity wanted of each."""
+"""Names of outputs, and the quantity wanted of each."""
 ACROSS = ".transverse", ".shear"
-"""What follows the name of a strain in those across its gauge's direction: strain, engineering shear."""
+"""Endings of the names of a gauge's transverse and engineering shear strain."""

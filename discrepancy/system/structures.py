@@ -14,12 +14,17 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError, said
-from discrepancy.system.excitation import Acting, Course, Load, Shown, place_among
+from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.load_change import choose_load_place
+from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.response import MOVES, TURNS, Outputs, Place
-from discrepancy.system.scales import PortScale
-from discrepancy.system.system_model import Case, State, SystemModel
+from discrepancy.system.scales import ForceShare, PortScale
+from discrepancy.system.system_model import SystemModel
+from discrepancy.system.system_state import PatchedTrial
+from discrepancy.system.system_state import SystemState as State
+from discrepancy.system.time_history import RecordedHistory
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
@@ -140,9 +145,11 @@ class StructureModel(SystemModel):
         none = dict.fromkeys(self.model.controls, 0.0)
         return self._pull(state, none | {control: 1.0}) - self._pull(state, none)
 
-    def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
+    def output_equations(
+        self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
+    ) -> list[OutputEquation]:
         """Return what outputs show."""
-        return [Shown.of(self._rows[output], quantity.order) for output, quantity in outputs]
+        return [OutputEquation.of_row(self._rows[output], quantity.order) for output, quantity in outputs]
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
@@ -157,22 +164,22 @@ class StructureModel(SystemModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        return self._load(state, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
+        return self._load(state, choose_load_place(self.forces or (LOAD_FACTOR,), place, self.what))
 
-    def lift(self, state: State, change: ModelPatch) -> FloatArray:
+    def lift_loads(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the load (1, n) of the load factor."""
         return self._load(state, LOAD_FACTOR)[None]
 
-    def acting(self, case: Case) -> Acting:
+    def excitation(self, case: PatchedTrial) -> Excitation:
         """Return what acts in a trial, with constant loads and controls that no trial records."""
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
-        acting, always = super().acting(case), self._pull(case.state, recorded)
+        excitation, always = super().excitation(case), self._pull(case.state, recorded)
         if not always.any():
-            return acting
-        steady = Load(always, Course(acting.time, np.ones(len(acting.time))))
-        return replace(acting, loads=(*acting.loads, steady))
+            return excitation
+        steady = Load(always, RecordedHistory(excitation.time, np.ones(len(excitation.time))))
+        return replace(excitation, loads=(*excitation.loads, steady))
 
-    def made(self, state: State) -> LinearSystem:
+    def build_system(self, state: State) -> LinearSystem:
         """Return the structure in a state, in the coordinates of `ReducedModel.at`.
 
         Raises
@@ -286,14 +293,16 @@ class WingModel(SystemModel):
             return None
         return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
 
-    def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
+    def output_equations(
+        self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
+    ) -> list[OutputEquation]:
         """Return what outputs show."""
         rows = np.array([self._row(output) for output, _ in outputs])
         factors = self.wing.strain_factors(case.patch)
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
-        return [Shown.of(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
+        return [OutputEquation.of_row(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
     @property
     def shown_outputs(self) -> tuple[str, ...]:
@@ -318,21 +327,21 @@ class WingModel(SystemModel):
         """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` if it is off the wing."""
         return self.wing.force_row(place, change)
 
-    def lift(self, state: State, change: ModelPatch) -> FloatArray:
+    def lift_loads(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the parts (2, n) of the lift."""
         return self.wing.load_parts(change)
 
-    def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
+    def distributed_scales(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, from those of its mean and the first mode."""
         share = self.wing.planform[1]
         motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
         ratio = motion / float(share @ motion)
-        by_place = tuple(zip(share.tolist(), ratio.tolist(), strict=True))
-        return {PLANFORM: replace(ports["span"], spread=by_place)}
+        by_place = tuple(map(ForceShare, share.tolist(), ratio.tolist()))
+        return {PLANFORM: replace(ports["span"], distribution=by_place)}
 
-    def made(self, state: State) -> LinearSystem:
+    def build_system(self, state: State) -> LinearSystem:
         """Return the wing in a state."""
         factor, servo, pitot, alpha, beta = state.parameters
         vector = np.array((factor, *state.losses, servo, pitot, 0.0, 0.0))
-        structure = self.wing.at(vector, state.structure, state.warmer)
+        structure = self.wing.at(vector, state.structure, state.temperature_rise)
         return _system(structure, (alpha, beta), self.port_rows)

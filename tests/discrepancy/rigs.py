@@ -17,8 +17,8 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document import Origin
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
 from discrepancy.system.lumped_file import LumpedDescription
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive

@@ -22,7 +22,7 @@ from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import mains_lines
 from discrepancy.errors import CatalogueError
 from discrepancy.sources.examples import example_campaign, plan_for
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import ACROSS, Conditions
 from discrepancy.system.sensing import observe
 from fe.runtime import patch as patches

@@ -16,7 +16,7 @@ from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions, Response
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.sensing import observe

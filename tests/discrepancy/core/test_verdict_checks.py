@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discrepancy.system.lumped_model import LumpedModel
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
 from discrepancy.files.verdict import read_verdict
@@ -16,6 +15,7 @@ from discrepancy.judgement.conclusion import Outcome
 from discrepancy.judgement.moved_unknowns import moved_sentence, moved_unknowns
 from discrepancy.judgement.verdict_checks import checked_verdict, far_held_out_records, unfitted_records
 from discrepancy.report.figures import ReportInput
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate

@@ -15,7 +15,7 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.judgement.separability import as_predicted
 from discrepancy.sources.examples import example_campaign, plan_for
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind

@@ -17,7 +17,7 @@ from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.model_choice import choose_model
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from fe.runtime.patch import LoadGain, LoadPlace, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fmu_asset.packing.contents import build_script_fmu

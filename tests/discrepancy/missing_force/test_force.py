@@ -26,7 +26,7 @@ from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence
 from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import search
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate

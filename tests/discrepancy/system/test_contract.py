@@ -16,10 +16,11 @@ from discrepancy.campaign.records import Hold, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.system.structures import StructureModel, WingModel
-from discrepancy.system.system_model import State, SystemModel
+from discrepancy.system.system_model import SystemModel
+from discrepancy.system.system_state import SystemState
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import PRIMITIVES, FreePlay, LoadPlace, PointMass, PowerDamping, PowerStiffness
@@ -85,7 +86,7 @@ def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> 
     model = kind.model
     stiffness, mass, row, rows = np.full((1, 1), 1974.0), np.full((1, 1), 2.0), np.ones(1), [np.ones(1)]
     if isinstance(model, SystemModel):
-        state = State(tuple(model.prior_mean()), (0.0,) * len(model.regions))
+        state = SystemState(tuple(model.prior_mean()), (0.0,) * len(model.regions))
         stiffness, mass = (getattr(model.system(state), name) for name in ("stiffness", "mass"))
         row, rows = model.force_row(kind.place, state), [model.port_rows[name] for name in kind.ports]
     loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -6.0]))

@@ -14,12 +14,13 @@ from scipy.optimize import brentq
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.system.excitation import Acting, Shown
+from discrepancy.system.excitation import Excitation, ReleasePoint
 from discrepancy.system.linear_system import LinearSystem
-from discrepancy.system.lumped import LumpedModel
 from discrepancy.system.lumped_file import SHIPPED_MODELS, LumpedDescription
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.motion import Motion, motion_of
-from discrepancy.system.system_model import State
+from discrepancy.system.output_equation import OutputEquation
+from discrepancy.system.system_state import SystemState
 from fe.runtime import patch as patches
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
@@ -130,7 +131,7 @@ def test_a_clock_shows_the_motion_at_other_times(items: tuple[Primitive, ...]) -
 def test_a_point_mass_sits_between_places() -> None:
     row = np.array([0.0, 0.25, 0.75])
     wanted = np.sqrt(eigh(STIFFNESS, MASS + 0.3 * np.outer(row, row), eigvals_only=True))
-    state = State((1.0,) * 3, structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
+    state = SystemState((1.0,) * 3, structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
     np.testing.assert_allclose(CHAIN.system(state).angular_frequency, wanted, rtol=1e-10)
 
 
@@ -154,7 +155,7 @@ def test_closed_form_and_stepped_ringdown_agree_for_any_damping(ratios: Any, clo
 @pytest.mark.parametrize(("name", "whole", "parts"), INPUTS.table("parts.toml")["row"])
 def test_a_matrix_may_be_given_by_parts_alone(name: str, whole: str, parts: str) -> None:
     one, other = (
-        model_of(text).description.terms({})
+        model_of(text).description.scaled_matrices({})
         for text in (INPUTS.text(f"{name}.toml"), INPUTS.text(f"{name}.toml", (whole, "")) + parts)
     )
     for kind in ("mass", "stiffness", "capacity", "conductance"):
@@ -191,12 +192,12 @@ def on_joint(modes: int, beta: float) -> LinearSystem:
 def let_go(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **how: int) -> Motion:
     system = on_joint(how.pop("modes", 3), beta)
     acts = laws_of(ModelPatch(items), list(system.ports))
-    acting = Acting(time, time, initial=np.zeros((0, 2)), release=(row, RELEASE))
-    return motion_of(system, acting, acts, **how)
+    excitation = Excitation(time, time, initial=np.zeros((0, 2)), release=ReleasePoint(row, RELEASE))
+    return motion_of(system, excitation, acts, **how)
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
-    return motion.seen([Shown.of(row) for row in rows]).values
+    return motion.response([OutputEquation.of_row(row) for row in rows]).values
 
 
 LAWS = laws("joint", HOLD, A, 15.0 * A)

@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
-from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_model import LumpedModel
+from discrepancy.system.port_scales import FORCE_PER_RMS
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
-from discrepancy.system.system_model import FORCES
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import PowerDamping, PowerStiffness, Primitive, Window
@@ -63,7 +63,7 @@ def test_a_body_falls_as_galilei_says_and_drag_makes_it_a_hyperbolic_tangent() -
     np.testing.assert_allclose(found[:, 1], 0.5 * speed**2 / 2.0, atol=1e-4)
     port = rig("falling_body").scales(campaign(trial(time))).ports["air"]  # from what acts and moves
     assert port.displacement == pytest.approx(0.5 * 9.81 * time[-1] ** 2)
-    assert port.stiffness * port.displacement == pytest.approx(FORCES * 2.0 * 9.81)
+    assert port.stiffness * port.displacement == pytest.approx(FORCE_PER_RMS * 2.0 * 9.81)
     assert port.angular_frequency * port.displacement == pytest.approx(9.81 * time[-1])
 
 

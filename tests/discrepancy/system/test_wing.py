@@ -18,7 +18,8 @@ from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.system.structures import StructureModel, WingModel
-from discrepancy.system.system_model import State, SystemModel
+from discrepancy.system.system_model import SystemModel
+from discrepancy.system.system_state import SystemState
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import entry
 from fe.reduction.reduced_basis import reduce_structure
@@ -48,7 +49,7 @@ def wing(coarse_patch_arrays: PatchArrays) -> WingModel:
 
 def modes(wing: WingModel, count: int) -> tuple[Any, Any, Any]:
     """Squares, shapes and modal coordinates of the release of `RING`, of the wing as it is believed."""
-    system = wing.system(State(tuple(wing.prior_mean().tolist()), (0.0, 0.0)))
+    system = wing.system(SystemState(tuple(wing.prior_mean().tolist()), (0.0, 0.0)))
     tip = wing.wing.force_row("tip_load")
     square, shapes = eigh(system.stiffness, system.mass, subset_by_index=[0, count - 1])
     held = np.linalg.solve(system.stiffness, tip)

@@ -1,0 +1,65 @@
+"""What moves an FMU: its state, a recorded force, a release, and the inputs that laws push."""
+
+from collections.abc import Hashable, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from fmu_asset.door.runs import State
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.system.time_history import RecordedHistory
+
+
+class FmuExcitation(NamedTuple):
+    """What moves an FMU.
+
+    Attributes
+    ----------
+    state : State
+        Parameters and constant inputs of the FMU.
+    step : float
+        Communication step [s].
+    record : int
+        Number of steps after which the answer to each input and each release is known.
+    inputs : tuple of str
+        Inputs that a recorded force or laws may push.
+    levers : mapping of str to float
+        Factor of the recorded force by input.
+    force : RecordedHistory, optional
+        The recorded force.
+    releases : mapping of str to float
+        Parameters that release the FMU, with displacement [m] and velocity [m/s] of the release
+        point; or the input that holds it until then, with the displacement.
+    settles : bool
+        Whether the FMU is to come to rest.
+    """
+
+    state: State
+    step: float
+    record: int
+    inputs: tuple[str, ...] = ()
+    levers: Mapping[str, float] = MappingProxyType({})
+    force: RecordedHistory | None = None
+    releases: Mapping[str, float] = MappingProxyType({})
+    settles: bool = False
+
+    @property
+    def recording(self) -> tuple[State, float, int]:
+        """State, step and number of steps of a recorded answer."""
+        return self.state, self.step, self.record
+
+    @property
+    def lever_values(self) -> FloatArray:
+        """Factor of the recorded force for each of the inputs (E,)."""
+        return np.array([self.levers.get(name, 0.0) for name in self.inputs])
+
+    @property
+    def first_force(self) -> float:
+        """The recorded force at the first sample, zero without one."""
+        return 0.0 if self.force is None else float(self.force.values[0])
+
+    @property
+    def kind(self) -> tuple[Hashable, ...]:
+        """Inputs and releases for which an FMU is linear, or is not."""
+        return self.inputs, *self.releases, self.settles

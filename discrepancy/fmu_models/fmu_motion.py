@@ -1,0 +1,439 @@
+"""Motion of an FMU with laws at its ports: by its system where it is linear, else step by step."""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from math import ceil
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from fe.compilation import compiled_kernel
+from fe.runtime.motion import ALIKE, Laws, static_solution
+from fmu_asset.door.runs import Run, StateSpace
+
+from discrepancy.campaign.records import FloatArray, Trial
+from discrepancy.errors import ModelError
+from discrepancy.fmu_models.description import FmuModelDescription
+from discrepancy.fmu_models.fmu_excitation import FmuExcitation
+from discrepancy.fmu_models.fmu_rest import FmuAtRest
+from discrepancy.fmu_models.port_coupling import PortCoupling
+from discrepancy.fmu_models.readout import Readout, SampledOutputs, sample
+from discrepancy.fmu_models.system_motion import LawPorts, system_motion
+from discrepancy.system.excitation import Excitation, Load
+
+CONVERGED = 1e-4
+"""Largest rms change of a motion with laws when steps are halved, as a share of the motion."""
+MOST_REFINEMENT = 64
+"""Steps that do not converge at this refinement are given up."""
+
+
+class FmuSimulator(FmuAtRest):
+    """Rest and motion of an FMU with laws at its ports.
+
+    Parameters
+    ----------
+    description : FmuModelDescription
+        Content of the model's file.
+    folder : Path
+        Its folder, where relative names begin.
+    """
+
+    def __init__(self, description: FmuModelDescription, folder: Path) -> None:
+        super().__init__(description, folder)
+        self._refinements: dict[Hashable, Refinement] = {}
+
+    def motion(
+        self,
+        excitation: FmuExcitation,
+        trial: Trial,
+        laws: Laws,
+        readout: Readout,
+        refinement: int = 1,
+    ) -> SampledOutputs:
+        """Return outputs and their rates in a dynamic trial.
+
+        Parameters
+        ----------
+        excitation : FmuExcitation
+            What moves the FMU.
+        trial : Trial
+            The trial, for its length and name.
+        laws : Laws
+            Internal forces.
+        readout : Readout
+            Outputs and times.
+        refinement : int
+            Steps are this many times smaller.
+
+        Raises
+        ------
+        ModelError
+            If the FMU refuses; or, where it is stepped, if a port has no velocity, or the steps do
+            not converge.
+        """
+        times = readout.times
+        end = max(float(times[-1]), float(trial.time[-1]))
+        ports = self._law_ports(excitation, laws)
+        system = self.system(excitation)
+        if system is not None and not system.jumps(ports.columns, ports.force_numbers):
+            return self._motion_of_system(
+                system, excitation, trial, laws, ports, readout, end, refinement
+            )
+        if times[-1] != trial.time[-1]:
+            # a little longer, so that a clock that is being fitted does not ask for another run
+            end += trial.interval
+        stepped = self._stepped_motion(excitation, trial, end, laws, readout.columns, refinement)
+        return sample(stepped.values, stepped.step, readout, readout.derivatives)
+
+    def _law_ports(self, excitation: FmuExcitation, laws: Laws) -> LawPorts:
+        """Return where laws act on the linear system, with the ports at the undisturbed outputs."""
+        ports = [self.ports.index(name) for name in laws.ports]
+        columns = [self.displacement_columns[port] for port in ports]
+        numbers = [excitation.inputs.index(self.port_inputs[port]) for port in ports]
+        return LawPorts(
+            np.array(columns, dtype=np.int64),
+            np.array(numbers, dtype=np.int64),
+            np.zeros(len(columns)),
+        )
+
+    # ------------------------------------------------------------ by its linear system
+
+    def _motion_of_system(
+        self,
+        system: StateSpace,
+        excitation: FmuExcitation,
+        trial: Trial,
+        laws: Laws,
+        ports: LawPorts,
+        readout: Readout,
+        end: float,
+        refinement: int,
+    ) -> SampledOutputs:
+        """Return outputs and rates by the FMU's linear system, followed until a time `end` [s].
+
+        Parameters
+        ----------
+        system : StateSpace
+            The linear system.
+        excitation : FmuExcitation
+            What moves the FMU.
+        trial : Trial
+            The trial, for the stamps of its force.
+        laws : Laws
+            Internal forces.
+        ports : LawPorts
+            Where they act.
+        readout : Readout
+            Outputs and times.
+        end : float
+            Time until which steps are made, if the samples are not even [s].
+        refinement : int
+            Steps are this many times smaller.
+        """
+        undisturbed = self._undisturbed_outputs(excitation)
+        amounts = self._release_amounts_of_system(excitation)
+        columns = list(readout.columns)
+        is_derivative = np.array(readout.derivatives) > 0
+        # the samples themselves if they are even, else steps: many lengths of steps would take long
+        times = readout.times
+        stamps, sample_rows = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
+        is_even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
+        if not is_even:
+            stamps = excitation.step * np.arange(ceil(end / excitation.step - 1e-6) + 1.0)
+        start, memory = self._start_with_laws(system, excitation, laws, ports, amounts)
+        # motion and outputs
+        loads = []
+        if excitation.force is not None:
+            loads.append(Load(excitation.lever_values, excitation.force))
+        at_undisturbed = LawPorts(ports.columns, ports.force_numbers, undisturbed[ports.columns])
+        states, forces = system_motion(
+            system,
+            Excitation(trial.time, stamps, loads),
+            start,
+            laws,
+            at_undisturbed,
+            refinement,
+            memory,
+        )
+        rows, direct = system.rows(columns, readout.derivatives)
+        constant = np.where(is_derivative, 0.0, undisturbed[columns])
+        values = states @ rows.T + forces @ direct.T + constant
+        if excitation.releases:
+            # the force that holds it until then may be seen at once
+            held = [
+                self._answer_to_release(excitation, name)[0] * amount
+                for name, amount in amounts.items()
+            ]
+            held_outputs = (undisturbed + sum(held))[columns]
+            values[0] = np.where(is_derivative, values[0], held_outputs)
+        if not is_even:
+            return sample(values, excitation.step, readout, [0] * len(columns))
+        rates = (states @ system.generator.T + forces @ system.push.T) @ rows.T
+        if direct.any():
+            rates += np.gradient(forces, stamps, axis=0) @ direct.T
+        values = values[sample_rows[:-1]]
+        rates = rates[sample_rows[:-1]]
+        is_before = times < 0.0
+        rates[is_before] = 0.0
+        values[np.ix_(is_before, is_derivative)] = 0.0
+        return SampledOutputs(values, rates)
+
+    def _start_with_laws(
+        self,
+        system: StateSpace,
+        excitation: FmuExcitation,
+        laws: Laws,
+        ports: LawPorts,
+        amounts: Mapping[str, float],
+    ) -> "StartState":
+        """Return the state at the begin: under a force at rest with the laws, else as released.
+
+        Parameters
+        ----------
+        system : StateSpace
+            The linear system.
+        excitation : FmuExcitation
+            What moves the FMU.
+        laws : Laws
+            Internal forces.
+        ports : LawPorts
+            Where they act.
+        amounts : mapping of str to float
+            What releases the FMU.
+        """
+        if not len(laws) or excitation.force is None:
+            return StartState(self._start_state(system, excitation, amounts), None)
+        first_forces = excitation.first_force * excitation.lever_values
+        gain = system.gain
+        outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
+        without_laws = outputs[ports.columns]
+        compliance = gain[np.ix_(ports.columns, ports.force_numbers)]
+        solution = static_solution(laws, without_laws[None], compliance, kernel=compiled_kernel())
+        law_forces = np.bincount(ports.force_numbers, solution.forces[0], len(first_forces))
+        return StartState(system.at_rest(first_forces - law_forces), solution.memory)
+
+    # ------------------------------------------------------------ step by step
+
+    def _stepped_motion(
+        self,
+        excitation: FmuExcitation,
+        trial: Trial,
+        end: float,
+        laws: Laws,
+        columns: Sequence[int],
+        refinement: int,
+    ) -> "SteppedOutputs":
+        """Return outputs of the FMU stepped until a time `end` [s], with the laws beside it.
+
+        Parameters
+        ----------
+        excitation : FmuExcitation
+            What moves the FMU.
+        trial : Trial
+            The trial, for its kind and name.
+        end : float
+            Time of the last step [s].
+        laws : Laws
+            Internal forces.
+        columns : sequence of int
+            Columns of the outputs that are read.
+        refinement : int
+            Steps are this many times smaller than needed.
+        """
+        fixed_step = self.description.motion.step
+        amounts = self._release_amounts(excitation)
+        # inputs are held over steps
+        longest = excitation.step if excitation.force is None else 0.5 * excitation.step
+
+        def outputs_by(parts: int) -> FloatArray:
+            step = fixed_step or longest / parts
+            finer = excitation._replace(step=step, record=ceil(end / step - 1e-6))
+            run = self._run(finer, amounts)
+            if len(laws):
+                # an unstable coupling grows beyond all numbers
+                with np.errstate(all="ignore"):
+                    return self._outputs_with_laws(run, laws, trial.name)
+            courses = [values.tobytes() for values in run.courses.values()]
+            key = (run.state, run.step, run.steps, *run.begin.items(), *courses)
+            return self.remembered(key, lambda: self.followed(run))
+
+        parts = 1
+        if len(laws) and fixed_step is None:
+            # an accelerometer that nobody reads would ask for steps many times smaller
+            watched = sorted({*columns, *self.displacement_columns})
+            kind = (*watched, trial.kind, trial.interval)
+            parts = self._parts_for(
+                laws, kind, longest, lambda parts: outputs_by(parts)[::parts, watched]
+            )
+        parts *= refinement
+        outputs = outputs_by(parts)[:, list(columns)]
+        return SteppedOutputs(outputs, fixed_step or longest / parts)
+
+    def _settled_with_laws(self, run: Run, laws: Laws, trial: str) -> "SettledRun":
+        """Return a run that has settled with laws under its first loads."""
+        outputs = self.begun(run)[1][None]
+        columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
+        if not run.courses or not np.any(outputs[:, columns]):
+            return SettledRun(run, None)
+
+        def run_under(forces: FloatArray) -> Run:
+            loads = {name: np.full(1, value) for name, value in run.begin.items()}
+            begin = self.loads_less_laws(loads, laws, forces)
+            return run._replace(begin={name: float(values[0]) for name, values in begin.items()})
+
+        def outputs_under(forces: FloatArray) -> FloatArray:
+            return self.begun(run_under(forces))[1][None]
+
+        _, solution = self.rest_with_laws(laws, outputs_under, outputs, run.state, trial)
+        return SettledRun(run_under(solution.forces), solution.memory)
+
+    def _outputs_with_laws(self, run: Run, laws: Laws, trial: str) -> FloatArray:
+        """Return the outputs (K, C) of a run with laws; NaN if the coupling is unstable."""
+        run, memory = self._settled_with_laws(run, laws, trial)
+        ports = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
+        names = [self.ports[port] for port in ports]
+        inputs = [self.port_inputs[port] for port in ports]
+        position_columns = [self.displacement_columns[port] for port in ports]
+        speed_columns = [self.velocity_columns[port] for port in ports]
+        if min(speed_columns) < 0:
+            port = names[speed_columns.index(-1)]
+            raise ModelError(
+                f"The FMU model {self.description.name!r} is not linear, or the speed of a port "
+                f"jumps with a force, so its port {port!r} needs a velocity output; name it in "
+                "[[port]]."
+            )
+        first_step, speed_gain = self._speed_gain(run, inputs, speed_columns)
+        coupling = PortCoupling(laws, names, speed_gain, run.step, memory)
+        # step by step, with the force of the laws held over each step
+        asset, first, courses = self.begun(run)
+        outputs = [first]
+        forces = np.column_stack([*courses.values()])
+        port_columns = [list(courses).index(name) for name in inputs]
+        previous_speeds = 2.0 * first_step[0] - first_step[1]
+        speed_loss = np.zeros(len(ports))
+        for step_forces in forces:
+            positions = outputs[-1][position_columns]
+            speeds = outputs[-1][speed_columns]
+            accelerations = (speeds - previous_speeds + speed_loss) / run.step
+            speed_loss = coupling.speed_loss(positions, speeds, accelerations)
+            previous_speeds = speeds
+            step_forces[port_columns] -= np.linalg.solve(speed_gain, speed_loss)
+            if not np.isfinite(step_forces).all():
+                return np.full((len(forces) + 1, len(first)), np.nan)
+            load = dict(zip(courses, step_forces.tolist(), strict=True))
+            with self.refusals():
+                outputs.append(asset.step(load=load).values)
+        return np.array(outputs)
+
+    def _speed_gain(
+        self, run: Run, inputs: Sequence[str], speed_columns: list[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return speeds (2, P) around the first step, and what unit forces add in it (P, P).
+
+        Parameters
+        ----------
+        run : Run
+            The run without laws.
+        inputs : sequence of str
+            Force input of each port.
+        speed_columns : list of int
+            Column of each port's speed.
+        """
+        first_courses = {name: course[:1] for name, course in run.courses.items()}
+        one_step = run._replace(steps=1, courses=first_courses)
+        undisturbed = self.followed(one_step)[:, speed_columns]
+        sizes = np.array([self.size(name) for name in inputs])
+        changes = []
+        for name in inputs:
+            push = first_courses.get(name, 0.0) + np.full(1, self.size(name))
+            pushed = one_step._replace(courses={**first_courses, name: push})
+            changes.append(self.followed(pushed)[1, speed_columns] - undisturbed[1])
+        return undisturbed, np.stack(changes, axis=1) / sizes
+
+    def _parts_for(
+        self,
+        laws: Laws,
+        kind: Hashable,
+        step: float,
+        outputs_by: Callable[[int], FloatArray],
+    ) -> int:
+        """Return into how many parts steps are divided for laws.
+
+        Steps are halved until that changes nothing that moves by more than `CONVERGED` of its
+        largest motion (rms). What was enough is kept for laws of this kind up to twice as strong.
+
+        Parameters
+        ----------
+        laws : Laws
+            Internal forces.
+        kind : hashable
+            What else the number depends on.
+        step : float
+            The whole step [s].
+        outputs_by : callable
+            Parts of a step to outputs (K, C) at the ends of whole steps.
+
+        Raises
+        ------
+        ModelError
+            If the steps do not converge.
+        """
+        strength = float(np.max(np.abs(laws.values[:, 0])))
+        # roughness asks for short steps
+        exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)
+        key = (kind, laws.ports, laws.numbers.tobytes(), exponents.tobytes())
+        refinement = self._refinements.get(key, Refinement(1, 0.0))
+        parts = refinement.parts
+        if strength <= 2.0 * refinement.strength:
+            return parts
+        fine = outputs_by(parts)
+        while parts <= MOST_REFINEMENT:
+            coarse = fine
+            fine = outputs_by(2 * parts)
+            change = _relative_change(coarse, fine)
+            if change <= CONVERGED:
+                self._refinements[key] = Refinement(parts, strength)
+                return parts
+            parts *= 2
+        ports = ", ".join(dict.fromkeys(laws.ports))
+        raise ModelError(
+            f"The internal force at {ports} does not converge in the co-simulation with the FMU "
+            f"model {self.description.name!r}: halving steps of {2.0 * step / parts:.2g} s still "
+            f"changes the motion by {change:.1g} of its size; the force is too stiff for the port."
+        )
+
+
+class Refinement(NamedTuple):
+    """Parts of a step that were enough for laws of a strength."""
+
+    parts: int
+    strength: float
+
+
+class StartState(NamedTuple):
+    """State (n,) of a linear system at the begin, and the memory of laws loaded before."""
+
+    state: FloatArray
+    memory: FloatArray | None
+
+
+class SteppedOutputs(NamedTuple):
+    """Values (K, C) of outputs on an even grid from zero, and its step [s]."""
+
+    values: FloatArray
+    step: float
+
+
+class SettledRun(NamedTuple):
+    """A run that begins at rest with laws, and their memory; None if they were never loaded."""
+
+    run: Run
+    memory: FloatArray | None
+
+
+def _relative_change(coarse: FloatArray, fine: FloatArray) -> float:
+    """Return the largest rms difference of two motions (K, C), as a share of the largest motion."""
+    rows = min(len(fine), len(coarse))
+    with np.errstate(all="ignore"):
+        largest = np.max(np.abs(fine - fine.mean(axis=0)), axis=0)
+        difference = np.sqrt(np.mean((coarse[:rows] - fine[:rows]) ** 2, axis=0))
+        return float(np.max(difference / np.where(largest == 0.0, np.inf, largest)))

@@ -1,0 +1,416 @@
+"""An FMU with ports: its linear system, identified from its answers, and its communication step."""
+
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from math import ceil
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import root_scalar
+from scipy.signal import periodogram
+
+from discrepancy.campaign.records import FloatArray, Hold, Trial
+from discrepancy.errors import ModelError
+from discrepancy.fmu_models.description import FmuModelDescription
+from discrepancy.fmu_models.fmu_excitation import FmuExcitation
+from discrepancy.fmu_models.system_motion import MOST_SYSTEMS, system_motion
+from discrepancy.fmu_models.variables import FmuVariables
+from discrepancy.system.excitation import Excitation, Load
+from discrepancy.system.time_history import RecordedHistory, equivalent_ramps
+from fmu_asset.door.runs import FmuRuns, Run, State, StateSpace, realised
+from fmu_asset.errors import FmuError
+from reporting.memory import ResultCache
+
+LINEAR = 1e-6
+"""Largest deviation from superposition of a linear FMU, as a share of the motion."""
+PHASE = 0.1
+"""Longest communication step without laws: radians of the first mode."""
+LEAST_RECORD, RECORD = 64, 600
+"""Least and most steps of the answer to a force or a release that are recorded."""
+SAFE_TURN = 0.8 * np.pi
+"""Turn of a mode in a step that stays below half a circle as parameters change [rad]."""
+MOST_PARTS = 16
+"""Parts of an interval up to which the system is looked for."""
+SAME_MOTION = 1e-2
+"""A mode that turns by more than half a circle in a step looks like a slower one there: half the
+step then gives another motion, by more than this share of it."""
+RELEASE = 1e-3
+"""Displacement from which an FMU without ports is released to find its first mode [m]."""
+
+
+class Pace(NamedTuple):
+    """Angular frequency [rad/s] of the first mode, and the communication step [s]."""
+
+    angular_frequency: float
+    step: float
+
+
+class PacedSystem(NamedTuple):
+    """The system at a step that shows all modes, if the FMU is linear; parts of an interval."""
+
+    system: StateSpace | None
+    excitation: FmuExcitation
+    parts: int
+
+
+class IdentifiedFmu(FmuRuns):
+    """An FMU with ports, its linear system and its communication step.
+
+    Parameters
+    ----------
+    description : FmuModelDescription
+        Content of the model's file.
+    folder : Path
+        Its folder, where relative names begin.
+
+    Attributes
+    ----------
+    nominal : State
+        State of motions at the means of the parameters; set by the model.
+    ports, port_inputs : list of str
+        Names of the ports, and inputs of their forces.
+    displacement_columns, velocity_columns : list of int
+        Columns of the ports' displacements and velocities; -1 for a velocity that is no output.
+    release_variables : list of str
+        Parameter or input that releases the FMU, and the parameter of its velocity.
+    """
+
+    nominal = State()
+
+    def __init__(self, description: FmuModelDescription, folder: Path) -> None:
+        self.description = description
+        static = description.static
+        with self.refusals():
+            self.names = FmuVariables(description, folder)
+            super().__init__(
+                self.names.path,
+                self.names.binding,
+                description.isolated,
+                static.limit,
+                static.tolerance,
+            )
+            self._check_parameters()
+        names = self.names
+        self.ports = [port.name for port in description.port]
+        self.port_inputs = [names.variable(port.force) for port in description.port]
+        columns = names.columns
+        self.displacement_columns = [columns[f"port.{port}.displacement"] for port in self.ports]
+        self.velocity_columns = [columns.get(f"port.{port}.velocity", -1) for port in self.ports]
+        self.release_variables = self._find_release_variables()
+        self._is_linear: dict[tuple[Hashable, ...], bool] = {}
+        self._release_sizes: dict[str, float] = {}
+        self._systems = ResultCache(MOST_SYSTEMS)
+        self._paces = ResultCache()
+
+    def _check_parameters(self) -> None:
+        """Refuse what the FMU cannot be set to: beyond its range a posterior would be cut."""
+        description = self.description
+        settings: list[Mapping[str, float]] = []
+        for parameter in description.parameter:
+            settings.append({parameter.variable: parameter.low})
+            settings.append({parameter.variable: parameter.high})
+        for effect in description.effects.values():
+            settings.append({f"effect.{effect}.active": 1.0})
+        settings += [description.static.parameters, description.motion.parameters]
+        for setting in settings:
+            by_key = {self.names.parameter(name): value for name, value in setting.items()}
+            self.asset.check_parameters(by_key)
+
+    def _find_release_variables(self) -> list[str]:
+        """Return what lets the FMU go, and what gives it a velocity, as far as it has them."""
+        release = self.description.release
+        if release is None:
+            return []
+        parameters = [name for name in (release.displacement, release.velocity) if name is not None]
+        variables = [self.names.parameter(name) for name in parameters]
+        if release.hold is not None:
+            variables.append(self.names.variable(release.hold))
+        return variables
+
+    def refusals(self) -> AbstractContextManager[None]:
+        """Return the context that adds the model's name to what the FMU refuses."""
+        return ModelError.instead_of(FmuError, before=f"The FMU model {self.description.name!r}: ")
+
+    def excitation(
+        self,
+        trial: Trial,
+        state: State,
+        ports: Sequence[str],
+        levers: Mapping[str, float] | None = None,
+    ) -> FmuExcitation:
+        """Return the excitation of a trial, still without its force or release.
+
+        Parameters
+        ----------
+        trial : Trial
+            A dynamic trial.
+        state : State
+            Parameters and constant inputs.
+        ports : sequence of str
+            Ports at which laws act.
+        levers : mapping of str to float, optional
+            Factor of the recorded force by input.
+        """
+        levers = levers or {}
+        law_inputs = [self.port_inputs[self.ports.index(name)] for name in ports]
+        inputs = tuple(dict.fromkeys([*levers, *law_inputs]))
+        step = self.nominal_pace(trial).step
+        return FmuExcitation(state, step, record_of(trial), inputs, levers)
+
+    # ------------------------------------------------------------ its linear system
+
+    def system(self, excitation: FmuExcitation) -> StateSpace | None:
+        """Return the FMU as a linear system; None if it is not linear.
+
+        It is linear where one system gives its answers to single forces and releases, and predicts
+        what all of them do together.
+        """
+        kind = excitation.kind
+        may_be_linear = self.description.superposition and (
+            excitation.inputs or excitation.releases
+        )
+        if not may_be_linear or self._is_linear.get(kind) is False:
+            return None
+        key = (kind, *excitation.recording)
+        system: StateSpace | None = self._systems.get(key, lambda: self._identify(excitation))
+        if system is not None and kind not in self._is_linear:
+            self._is_linear[kind] = self._predicts(system, excitation, LINEAR)
+        return system if self._is_linear.get(kind) else None
+
+    def _identify(self, excitation: FmuExcitation) -> StateSpace | None:
+        """Return the linear system of the answers to unit forces and releases, if there is one."""
+        answers = [self._answer_to_force(excitation, name) for name in excitation.inputs]
+        answers += [self._answer_to_release(excitation, name) for name in excitation.releases]
+        records = np.stack(answers, axis=2)[1:]
+        return realised(records, len(excitation.inputs), excitation.step)
+
+    def _answer_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
+        """Return the outputs (record + 1, C) after a unit force over the first step."""
+        size = self.size(name)
+        impulse = size * np.eye(1, excitation.record).ravel()
+        run = Run(*excitation.recording, courses={name: impulse})
+        key = (*excitation.recording, name, False)
+        return self.remembered(key, lambda: self._motion(excitation, run) / size)
+
+    def _answer_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
+        """Return the outputs (record + 1, C) after a release by one unit."""
+        usual = excitation.releases[name] or 1.0
+        if self._is_input(name):
+            usual = self.size(name)
+        size = self._release_sizes.setdefault(name, usual)
+        run = self._run(excitation._replace(force=None), {name: size})
+        key = (*excitation.recording, name, True)
+        return self.remembered(key, lambda: self._motion(excitation, run) / size)
+
+    def _is_input(self, name: str) -> bool:
+        """Return whether a name is an input of the FMU, not a parameter."""
+        return name in self.names.binding.load
+
+    def _motion(self, excitation: FmuExcitation, run: Run) -> FloatArray:
+        """Return the outputs (steps + 1, C) of a run, less those of the undisturbed FMU."""
+        return self.followed(run) - self._undisturbed_outputs(excitation)
+
+    def _undisturbed_outputs(self, excitation: FmuExcitation) -> FloatArray:
+        """Return the outputs (C,) at the start if nothing moves the FMU."""
+        state, step, _ = excitation.recording
+        run = Run(state, step, 0)
+        return self.remembered((state, step), lambda: self.begun(run)[1])
+
+    def _predicts(self, system: StateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
+        """Return whether a system gives the motion of the FMU under all that moves it at once.
+
+        Inputs of laws get random forces.
+
+        Parameters
+        ----------
+        system : StateSpace
+            The system.
+        excitation : FmuExcitation
+            What moves the FMU.
+        tolerance : float
+            Largest error of an output, as a share of its largest motion.
+        """
+        amounts = self._release_amounts_of_system(excitation)
+        run = self._run(excitation, amounts)
+        random = np.random.default_rng(0)
+        forces = {
+            name: self.size(name) * random.uniform(-1.0, 1.0, run.steps)
+            for name in excitation.inputs
+        }
+        forces |= run.courses
+        motion = self._motion(excitation, run._replace(courses=forces))
+        # the same by the system
+        time = excitation.step * np.arange(run.steps + 1.0)
+        loads = []
+        for direction, values in zip(np.eye(len(forces)), forces.values(), strict=True):
+            history = RecordedHistory(time, np.append(values, 0.0), Hold.ZERO_ORDER)
+            loads.append(Load(direction, history))
+        start = self._start_state(system, excitation, amounts)
+        states, acting = system_motion(system, Excitation(time, time, loads), start)
+        predicted = motion - states @ system.outputs.T - acting @ system.direct.T
+        error = np.max(np.abs(predicted)[1:], axis=0)
+        return bool(np.all(error <= tolerance * np.max(np.abs(motion), axis=0) + 1e-300))
+
+    # ------------------------------------------------------------ releases
+
+    def _release_amounts_of_system(self, excitation: FmuExcitation) -> dict[str, float]:
+        """Return the parameters or the force that displace the release point of a linear FMU."""
+        amounts = dict(excitation.releases)
+        column = self.names.columns.get("release")
+        if self.description.release is None or column is None or not amounts:
+            return amounts
+        name, displacement = next(iter(amounts.items()))
+        if displacement != 0.0:
+            answer = self._answer_to_release(excitation, name)
+            amounts[name] = displacement / float(answer[0, column])
+        return amounts
+
+    def _release_amounts(self, excitation: FmuExcitation) -> dict[str, float]:
+        """Return the parameters or the force that displace the release point of any FMU.
+
+        Raises
+        ------
+        ModelError
+            If there are none.
+        """
+        amounts = dict(excitation.releases)
+        column = self.names.columns.get("release")
+        release = self.description.release
+        if release is None or column is None or not amounts:
+            return amounts
+        name, displacement = next(iter(amounts.items()))
+        if displacement == 0.0:
+            return amounts
+
+        def missing_displacement(amount: float) -> float:
+            at_begin = excitation._replace(force=None, record=0)
+            run = self._run(at_begin, {name: amount})
+            key = (excitation.state, excitation.step, name, amount, "begin")
+            outputs = self.remembered(key, lambda: self.begun(run)[1])
+            moved = float((outputs - self._undisturbed_outputs(excitation))[column])
+            return moved - displacement
+
+        guess = self.size(name) if self._is_input(name) else displacement
+        solution = root_scalar(missing_displacement, x0=0.0, x1=guess, rtol=1e-10, maxiter=20)
+        amount = float(solution.root)
+        if not abs(missing_displacement(amount)) <= 1e-6 * abs(displacement):
+            raise ModelError(
+                f"Nothing that [release] names puts {release.output!r} of the FMU model "
+                f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or "
+                "output there."
+            )
+        return amounts | {name: amount}
+
+    def _run(self, excitation: FmuExcitation, amounts: Mapping[str, float]) -> Run:
+        """Return the run by which the FMU follows an excitation, released by amounts."""
+        begin = {name: amount for name, amount in amounts.items() if self._is_input(name)}
+        parameters = {name: amount for name, amount in amounts.items() if name not in begin}
+        run = Run(excitation.state.having(parameters), excitation.step, excitation.record, begin)
+        if excitation.force is None:
+            return run
+        for name, lever in excitation.levers.items():
+            begin[name] = lever * excitation.first_force
+        # inputs are held over steps: the mean of each step
+        time = excitation.step * np.arange(excitation.record + 1.0)
+        at_begin, at_end = equivalent_ramps(excitation.force.values_at, time)
+        courses = {
+            name: 0.5 * lever * (at_begin + at_end) for name, lever in excitation.levers.items()
+        }
+        return run._replace(courses=courses)
+
+    def _start_state(
+        self, system: StateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
+    ) -> FloatArray:
+        """Return the state (n,) at the begin: as released, and at rest under the first force."""
+        start: FloatArray = system.starts @ np.array([*amounts.values()])
+        first_force = excitation.first_force
+        if first_force:
+            return start + system.at_rest(first_force * excitation.lever_values)
+        return start
+
+    # ------------------------------------------------------------ pace
+
+    def pace(self, trial: Trial, state: State) -> Pace:
+        """Return the first mode of the FMU and the communication step of a trial.
+
+        The mode is the one that is most flexible at the first port; without a port, the loudest.
+        The step is a whole part of the sampling interval.
+        """
+        interval = trial.interval
+        releases = {}
+        if self.release_variables and not self.ports:
+            releases = {self.release_variables[0]: RELEASE}
+        inputs = tuple(dict.fromkeys(self.port_inputs))
+        if not inputs and not releases:
+            inputs = tuple(self.names.binding.load)[:1]
+        excitation = FmuExcitation(state, interval, record_of(trial), inputs, releases=releases)
+        system, excitation, parts = self._system_that_shows_all_modes(excitation, interval)
+        # the first mode
+        mode = None
+        if system is not None and self.ports:
+            mode = system.most_flexible(self.displacement_columns[0], 0)
+        frequency = self.description.scales.angular_frequency
+        if not frequency:
+            frequency = self._loudest_frequency(excitation) if mode is None else mode[0]
+        least_parts = max(parts, ceil(frequency * interval / PHASE))
+        return Pace(frequency, self.description.motion.step or interval / least_parts)
+
+    def _system_that_shows_all_modes(
+        self, excitation: FmuExcitation, interval: float
+    ) -> PacedSystem:
+        """Return the system at a step in which no mode turns by more than half a circle."""
+        fixed_step = self.description.motion.step
+        parts = 1
+        while True:
+            excitation = excitation._replace(step=fixed_step or interval / parts)
+            system = self.system(excitation)
+            if system is None or fixed_step or parts > MOST_PARTS:
+                break
+            rates, _ = system.modes
+            largest_turn = np.max(np.abs(rates.imag)) * excitation.step
+            half_step = excitation._replace(step=0.5 * excitation.step)
+            if largest_turn <= SAFE_TURN and self._predicts(system, half_step, SAME_MOTION):
+                break
+            parts *= 2
+        return PacedSystem(system, excitation, parts)
+
+    def _loudest_frequency(self, excitation: FmuExcitation) -> float:
+        """Return the angular frequency of the largest line in the spectrum of a record [rad/s].
+
+        Raises
+        ------
+        ModelError
+            If the FMU does not move.
+        """
+        if excitation.releases:
+            motion = self._answer_to_release(excitation, next(iter(excitation.releases)))
+        else:
+            motion = self._answer_to_force(excitation, excitation.inputs[0])
+        last_quarter = motion[-len(motion) // 4 :]
+        motion = motion - last_quarter.mean(axis=0)
+        frequencies, power = periodogram(
+            motion,
+            1.0 / excitation.step,
+            window="hann",
+            nfft=4 * len(motion),
+            detrend=False,
+            axis=0,
+        )
+        if not np.any(power):
+            raise ModelError(
+                f"The FMU model {self.description.name!r} does not move; state angular_frequency "
+                "in [scales]."
+            )
+        loudest = frequencies[np.argmax(power.max(axis=1))]
+        return 2.0 * np.pi * float(max(frequencies[1], loudest))
+
+    def nominal_pace(self, trial: Trial) -> Pace:
+        """Return the pace in the nominal state: steps do not change while parameters are fitted."""
+        pace: Pace = self._paces.get(trial.interval, lambda: self.pace(trial, self.nominal))
+        return pace
+
+
+def record_of(trial: Trial) -> int:
+    """Return the number of steps that are recorded for a trial."""
+    return min(max(len(trial.time), LEAST_RECORD), RECORD)

@@ -1,0 +1,110 @@
+"""Laws at the ports of an FMU that is stepped: in a step each port moves as a mass would.
+
+The force of the laws is held over each step of the FMU. In it a port moves as a mass under what
+else accelerates it: what its speed answers to a force is measured beforehand, and the laws act on
+that mass as they do on any structure. Second order in the step.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from fe.compilation import compiled_kernel
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import Boundaries, Laws, steps_under
+from fe.runtime.motion_arrays import ModalMotion
+from fe.runtime.motion_arrays import State as ModalState
+
+from discrepancy.campaign.records import FloatArray
+
+
+class PortCoupling:
+    """Masses at P ports of an FMU, on which J laws act.
+
+    Parameters
+    ----------
+    laws : Laws
+        The laws.
+    ports : sequence of str
+        Names of their ports.
+    speed_gain : (P, P) ndarray
+        Speed of each port after a step under a unit force at each input.
+    step : float
+        Step of the FMU [s].
+    memory : ndarray, optional
+        Memory of the laws; by default they are loaded from zero at once.
+    """
+
+    def __init__(
+        self,
+        laws: Laws,
+        ports: Sequence[str],
+        speed_gain: FloatArray,
+        step: float,
+        memory: FloatArray | None,
+    ) -> None:
+        count = len(ports)
+        masses = ModalSystem(
+            np.zeros(count),
+            np.zeros((count, count)),
+            dict(zip(ports, np.eye(count), strict=True)),
+            actions=dict(zip(ports, speed_gain.T / step, strict=True)),
+        )
+        # one step, whose forces are filled in each time
+        self._step = step
+        boundaries = Boundaries(np.array([0.0, step]), np.arange(2), np.array([step]))
+        no_displacement = np.zeros((2, len(laws)))
+        self._steps = steps_under(
+            masses, boundaries, np.zeros((1, count)), np.zeros((1, count)), no_displacement
+        )
+        self._law_arrays = tuple(
+            laws.at(
+                laws.rows(masses.ports, count),
+                laws.rows(masses.actions, count),
+                np.zeros(len(laws)),
+                0.0,
+                self._steps.transition,
+            )
+        )
+        # state and results of the step
+        self._has_memory = memory is not None
+        memory = laws.memory() if memory is None else memory
+        self._state = ModalState(np.zeros(count), np.zeros(count), memory)
+        self._results = ModalMotion(
+            q=np.zeros((2, count)),
+            v=np.zeros((2, count)),
+            port_forces=np.zeros((2, len(laws))),
+            lagged=np.zeros((2, len(laws))),
+            memory=memory,
+        )
+
+    def speed_loss(
+        self, positions: FloatArray, speeds: FloatArray, accelerations: FloatArray
+    ) -> FloatArray:
+        """Return by how much the laws slow down the ports (P,) in the next step.
+
+        Parameters
+        ----------
+        positions, speeds : (P,) arrays
+            Motion of the ports at the begin of the step.
+        accelerations : (P,) array
+            What else accelerates the ports in the step.
+        """
+        h = self._step
+        self._state.q[:] = positions
+        self._state.v[:] = speeds
+        self._steps.push[:] = np.concatenate((0.5 * h * h * accelerations, h * accelerations))
+        self._steps.begin[:] = accelerations
+        self._steps.end[:] = accelerations
+        compiled_kernel().integrate(
+            tuple(self._steps),
+            0,
+            1,
+            0,
+            True,
+            self._has_memory,
+            self._law_arrays,
+            tuple(self._state),
+            tuple(self._results),
+        )
+        self._has_memory = True
+        return speeds + h * accelerations - self._state.v

@@ -1,0 +1,76 @@
+"""Outputs of an FMU at the samples of a trial, and their time derivatives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from discrepancy.campaign.records import FloatArray
+
+
+class OutputColumns(NamedTuple):
+    """Columns of outputs of the FMU, and how many times each is differentiated."""
+
+    columns: list[int]
+    derivatives: list[int]
+
+
+class SampledOutputs(NamedTuple):
+    """Values and rates (N, C) of outputs at the samples of a trial."""
+
+    values: FloatArray
+    rates: FloatArray
+
+
+@dataclass(frozen=True)
+class Readout:
+    """Which outputs of an FMU are read, and when.
+
+    Attributes
+    ----------
+    columns : sequence of int
+        Columns of the outputs, C of them.
+    derivatives : sequence of int
+        How many times each is differentiated in time.
+    times : (N,) ndarray
+        Times of the samples [s].
+    """
+
+    columns: Sequence[int]
+    derivatives: Sequence[int]
+    times: FloatArray
+
+
+def sample(
+    values: FloatArray, step: float, readout: Readout, still_to_derive: Sequence[int]
+) -> SampledOutputs:
+    """Return values and rates at the times of a readout, from values on an even grid.
+
+    Parameters
+    ----------
+    values : (K, C) array
+        Values at 0, `step`, 2 `step`, ...
+    step : float
+        Step of the grid [s].
+    readout : Readout
+        Outputs and times; before zero the first value holds.
+    still_to_derive : sequence of int
+        For each column, how many times the values are still to be differentiated.
+    """
+    grid = step * np.arange(len(values))
+    curve = CubicSpline(grid, values)
+    inside = np.clip(readout.times, 0.0, grid[-1])
+    sampled = curve(inside)
+    rates = curve(inside, 1)
+    for column, order in enumerate(still_to_derive):
+        if order > 0:
+            # derivatives of the derivative's own spline keep the order of the first one
+            derivative = CubicSpline(grid, curve(grid, 1)[:, column])
+            sampled[:, column] = derivative(inside, order - 1)
+            rates[:, column] = derivative(inside, order)
+    is_before = readout.times < 0.0
+    rates[is_before] = 0.0
+    sampled[np.ix_(is_before, np.array(readout.derivatives) > 0)] = 0.0
+    return SampledOutputs(np.ascontiguousarray(sampled), np.ascontiguousarray(rates))

@@ -1,0 +1,176 @@
+"""Motion of the linear system of an FMU under forces, with internal forces at its ports."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from fe.compilation import compiled_kernel
+from fe.runtime.arrays import IntArray
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
+from fmu_asset.door.runs import StateSpace
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.system.excitation import Excitation
+from discrepancy.system.time_history import SMOOTH_PARTS, equivalent_ramps
+
+MOST_SYSTEMS = 64
+"""Number of systems that are kept."""
+ROUNDING = 1e-9
+"""Share of the displacement at rest below which what a force moves at once is rounding."""
+NO_INDICES: IntArray = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class LawPorts:
+    """Where J laws act on a system.
+
+    Attributes
+    ----------
+    columns : (J,) ndarray of int
+        Output of the system that is the displacement of each law's port.
+    force_numbers : (J,) ndarray of int
+        Force of the system at each law's port.
+    rest_positions : (J,) ndarray
+        Position of each law's port without forces.
+    """
+
+    columns: IntArray
+    force_numbers: IntArray
+    rest_positions: FloatArray
+
+
+NO_PORTS = LawPorts(NO_INDICES, NO_INDICES, np.zeros(0))
+
+
+class SystemMotion(NamedTuple):
+    """States (N, n) and forces (N, E) of a system at the samples."""
+
+    states: FloatArray
+    forces: FloatArray
+
+
+def system_motion(
+    system: StateSpace,
+    excitation: Excitation,
+    start: FloatArray,
+    laws: Laws = NO_LAWS,
+    ports: LawPorts = NO_PORTS,
+    refinement: int = 1,
+    memory: FloatArray | None = None,
+) -> SystemMotion:
+    """Return the motion of a system at the samples of an excitation, with laws at ports.
+
+    Position and speed of a law's port are coordinates beside the state, from which they follow: so
+    laws act on this system as on any other.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The system that moves.
+    excitation : Excitation
+        Forces, with directions (E,).
+    start : (n,) array
+        State at the first time.
+    laws : Laws
+        J internal forces.
+    ports : LawPorts
+        Where they act.
+    refinement : int
+        Steps with laws are this many times smaller.
+    memory : array, optional
+        Memory of the laws at the first time; by default they were loaded from zero at once.
+    """
+    coupled = _with_ports(
+        system, laws.ports, tuple(ports.columns.tolist()), tuple(ports.force_numbers.tolist())
+    )
+    modal = coupled.modal
+    # steps under the forces
+    boundaries = substeps(
+        modal,
+        laws,
+        excitation.sample_times,
+        refinement,
+        SMOOTH_PARTS if excitation.is_smooth else 1,
+        excitation.edges,
+    )
+    begin, end = equivalent_ramps(
+        lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time
+    )
+    direct_displacement = excitation.loads_at(boundaries.time, system.direct[ports.columns].T)
+    steps = steps_under(modal, boundaries, begin, end, direct_displacement)
+    # ports follow from the state at the begin
+    port_rows = system.outputs[ports.columns[coupled.first_laws]]
+    rest_positions = ports.rest_positions[coupled.first_laws]
+    positions = port_rows @ start + rest_positions
+    speeds = port_rows @ system.generator @ start
+    first = Begin(
+        q=np.concatenate((positions, 0.0 * start)),
+        v=np.concatenate((speeds, start)),
+        memory=memory,
+    )
+    motion = advance(modal, laws, steps, first, compiled_kernel())
+    # what acts on the system, laws too
+    forces = excitation.loads_at(excitation.sample_times, np.eye(system.push.shape[1]))
+    np.subtract.at(forces.T, ports.force_numbers, motion.port_forces.T)
+    return SystemMotion(motion.v[:, len(positions) :], forces)
+
+
+class SystemWithPorts(NamedTuple):
+    """A system whose ports are coordinates beside the state.
+
+    Attributes
+    ----------
+    directions : (P + n, E) ndarray
+        What unit forces give to ports and state.
+    modal : ModalSystem
+        Ports and state; a state is the speed of a coordinate.
+    first_laws : (P,) ndarray of int
+        The first law at each port.
+    """
+
+    directions: FloatArray
+    modal: ModalSystem
+    first_laws: IntArray
+
+
+@lru_cache(maxsize=MOST_SYSTEMS)
+def _with_ports(
+    system: StateSpace,
+    names: tuple[str, ...],
+    columns: tuple[int, ...],
+    force_numbers: tuple[int, ...],
+) -> SystemWithPorts:
+    """Return a system with the ports of J laws as coordinates.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The system, of order n.
+    names : tuple of str
+        Port of each law.
+    columns, force_numbers : tuple of int
+        Displacement output and force of each law's port.
+    """
+    ports, first_laws = np.unique(names, return_index=True)
+    count = len(first_laws)
+    order = len(system.generator)
+    column = np.array(columns, dtype=np.int64)[first_laws]
+    number = np.array(force_numbers, dtype=np.int64)[first_laws]
+    # rates of ports and state
+    port_rates = system.outputs[column] @ system.generator
+    directions = np.vstack((port_rates @ system.push, system.push))
+    damping = np.zeros((count + order, count + order))
+    damping[:, count:] = -np.vstack((port_rates @ system.generator, system.generator))
+    # displacement that comes at once with the force
+    at_once = system.direct[column, number]
+    at_rest = system.gain[column, number]
+    modal = ModalSystem(
+        np.zeros(count + order),
+        damping,
+        dict(zip(ports, np.eye(count, count + order), strict=True)),
+        np.where(at_once > ROUNDING * at_rest, at_once, 0.0),
+        actions=dict(zip(ports, directions.T[number], strict=True)),
+    )
+    return SystemWithPorts(directions, modal, first_laws)

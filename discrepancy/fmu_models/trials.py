@@ -1,0 +1,89 @@
+"""Trials and patches as an FMU takes them."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from fe.runtime.patch import ModelPatch
+
+from discrepancy.campaign.records import Campaign, Trial, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.fmu_models.fmu_motion import FmuSimulator
+from discrepancy.system.load_change import require_release
+from discrepancy.system.response import Conditions
+
+
+def effect_parameters(
+    patch: ModelPatch,
+    effects: Mapping[str, str],
+    known_parameters: Collection[str],
+    model_name: str,
+) -> dict[str, float]:
+    """Return the parameters of the effects that an FMU carries itself.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        Any primitives.
+    effects : mapping of str to str
+        Kinds of primitives that the FMU carries, to the ids of its effects.
+    known_parameters : collection of str
+        Parameters that are set already.
+    model_name : str
+        The model as it is called in a sentence.
+
+    Raises
+    ------
+    ModelError
+        If the patch has two primitives for one effect.
+    """
+    parameters: dict[str, float] = {}
+    for primitive in patch:
+        if primitive.kind not in effects:
+            continue
+        effect = f"effect.{effects[primitive.kind]}"
+        if f"{effect}.active" in {*known_parameters, *parameters}:
+            raise ModelError(
+                f"Of the two primitives {primitive.kind!r} {model_name} carries one ({effect})."
+            )
+        parameters[f"{effect}.active"] = 1.0
+        for key, value in primitive.to_mapping().items():
+            if key != "kind":
+                parameters[f"{effect}.{key}"] = float(value)
+    return parameters
+
+
+def first_trial(campaign: Campaign, *, is_dynamic: bool) -> Trial | None:
+    """Return the first dynamic trial of a campaign, or the first at rest; None if there is none."""
+    for trial in campaign.trials:
+        if trial.is_dynamic is is_dynamic:
+            return trial
+    return None
+
+
+def bare_trial(kind: TrialKind, interval: float) -> Trial:
+    """Return a trial without readings, for scales without a campaign."""
+    count = 1 if kind is TrialKind.STATIC else 400
+    return Trial.plain("", kind, (), interval * np.arange(float(count)))
+
+
+def release_amounts(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> dict[str, float]:
+    """Return what releases an FMU, with displacement [m] and velocity [m/s]."""
+    release = require_release(trial)
+    variables = fmu.release_variables
+    if not variables:
+        raise ModelError(
+            f"The FMU model {fmu.description.name!r} cannot ring down: state in [release] the "
+            "FMU's parameter of the release displacement, or the force that holds it."
+        )
+    first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
+    if release.at_rest:
+        return {variables[0]: release.displacement * float(1.0 + first_mode[0])}
+    if len(variables) < 2:
+        raise ModelError(
+            f"The ring-down {trial.name!r} does not begin at rest, which the FMU model "
+            f"{fmu.description.name!r} can follow only if [release] names parameters of "
+            "displacement and velocity."
+        )
+    frequency = fmu.nominal_pace(trial).angular_frequency
+    amplitudes = release.displacement * first_mode * (1.0, frequency)
+    return dict(zip(variables, amplitudes.tolist(), strict=True))

@@ -1,0 +1,213 @@
+"""The variables of an FMU that a model needs, and the binding to them in SI units."""
+
+from collections.abc import Mapping
+from math import pi
+from pathlib import Path
+from typing import NamedTuple
+
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding
+from reporting.words import counted
+
+from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.units import UNITS
+from discrepancy.errors import ModelError
+from discrepancy.fmu_models.description import FmuModelDescription, FmuOutputSection
+
+REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")
+"""Units of FMUs in which an angular velocity is revolutions per minute."""
+
+
+class ObservedVariable(NamedTuple):
+    """An output of the model: its name, the variable that it shows, and its SI unit."""
+
+    name: str
+    variable: str
+    unit: str
+
+
+class FmuVariables:
+    """The variables of an FMU that a model needs.
+
+    Parameters
+    ----------
+    description : FmuModelDescription
+        The model's file.
+    folder : Path
+        Its folder, where relative names begin.
+
+    Attributes
+    ----------
+    path : Path
+        The FMU.
+    binding : Binding
+        All inputs as loads, by the FMU's names, and all outputs.
+    columns : dict of str to int
+        Column of each output of the description, of `port.NAME.displacement` and `.velocity`, and
+        of `release`.
+    quantities : dict of str to Quantity
+        What each output of the description is.
+    input_factors : dict of str to float
+        Factor of each `[[input]]` of the description, by the FMU's name: revolutions per minute
+        stand for an angular velocity and have no unit that converts to rad/s.
+
+    Raises
+    ------
+    FmuError
+        If the FMU or the binding is missing, or a variable is missing or of another causality or
+        unit.
+    ModelError
+        If an output names another number of variables than of names.
+    """
+
+    def __init__(self, description: FmuModelDescription, folder: Path) -> None:
+        self.path = folder / description.fmu
+        self._description = description
+        self._fmu = read_fmu(self.path)
+        # the binding of the user, if there is one
+        step = description.motion.step or description.static.step
+        file = description.binding_file(folder)
+        if file is None:
+            base = Binding(binding=Header(name=description.name, step_size=step))
+        else:
+            base = load_binding(file)
+        self._variables = _variables_by_name(base)
+        self._parameter_keys = {item.variable: key for key, item in base.parameter.items()}
+        self._parameter_keys |= {key: key for key in base.parameter}
+        # what the model needs
+        self.input_factors: dict[str, float] = {}
+        self.quantities: dict[str, Quantity] = {}
+        loads = self._bound_inputs()
+        parameters = self._bound_parameters(base.parameter)
+        observed = self._observed_variables()
+        self.columns = {item.name: column for column, item in enumerate(observed)}
+        outputs = Vector(
+            variables=tuple(item.variable for item in observed),
+            unit=tuple(item.unit for item in observed),
+        )
+        header = base.with_header(name=description.name, step_size=step, decimation=1)
+        self.binding = Binding(
+            binding=header.binding,
+            limits=base.limits,
+            load=loads,
+            parameter=base.parameter | parameters,
+            observation={"outputs": outputs},
+        )
+
+    def variable(self, name: str) -> str:
+        """Return the FMU's name of an input or output that the description names."""
+        return self._variables.get(name, name)
+
+    def parameter(self, name: str) -> str:
+        """Return the key under which a parameter is set: the binding's key, or the FMU's name."""
+        return self._parameter_keys.get(name, name)
+
+    def _bound_inputs(self) -> dict[str, Input]:
+        """Return the inputs that trials set, by the FMU's names; note factors of `[[input]]`."""
+        description = self._description
+        inputs = description.inputs
+        units: dict[str | None, str] = dict.fromkeys(inputs.force.values(), "N")
+        units[inputs.load_factor] = "1"
+        for region_input in inputs.regions.values():
+            units[region_input] = "1"
+        units[inputs.temperature] = "K" if inputs.temperature_reference is None else "degC"
+        units[inputs.bending_moment] = "N.m"
+        units[inputs.torque] = "N.m"
+        if description.release is not None:
+            units[description.release.hold] = "N"
+        for port in description.port:
+            units[port.force] = "N.m" if port.rotation else "N"
+        for section in description.input:
+            unit = self._unit_of_variable(section.variable)
+            is_angular_velocity = section.quantity is Quantity.ANGULAR_VELOCITY
+            is_in_revolutions = is_angular_velocity and unit in REVOLUTIONS
+            variable = self.variable(section.variable)
+            self.input_factors[variable] = 30.0 / pi if is_in_revolutions else 1.0
+            if not is_in_revolutions:
+                unit = self._unit_of_quantity(section.quantity, section.variable)
+            units[section.variable] = unit
+        bound: dict[str, Input] = {}
+        for name, unit in units.items():
+            if name is not None:
+                variable = self.variable(name)
+                bound[variable] = Input(variable=variable, unit=unit)
+        return bound
+
+    def _bound_parameters(self, known: Mapping[str, Parameter]) -> dict[str, Parameter]:
+        """Return the parameters that the binding does not have, or has in another unit.
+
+        The value and the range that the binding has in another unit are left out.
+        """
+        description = self._description
+        units: dict[str | None, str] = {item.variable: item.unit for item in description.parameter}
+        if description.release is not None:
+            units[description.release.displacement] = "m"
+            units[description.release.velocity] = "m/s"
+        bound: dict[str, Parameter] = {}
+        for name, unit in units.items():
+            if name is None:
+                continue
+            key = self.parameter(name)
+            if key not in known or unit != known[key].unit:
+                variable = known[key].variable if key in known else key
+                bound[key] = Parameter(variable=variable, unit=unit)
+        return bound
+
+    def _observed_variables(self) -> list[ObservedVariable]:
+        """Return the outputs of the description, then those of ports and of the release."""
+        description = self._description
+        observed: list[ObservedVariable] = []
+        for section in description.output:
+            observed += self._expanded_outputs(section)
+        for port in description.port:
+            unit = "rad" if port.rotation else "m"
+            name = f"port.{port.name}"
+            displacement = self.variable(port.displacement)
+            observed.append(ObservedVariable(f"{name}.displacement", displacement, unit))
+            if port.velocity is not None:
+                velocity = self.variable(port.velocity)
+                observed.append(ObservedVariable(f"{name}.velocity", velocity, f"{unit}/s"))
+        if description.release is not None and description.release.output is not None:
+            output = self.variable(description.release.output)
+            observed.append(ObservedVariable("release", output, "m"))
+        return observed
+
+    def _expanded_outputs(self, section: FmuOutputSection) -> list[ObservedVariable]:
+        """Return the outputs of a section, which may be several; note their quantity."""
+        names = expand(section.name)
+        variables = expand(section.variable)
+        if len(names) != len(variables):
+            raise ModelError(
+                f"The FMU model {self._description.name!r}: the output {section.name!r} stands for "
+                f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as "
+                "many."
+            )
+        outputs = []
+        for name, variable in zip(names, variables, strict=True):
+            self.quantities[name] = section.quantity
+            unit = self._unit_of_quantity(section.quantity, variable)
+            outputs.append(ObservedVariable(name, self.variable(variable), unit))
+        return outputs
+
+    def _unit_of_quantity(self, quantity: Quantity, variable: str) -> str:
+        """Return the SI unit of a quantity as FMUs write it, of a signal the variable's own."""
+        if quantity is Quantity.SIGNAL:
+            return self._unit_of_variable(variable)
+        return UNITS[quantity].si.replace(" ", ".")
+
+    def _unit_of_variable(self, name: str) -> str:
+        """Return the unit that the FMU declares for a variable, "1" if it declares none."""
+        variable = self._fmu.variable(self.variable(name))
+        if variable is None:
+            return "1"
+        return variable.unit or "1"
+
+
+def _variables_by_name(binding: Binding) -> dict[str, str]:
+    """Return the variables of the FMU by the names of a binding, with and without their role."""
+    variables: dict[str, str] = {}
+    for role in ("monitor", "load", "health", "control"):
+        for key, item in getattr(binding, role).items():
+            variables[key] = item.variable
+            variables[f"{role}.{key}"] = item.variable
+    return variables

@@ -1,0 +1,97 @@
+"""What a patch changes of recorded loads, and the words of a trial for where loads act."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from fe.runtime.patch import LoadGain, LoadPlace, Primitive
+
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import FloatArray, Trial
+from discrepancy.errors import ModelError
+from discrepancy.system.response import Place
+
+DEFAULT_PLACE = "tip_load"
+"""Load place of a campaign that names none; a model with one input takes that one."""
+
+
+class LoadChange(NamedTuple):
+    """How the acting load differs from the recorded one.
+
+    Attributes
+    ----------
+    gain, tare : float
+        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not
+        zero.
+    along_span, along_chord : float
+        How far the acting force is moved [m].
+    """
+
+    gain: float = 0.0
+    tare: float = 0.0
+    along_span: float = 0.0
+    along_chord: float = 0.0
+
+    @classmethod
+    def of_patch(cls, patch: Iterable[Primitive]) -> "LoadChange":
+        """Return the change by all gains and places of a patch, one applied after the other."""
+        change = cls()
+        for primitive in patch:
+            if isinstance(primitive, LoadGain):
+                change = change._replace(
+                    gain=(1.0 + change.gain) * (1.0 + primitive.gain) - 1.0,
+                    tare=change.tare * (1.0 + primitive.gain) + primitive.tare,
+                )
+            elif isinstance(primitive, LoadPlace):
+                change = change._replace(
+                    along_span=change.along_span + primitive.along_span,
+                    along_chord=change.along_chord + primitive.along_chord,
+                )
+        return change
+
+    def apply_to(self, values: FloatArray, recorded: FloatArray) -> FloatArray:
+        """Return the acting load (N,) [N or N m].
+
+        Parameters
+        ----------
+        values : (N,) array
+            The recorded values, with a constant that they may lack.
+        recorded : (N,) array
+            The recorded values themselves; where they are zero there is no tare.
+        """
+        return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
+
+
+def choose_load_place(
+    places: Sequence[str], place: Place, model_name: str, where: str = "a trial"
+) -> str:
+    """Return the load place of a model that a trial means: the only one where the trial names none.
+
+    Parameters
+    ----------
+    places : sequence of str
+        The load places of the model.
+    place : str or (float, float)
+        What the trial names.
+    model_name, where : str
+        Model and trial as they are called in a sentence.
+
+    Raises
+    ------
+    ModelError
+        If the model has no such place, or the trial names none of several.
+    """
+    if place == DEFAULT_PLACE and place not in places and len(places) == 1:
+        return places[0]
+    if isinstance(place, str) and place in places:
+        return place
+    problem = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
+    forces = f"forces at {', '.join(places)}: name one of these" if places else "no force"
+    raise ModelError(f"In {where} {problem}, and {model_name} takes {forces}.")
+
+
+def require_release(trial: Trial) -> Release:
+    """Return how a ring-down began; raises `ModelError` if the trial does not say it."""
+    if trial.release is None:
+        raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+    return trial.release

@@ -1,0 +1,431 @@
+"""A lumped linear structure as a model, with named inputs, outputs and ports."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
+from discrepancy.campaign.units import UNITS
+from discrepancy.errors import ModelError
+from discrepancy.system.excitation import Excitation, Load
+from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.load_change import LoadChange, choose_load_place
+from discrepancy.system.lumped_file import BLOCKS, LumpedDescription
+from discrepancy.system.lumped_sections import InputSection, OutputSection
+from discrepancy.system.model_file import DescribedModel
+from discrepancy.system.output_equation import Feedthrough, OutputEquation
+from discrepancy.system.response import EITHER, MOVES, TURNS, Outputs, Place
+from discrepancy.system.rig import OffsetInput, Rig, build_rig
+from discrepancy.system.system_model import SystemModel
+from discrepancy.system.system_state import LoadsAndMotions, PatchedTrial, SystemState
+from discrepancy.system.time_history import FormulaHistory, RecordedHistory
+from fe.runtime import patch as changes
+from fe.runtime.laws import LAWS
+from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
+from fe.runtime.state import Losses
+from reporting.words import comma_list
+
+MOST_MODES = 8
+"""Modes with inertia of a structure on springs; the others follow without inertia."""
+
+
+class LumpedModel(DescribedModel, SystemModel):
+    """A lumped model (`discrepancy.system.interface.Model`).
+
+    Damping that is given as modal ratios stays at these ratios when the structure changes. Health
+    (z1, z2) has no meaning here and is ignored.
+
+    Parameters
+    ----------
+    description : LumpedDescription
+        Content of its file.
+    """
+
+    follows_windows: ClassVar[bool] = True
+
+    cache_size = 256
+
+    def __init__(self, description: LumpedDescription) -> None:
+        self.description = description
+        super().__init__(
+            description, {output.name: output.quantity for output in description.output}
+        )
+        self.load_places = tuple(section.name for section in description.input)
+        self.kinds = _trial_kinds(description)
+        self.length = description.characteristic_length
+        self.port_rows = {}
+        self.law_directions = {}
+        for port in description.port:
+            self.port_rows[port.name] = description.padded(port.vector)
+            self.law_directions[port.name] = description.padded(port.acts or port.vector)
+        self._places = sorted(description.place, key=lambda place: place.station)
+        if self._places:
+            self.stations = (self._places[0].station, self._places[-1].station)
+        self._inputs = {section.name: section for section in description.input}
+        self._outputs = {section.name: section for section in description.output}
+
+    @classmethod
+    def load(cls, path: Path | str) -> "LumpedModel":
+        """Return the model of a TOML file, or a shipped one by name; raises `ModelError`."""
+        return cls(LumpedDescription.read(path))
+
+    # ------------------------------------------------------------ what it is
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Return whether the model can carry a primitive."""
+        description = self.description
+        rows = self.port_rows.values()
+        if primitive in LAWS:
+            # a law of displacement needs one: the position of a state's port has no meaning
+            displacement_count = description.displacement_count
+            all_move = all(np.any(row[:displacement_count]) for row in rows)
+            return bool(self.port_rows) and (primitive.of_speed or all_move)
+        can_move_load = any(section.station_derivative is not None for section in description.input)
+        carried: dict[type[Primitive], bool] = {
+            changes.StiffnessDrift: description.displacement_count > 0,
+            changes.ModulusTemperature: True,
+            changes.PointMass: bool(self._places),
+            changes.RootCompliance: description.root is not None,
+            changes.LoadGain: True,
+            changes.LoadPlace: can_move_load,
+            PortLoad: bool(self.port_rows),
+        }
+        return carried.get(primitive, primitive in SENSORS)
+
+    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+        """Return one row without losses: health has no meaning here."""
+        return [()]
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether it has a mode that vibrates."""
+        mean_state = SystemState(tuple(self.prior_mean().tolist()))
+        return bool(np.any(self.system(mean_state).angular_frequency > 0.0))
+
+    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+        """Return the laws that the model itself has at ports, each times its factor."""
+        if self.linear:
+            return NO_PATCH
+        factors = self._factors(parameters.tolist())
+        return ModelPatch(
+            tuple(law.scaled_force(factors.get(law.name, 1.0)) for law in self.description.law)
+        )
+
+    # ------------------------------------------------------------ what acts in a trial
+
+    def force_row(
+        self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
+    ) -> FloatArray:
+        """Return the load (N,) of 1 N at a place, or of one unit of another input."""
+        load_change = LoadChange.of_patch(change)
+        return self._input_direction(self.rig(state), self._input_at(place), load_change)
+
+    def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
+        """Return the loads and the prescribed motions in a trial.
+
+        A motion that an input can prescribe and that the trial does not record is zero if an output
+        is its reaction; else it is free.
+        """
+        trial = case.trial
+        rig = self.rig(case.state)
+        description = self.description
+        still = RecordedHistory(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0)
+        motions = {item.reaction: still for item in description.output if item.reaction is not None}
+        # constant loads and references of controllers
+        always = RecordedHistory(trial.time, np.ones(len(trial.time)))
+        constant = [
+            Load(rig.load_direction(item, item.vector), always) for item in description.load
+        ]
+        inputs = self._offset_inputs(case)
+        loads = constant + rig.loads_of_references(trial, inputs)
+        # recorded loads and motions
+        references = {loop.section.reference for loop in rig.loops.values()}
+        change = LoadChange.of_patch(case.patch)
+        for name, offset_input in inputs.items():
+            if name in references:
+                continue
+            section = self._section_of(trial, offset_input.recorded)
+            if section.quantity.moving:
+                motions[name] = _prescribed_motion(trial, offset_input, rig.factor(name))
+            else:
+                direction = self._input_direction(rig, section, change)
+                loads.append(Load(direction, _load_history(trial, offset_input, change)))
+        # forces by a formula in time
+        for primitive in case.patch:
+            if isinstance(primitive, PortLoad):
+                loads.append(self._port_load(primitive))
+        return LoadsAndMotions(loads, motions)
+
+    def _port_load(self, primitive: PortLoad) -> Load:
+        """Return the load of a force by a formula; raises `ModelError` if there is no such port."""
+        if primitive.port not in self.law_directions:
+            raise ModelError(
+                f"A force acts at the port {primitive.port!r}, which {self.name!r} does not have; "
+                f"it has {comma_list(self.law_directions)}."
+            )
+        spans = tuple(window.span for window in primitive.windows)
+        history = FormulaHistory(course_of(primitive.force, primitive.kind), spans)
+        return Load(self.law_directions[primitive.port], history)
+
+    def _offset_inputs(self, case: PatchedTrial) -> dict[str, OffsetInput]:
+        """Return the recorded inputs of a trial, or its force at its load place, by name."""
+        trial = case.trial
+        recorded = trial.inputs
+        if trial.kind is not TrialKind.DRIVEN:
+            section = self._input_at(trial.load_place)
+            recorded = (RecordedInput(section.name, section.quantity, trial.force, trial.hold),)
+        missing_offsets = (0.0,) * len(recorded)
+        offsets = (*case.conditions.offset, *missing_offsets)
+        pairs = zip(recorded, offsets, strict=False)
+        return {item.name: OffsetInput(item, offset) for item, offset in pairs}
+
+    def _section_of(self, trial: Trial, recorded: RecordedInput) -> InputSection:
+        """Return the input of the model that a trial records.
+
+        Raises
+        ------
+        ModelError
+            If the model has no such input, or one of another quantity, or if a motion that is
+            prescribed goes in steps or corners.
+        """
+        section = self._inputs.get(recorded.name)
+        if section is None:
+            raise ModelError(
+                f"The trial {trial.name!r} records the input {recorded.name!r}, which {self.what} "
+                f"does not have; it has {comma_list(self._inputs)}."
+            )
+        moving = section.quantity.moving
+        if recorded.quantity is not section.quantity and recorded.quantity not in moving:
+            raise ModelError(
+                f"The input {recorded.name!r} of {self.what} is {section.quantity.value}, but the "
+                f"trial {trial.name!r} records {recorded.quantity.value}."
+            )
+        if moving and recorded.hold not in (None, Hold.SMOOTH):
+            raise ModelError(
+                f"The input {recorded.name!r} of the trial {trial.name!r} is a motion that "
+                f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
+                "`reference` and `hold` out."
+            )
+        return section
+
+    def _input_at(self, place: Place) -> InputSection:
+        """Return the input of a load place; raises `ModelError` if there is none."""
+        candidates = [
+            name
+            for name, section in self._inputs.items()
+            if name == place or not section.quantity.moving
+        ]
+        return self._inputs[choose_load_place(candidates, place, self.what)]
+
+    def _input_direction(self, rig: Rig, section: InputSection, change: LoadChange) -> FloatArray:
+        """Return the load (N,) of one unit of an input whose place may have been moved."""
+        row = np.array(section.vector)
+        if change.along_span or change.along_chord:
+            if section.station_derivative is None:
+                raise ModelError(
+                    f"The input {section.name!r} of {self.name!r} declares no station_derivative, "
+                    "so its place cannot move."
+                )
+            row = row + change.along_span * np.array(section.station_derivative)
+        return rig.load_direction(section, row)
+
+    # ------------------------------------------------------------ outputs
+
+    def output_equations(
+        self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
+    ) -> list[OutputEquation]:
+        """Return what each output shows under an excitation; None: at rest."""
+        equations = []
+        for name, quantity in outputs:
+            section = self._outputs[name]
+            if section.vector is not None:
+                equation = self._vector_equation(section, section.vector, quantity)
+            elif section.controller is not None:
+                equation = self._controller_equation(section.controller, case, excitation)
+            else:
+                equation = self._reaction_equation(section, case, excitation)
+            equations.append(equation)
+        return equations
+
+    def _vector_equation(
+        self, section: OutputSection, vector: Sequence[float], quantity: Quantity
+    ) -> OutputEquation:
+        """Return what an output shows that is a sum of unknowns, as the quantity that is wanted."""
+        derivatives = 0
+        if quantity is not section.quantity:
+            derivatives = quantity.derivatives_of(section.quantity)
+        description = self.description
+        equation = OutputEquation.of_row(
+            description.padded(vector),
+            displacement_derivative=section.quantity.order + derivatives,
+            state_derivative=derivatives,
+            state_count=description.unknown_count - description.displacement_count,
+        )
+        constant = 0.0 if derivatives else section.constant
+        return OutputEquation(equation.rows, constant=constant)
+
+    def _controller_equation(
+        self, controller: str, case: PatchedTrial, excitation: Excitation | None
+    ) -> OutputEquation:
+        """Return what an output shows that is what a controller puts out."""
+        loop = self.rig(case.state).loops[controller]
+        along = loop.direction / float(loop.direction @ loop.direction)
+        references: list[Load] = []
+        if excitation is not None:
+            references = loop.reference_loads(case.trial, self._offset_inputs(case))
+        feedthrough = [Feedthrough(float(load.direction @ along), load) for load in references]
+        return OutputEquation(loop.output_rows, feedthrough=feedthrough)
+
+    def _reaction_equation(
+        self, section: OutputSection, case: PatchedTrial, excitation: Excitation | None
+    ) -> OutputEquation:
+        """Return what an output shows that is the force by which a motion is prescribed."""
+        drives = [] if excitation is None else list(excitation.prescribed_motions)
+        if excitation is None or section.reaction not in drives:
+            raise ModelError(
+                f"The output {section.name!r} of {self.name!r} is the reaction of "
+                f"{section.reaction!r}, whose motion this trial does not prescribe."
+            )
+        system = self.system(case.state._replace(drives=tuple(drives)))
+        along = system.drive_shapes[:, drives.index(section.reaction)]
+        rows = [
+            along @ system.stiffness,
+            along @ system.damping,
+            along @ system.mass,
+            0.0 * along,
+        ]
+        feedthrough = [
+            Feedthrough(-float(load.direction @ along), load) for load in excitation.loads
+        ]
+        return OutputEquation(np.array(rows), feedthrough=feedthrough, law_direction=along)
+
+    # ------------------------------------------------------------ units of ports
+
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of a force at a port and of what it acts on.
+
+        The port moves or turns as the unknowns of which it is a sum or difference do, and these as
+        what is measured or prescribed of them.
+        """
+        row = self.port_rows.get(port)
+        if row is None:
+            return EITHER
+        if not np.any(row[: self.description.displacement_count]):
+            return self._units_of_state_port()
+        if not np.all(np.isin(row, (-1.0, 0.0, 1.0))):
+            return EITHER
+        units_by_unknown = self._units_by_unknown()
+        units: set[tuple[str, str]] = set()
+        for unknown in np.flatnonzero(row).tolist():
+            units |= units_by_unknown.get(unknown, {MOVES, TURNS})
+        return units.pop() if len(units) == 1 else EITHER
+
+    def _units_of_state_port(self) -> tuple[str, str]:
+        """Return the units of a flow at a port of a state, and of the state."""
+        first_state = self.description.displacement_count
+        quantities = {
+            output.quantity
+            for output in self.description.output
+            if output.vector and any(output.vector[first_state:])
+        }
+        unit = UNITS[quantities.pop()].si if len(quantities) == 1 else "of the state's unit"
+        return f"{unit}/s times capacity", unit
+
+    def _units_by_unknown(self) -> dict[int, set[tuple[str, str]]]:
+        """Return units of force and motion by unknown, of those measured or prescribed alone."""
+        units: dict[int, set[tuple[str, str]]] = {}
+        sections: list[InputSection | OutputSection] = [*self.description.output]
+        sections += self.description.input
+        for section in sections:
+            vector = section.vector or ()
+            moving = section.quantity.moving
+            if moving and np.count_nonzero(vector) == 1 and max(vector) == 1.0:
+                unit = TURNS if Quantity.ANGLE in moving else MOVES
+                units.setdefault(vector.index(1.0), set()).add(unit)
+        return units
+
+    # ------------------------------------------------------------ matrices
+
+    def _factors(self, parameters: Sequence[float]) -> dict[str, float]:
+        """Return the factors of the terms at values of the parameters."""
+        factors: dict[str, float] = {}
+        for section, value in zip(self.description.parameter, parameters, strict=True):
+            for term in section.terms:
+                factors[term] = factors.get(term, 1.0) * value
+        return factors
+
+    @cached_property
+    def rig(self) -> Callable[[SystemState], Rig]:
+        """The function that returns the matrices and controllers in a state, with a cache."""
+
+        def build(state: SystemState) -> Rig:
+            factors = self._factors(state.parameters)
+            return build_rig(self.description, factors, state, self._places)
+
+        return lru_cache(self.cache_size)(build)
+
+    def build_system(self, state: SystemState) -> LinearSystem:
+        """Return the system in a state, with its prescribed motions and controllers."""
+        description = self.description
+        rig = self.rig(state)
+        count = description.unknown_count
+        # stiffness, damping and mass, by the derivative that they multiply
+        matrices = np.zeros((3, count, count))
+        for kind, block in BLOCKS.items():
+            matrices[block.derivative] += rig.matrices[kind]
+        first_integral = description.displacement_count + description.state_count
+        integrals = np.arange(first_integral, count)
+        matrices[2, integrals, integrals] = 1.0
+        if state.controlled:
+            for loop in rig.loops.values():
+                output_rows = loop.output_rows
+                for derivative in range(3):
+                    matrices[derivative] += np.outer(
+                        loop.error_integral, loop.measured[derivative]
+                    ) - np.outer(loop.direction, output_rows[derivative])
+        stiffness, damping, mass = matrices
+        beta = None if description.damping is None else description.damping.beta
+        drives = [description.padded(self._inputs[name].vector) for name in state.drives]
+        return LinearSystem(
+            mass,
+            damping,
+            stiffness,
+            self.port_rows,
+            mode_count=MOST_MODES if description.is_plain else None,
+            relaxation=rig.factor("damping") * (beta or 0.0),
+            state_count=count - description.displacement_count,
+            drives=np.array(drives),
+            actions=self.law_directions,
+        )
+
+
+def _trial_kinds(description: LumpedDescription) -> frozenset[TrialKind]:
+    """Return the kinds of trials that a lumped model can follow."""
+    kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
+    if not description.is_plain:
+        kinds -= {TrialKind.RINGDOWN}
+    if description.free:
+        # nothing holds it at rest
+        kinds -= {TrialKind.STATIC}
+    return kinds
+
+
+def _prescribed_motion(trial: Trial, offset_input: OffsetInput, factor: float) -> RecordedHistory:
+    """Return the motion that an input prescribes, times a factor of it."""
+    order = offset_input.recorded.quantity.order
+    return RecordedHistory(
+        trial.time, factor * offset_input.values, Hold.SMOOTH, motion_order=order
+    )
+
+
+def _load_history(trial: Trial, offset_input: OffsetInput, change: LoadChange) -> RecordedHistory:
+    """Return the course of an input that loads, a force with gain and tare of a patch."""
+    recorded = offset_input.recorded
+    values = offset_input.values
+    if recorded.quantity in (Quantity.FORCE, Quantity.TORQUE):
+        values = change.apply_to(values, recorded.values)
+    return RecordedHistory(trial.time, values, recorded.hold)

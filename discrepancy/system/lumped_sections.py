@@ -1,0 +1,213 @@
+"""Tables of a lumped model's file: damping, loads, outputs, ports, laws and controllers."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Annotated, Literal
+
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import LAWS
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.patch import ModelPatch
+from pydantic import BeforeValidator, ConfigDict, Field
+from reporting.toml_file import Fault, Name, NotNegative, Number
+
+from discrepancy.campaign.records import Quantity
+from discrepancy.system.model_file import NamedSection, ParameterSection, Section
+
+GAINS = ("proportional", "derivative", "integral")
+"""Gains of a controller; NAME.proportional is what a parameter scales."""
+
+
+def as_list(value: object) -> list[object] | tuple[object, ...]:
+    """Return one number as a list: with one unknown nobody needs brackets."""
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def _as_rows(value: object) -> object:
+    """Return a matrix by rows, also from its only row or from one number."""
+    entries = as_list(value)
+    if entries and isinstance(entries[0], list | tuple):
+        return entries
+    return [entries]
+
+
+def _as_matrix(value: object) -> object:
+    """Return a matrix by rows, also from its diagonal or from one number."""
+    entries = as_list(value)
+    if entries and isinstance(entries[0], list | tuple):
+        return entries
+    rows: list[list[object]] = []
+    for row, entry in enumerate(entries):
+        rows.append([0.0] * len(entries))
+        rows[row][row] = entry
+    return rows
+
+
+Vector = Annotated[tuple[Number, ...], Field(min_length=1), BeforeValidator(as_list)]
+Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_rows)]
+Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_matrix)]
+Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
+"""Share of critical damping; above one a mode is overdamped, far above a percentage was meant."""
+
+
+class Damping(Section):
+    """`[damping]`: modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
+
+    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(as_list)] | None = None
+    matrix: Matrix | None = None
+    alpha: NotNegative | None = None
+    beta: NotNegative | None = None
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield the fault that there is not exactly one kind of damping."""
+        has_coefficients = self.alpha is not None or self.beta is not None
+        kinds = [self.ratios is not None, self.matrix is not None, has_coefficients]
+        yield kinds.count(True) != 1, "give exactly one of ratios, matrix, or alpha and beta"
+
+
+class PartSection(NamedSection):
+    """`[[mass_part]]` and the like: a part that a parameter can scale, added to the base matrix."""
+
+    matrix: Matrix
+
+
+class NamedVector(NamedSection):
+    """A row of the unknowns with a name."""
+
+    vector: Vector
+
+
+class LoadSection(NamedVector):
+    """`[[load]]`: a constant load; with `through`, the matrix of that name times the vector."""
+
+    through: Name | None = None
+
+
+class InputSection(LoadSection):
+    """`[[input]]`: what acts along a vector, and how the vector changes along the structure [1/m].
+
+    A motion (displacement, velocity, acceleration, of an angle too) is prescribed to vector . u;
+    anything else is a load, vector times its value, or with `through` the part of that name times
+    vector times it.
+    """
+
+    quantity: Quantity = Quantity.FORCE
+    station_derivative: Vector | None = None
+
+
+class OutputSection(NamedSection):
+    """`[[output]]`: what can be measured; velocity and acceleration come from a displacement.
+
+    vector . u + constant, or the force by which a prescribed motion is made (`reaction`, an input's
+    name), or what a controller gives (`controller`, its name).
+    """
+
+    vector: Vector | None = None
+    quantity: Quantity = Quantity.DISPLACEMENT
+    reaction: Name | None = None
+    controller: Name | None = None
+    constant: Number = 0.0
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield the faults of more than one kind, and of a reaction that is no force."""
+        kinds = [kind for kind in (self.vector, self.reaction, self.controller) if kind is not None]
+        yield (
+            len(kinds) != 1,
+            f"the output {self.name!r} needs one of a vector, a reaction and a controller",
+        )
+        is_force = self.quantity in (Quantity.FORCE, Quantity.TORQUE)
+        yield (
+            self.reaction is not None and not is_force,
+            f'output {self.name!r} is a reaction: give it quantity = "force" or "torque"',
+        )
+
+
+class CouplingSection(Section):
+    """`[coupling]` between n displacements and m states."""
+
+    force_of_states: Rows | None = None
+    flow_of_speeds: Rows | None = None
+    flow_of_displacements: Rows | None = None
+
+
+class PortSection(NamedVector):
+    """`[[port]]`: where an internal force can act, between structure and ground or within it.
+
+    A port sees vector . u or vector . x, and a law there acts against it along the same vector, or
+    along `acts`: what flows out of one store by its own level and into the next has vector [1, 0],
+    acts [1, -1].
+    """
+
+    acts: Vector | None = None
+
+
+class LawSection(Section):
+    """`[[law]]`: a law that the model has at a port; other keys are the numbers of its `kind`."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    name: Name
+    kind: Name
+    port: Name
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield the faults of a law of an unknown kind, or with numbers that it cannot have."""
+        kinds = [law.kind for law in LAWS]
+        yield (
+            self.kind not in kinds,
+            f"the law {self.name!r} has the kind {self.kind!r}, but known are {', '.join(kinds)}",
+        )
+        try:
+            self.scaled_force(1.0).check()
+        except InvalidPatchError as cause:
+            yield True, f"the law {self.name!r}: {cause}"
+
+    def scaled_force(self, factor: float) -> PortForce:
+        """Return the law with its force multiplied by a factor."""
+        row = {"kind": self.kind, "port": self.port, **(self.model_extra or {})}
+        (law,) = ModelPatch.from_list([row], f"the law {self.name!r}")
+        assert isinstance(law, PortForce)  # the kind is checked
+        return replace(law, **{name: factor * getattr(law, name) for name in law.proportional})
+
+
+class ControllerSection(NamedSection):
+    """`[[controller]]`: a force acts . (P e + D e' + I s), e = reference - vector . z, s' = e.
+
+    z are the unknowns, or their speeds where `quantity` is a speed; the reference is an input of
+    the campaign with the controller's `reference` as its name, and zero in a trial that does not
+    record it. With `derivative_of = "measurement"` D acts on -vector . z' alone.
+    """
+
+    vector: Vector
+    acts: Vector
+    quantity: Quantity
+    reference: Name | None = None
+    proportional: Number = 0.0
+    derivative: Number = 0.0
+    integral: Number = 0.0
+    derivative_of: Literal["error", "measurement"] = "error"
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield the fault of a controller without a gain."""
+        has_gain = self.proportional or self.derivative or self.integral
+        yield not has_gain, f"controller {self.name!r} has no gain: give one of {', '.join(GAINS)}"
+
+
+class PlaceSection(NamedVector):
+    """`[[place]]`: where a mass can sit; the stations [m] of places make a line."""
+
+    station: Number
+
+
+class RootSection(Section):
+    """`[root]`: motion of the unknowns when the whole turns rigidly about the root [m/rad]."""
+
+    lever: Vector
+
+
+class ScaledParameter(ParameterSection):
+    """`[[parameter]]`: a factor of the terms named."""
+
+    terms: Annotated[tuple[Name, ...], BeforeValidator(as_list)]
+    mean: Number = 1.0
+    low: NotNegative

@@ -1,0 +1,277 @@
+"""Matrices and controllers of a lumped model in a state."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass, RootCompliance
+from scipy.linalg import eigh
+
+from discrepancy.campaign.records import FloatArray, Hold, RecordedInput, Trial
+from discrepancy.errors import ModelError
+from discrepancy.system.excitation import Load
+from discrepancy.system.lumped_file import LumpedDescription
+from discrepancy.system.lumped_sections import (
+    GAINS,
+    ControllerSection,
+    Damping,
+    LoadSection,
+    PlaceSection,
+)
+from discrepancy.system.output_equation import OutputEquation
+from discrepancy.system.system_state import SystemState
+from discrepancy.system.time_history import RecordedHistory
+
+LEAST_STIFFNESS = 0.05
+"""A temperature that leaves less than this share of the stiffness is refused."""
+
+
+class OffsetInput(NamedTuple):
+    """A recorded input, and the constant that its readings lack [SI]."""
+
+    recorded: RecordedInput
+    offset: float
+
+    @property
+    def values(self) -> FloatArray:
+        """The values (N,) that acted."""
+        return self.recorded.values + self.offset
+
+
+@dataclass(frozen=True)
+class ControlLoop:
+    """A controller in a rig of N unknowns, with its gains times their factors.
+
+    Attributes
+    ----------
+    section : ControllerSection
+        The controller in the file.
+    proportional, derivative, integral : float
+        Gains.
+    measured : (4, N) ndarray
+        What it measures, as `OutputEquation.rows`.
+    direction : (N,) ndarray
+        Load for a controller output of one.
+    error_integral : (N,) ndarray
+        Row of the unknown that is the integral of the error; zero without an integral gain.
+    """
+
+    section: ControllerSection
+    proportional: float
+    derivative: float
+    integral: float
+    measured: FloatArray
+    direction: FloatArray
+    error_integral: FloatArray
+
+    @property
+    def output_rows(self) -> FloatArray:
+        """What the controller puts out without a reference (4, N), as `OutputEquation.rows`."""
+        measured_rate = np.roll(self.measured, 1, axis=0)
+        rows = -self.proportional * self.measured - self.derivative * measured_rate
+        rows[1] += self.integral * self.error_integral
+        return rows
+
+    def reference_loads(self, trial: Trial, inputs: Mapping[str, OffsetInput]) -> list[Load]:
+        """Return what the recorded reference of the controller does, as loads.
+
+        Raises
+        ------
+        ModelError
+            If the reference has another quantity than the controller, or goes in steps that have no
+            derivative.
+        """
+        section = self.section
+        if section.reference is None or section.reference not in inputs:
+            return []
+        reference = inputs[section.reference]
+        recorded = reference.recorded
+        if recorded.quantity is not section.quantity:
+            raise ModelError(
+                f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
+                f"{trial.name!r} records its reference {recorded.name!r} as "
+                f"{recorded.quantity.value}."
+            )
+        history = RecordedHistory(trial.time, reference.values, recorded.hold)
+        loads = [Load(self.proportional * self.direction + self.error_integral, history)]
+        if self.derivative != 0.0 and section.derivative_of == "error":
+            if history.hold is Hold.ZERO_ORDER:
+                raise ModelError(
+                    f"The reference {section.reference!r} of the trial {trial.name!r} goes in "
+                    f"steps, which the controller {section.name!r} cannot differentiate: say "
+                    "derivative_of = 'measurement' in the model, or hold = 'linear' in the "
+                    "campaign."
+                )
+            loads.append(Load(self.derivative * self.direction, history, derivative=1))
+        return loads
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A lumped model at values of its parameters, under a patch of its structure.
+
+    Attributes
+    ----------
+    factors : mapping of str to float
+        Factors of the terms by name.
+    matrices : mapping of str to (N, N) ndarray
+        Matrices by kind, and their parts by name.
+    loops : mapping of str to ControlLoop
+        Controllers by name.
+    """
+
+    factors: Mapping[str, float]
+    matrices: Mapping[str, FloatArray]
+    loops: Mapping[str, ControlLoop]
+
+    def factor(self, name: str) -> float:
+        """Return the factor of a term, one if no parameter scales it."""
+        return self.factors.get(name, 1.0)
+
+    def load_direction(self, section: LoadSection, row: Sequence[float] | FloatArray) -> FloatArray:
+        """Return a load (N,) along a row, through the matrix and with the factor of its section."""
+        direction = np.zeros(len(self.matrices["mass"]))
+        direction[: len(row)] = row
+        if section.through is not None:
+            direction = self.matrices[section.through] @ direction
+        return np.asarray(self.factor(section.name) * direction)
+
+    def loads_of_references(self, trial: Trial, inputs: Mapping[str, OffsetInput]) -> list[Load]:
+        """Return what the recorded references of all controllers do, as loads."""
+        loads: list[Load] = []
+        for loop in self.loops.values():
+            loads += loop.reference_loads(trial, inputs)
+        return loads
+
+
+def build_rig(
+    description: LumpedDescription,
+    factors: Mapping[str, float],
+    state: SystemState,
+    places: Sequence[PlaceSection],
+) -> Rig:
+    """Return a lumped model in a state.
+
+    Parameters
+    ----------
+    description : LumpedDescription
+        The file's content.
+    factors : mapping of str to float
+        Factors of the terms by name, from the values of the parameters.
+    state : SystemState
+        The structural patch and the temperature.
+    places : sequence of PlaceSection
+        Places of masses in the order of their stations.
+
+    Raises
+    ------
+    ModelError
+        If the temperature leaves too little of the stiffness.
+    """
+    softening = state.temperature_rise * sum(
+        primitive.coefficient
+        for primitive in state.structure
+        if isinstance(primitive, ModulusTemperature)
+    )
+    remaining = 1.0 - softening
+    if remaining < LEAST_STIFFNESS:
+        raise ModelError(
+            f"The temperature leaves {remaining:.2g} of the stiffness, which none has."
+        )
+    warm_factors = {**factors, "stiffness": factors.get("stiffness", 1.0) * remaining}
+    matrices = description.scaled_matrices(warm_factors)
+    n = description.displacement_count
+    if n:
+        # views of the matrices, changed in place
+        mass = matrices["mass"][:n, :n]
+        stiffness = matrices["stiffness"][:n, :n]
+        _apply_patch(state.structure, description, places, mass, stiffness)
+        if description.damping is not None:
+            damping = _damping_matrix(description.damping, mass, stiffness)
+            matrices["damping"][:n, :n] += factors.get("damping", 1.0) * damping
+    return Rig(factors, matrices, _control_loops(description, factors))
+
+
+def _apply_patch(
+    patch: ModelPatch,
+    description: LumpedDescription,
+    places: Sequence[PlaceSection],
+    mass: FloatArray,
+    stiffness: FloatArray,
+) -> None:
+    """Add the point masses and root compliances of a patch to mass and stiffness (n, n).
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        Structural primitives.
+    description : LumpedDescription
+        The file's content, for the lever of the root.
+    places : sequence of PlaceSection
+        Places of masses in the order of their stations.
+    mass, stiffness : (n, n) arrays
+        Matrices that are changed in place.
+    """
+    for primitive in patch:
+        if isinstance(primitive, PointMass):
+            row = _row_at_station(places, primitive.station)[: len(mass)]
+            mass += primitive.mass * np.outer(row, row)
+        elif isinstance(primitive, RootCompliance) and description.root is not None:
+            # in series: (K^-1 + c l l^T)^-1 by Sherman and Morrison
+            lever = np.array(description.root.lever)
+            moment = stiffness @ lever
+            factor = primitive.compliance / (1.0 + primitive.compliance * float(moment @ lever))
+            stiffness -= np.outer(moment, moment) * factor
+
+
+def _row_at_station(places: Sequence[PlaceSection], station: float) -> FloatArray:
+    """Return the row of the unknowns at a station [m], linear between the places."""
+    stations = [place.station for place in places]
+    columns = np.transpose([place.vector for place in places])
+    return np.array([np.interp(station, stations, column) for column in columns])
+
+
+def _damping_matrix(damping: Damping, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
+    """Return the damping (n, n) by Rayleigh coefficients, or by ratios of these modes."""
+    if damping.ratios is None:
+        return (damping.alpha or 0.0) * mass + (damping.beta or 0.0) * stiffness
+    squares, shapes = eigh(stiffness, mass)
+    frequencies = np.sqrt(np.maximum(squares, 0.0))
+    weighted = mass @ shapes
+    return np.asarray((weighted * (2.0 * np.array(damping.ratios) * frequencies)) @ weighted.T)
+
+
+def _control_loops(
+    description: LumpedDescription, factors: Mapping[str, float]
+) -> dict[str, ControlLoop]:
+    """Return the controllers by name, with their gains times the factors of the parameters."""
+    unknown_count = description.unknown_count
+    displacement_count = description.displacement_count
+    next_integral = displacement_count + description.state_count
+    loops: dict[str, ControlLoop] = {}
+    for section in description.controller:
+        gains = []
+        for gain in GAINS:
+            scaled = factors.get(f"{section.name}.{gain}", 1.0) * getattr(section, gain)
+            gains.append(factors.get(section.name, 1.0) * scaled)
+        proportional, derivative, integral = gains
+        error_integral = np.zeros(unknown_count)
+        if section.integral:
+            error_integral[next_integral] = 1.0
+            next_integral += 1
+        measured = OutputEquation.of_row(
+            description.padded(section.vector),
+            displacement_derivative=section.quantity.order,
+            state_count=unknown_count - displacement_count,
+        )
+        loops[section.name] = ControlLoop(
+            section=section,
+            proportional=proportional,
+            derivative=derivative,
+            integral=integral,
+            measured=measured.rows,
+            direction=description.padded(section.acts),
+            error_integral=error_integral,
+        )
+    return loops

@@ -1,0 +1,70 @@
+"""What the matrices of a system depend on, and a trial with what acts in it."""
+
+from typing import NamedTuple
+
+from fe.runtime.patch import ModelPatch
+from fe.runtime.state import Losses
+
+from discrepancy.campaign.records import Trial
+from discrepancy.system.excitation import Excitation, Load
+from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.response import Conditions
+from discrepancy.system.time_history import RecordedHistory
+
+
+class SystemState(NamedTuple):
+    """What the matrices of a system depend on.
+
+    Attributes
+    ----------
+    parameters : tuple of float
+        Values (P,) of the model's parameters.
+    losses : tuple of float
+        Stiffness losses of the damage regions.
+    structure : ModelPatch
+        The primitives of a patch that change the structure.
+    temperature_rise : float
+        Temperature above the reference [K], zero where the structure does not depend on it.
+    drives : tuple of str
+        Inputs whose motion is prescribed.
+    controlled : bool
+        Whether the controllers act.
+    """
+
+    parameters: tuple[float, ...]
+    losses: Losses = ()
+    structure: ModelPatch = NO_PATCH
+    temperature_rise: float = 0.0
+    drives: tuple[str, ...] = ()
+    controlled: bool = True
+
+
+class PatchedTrial(NamedTuple):
+    """A trial under a patch and in conditions, and the state of the matrices at its begin."""
+
+    trial: Trial
+    conditions: Conditions
+    patch: ModelPatch
+    state: SystemState
+
+
+class LoadsAndMotions(NamedTuple):
+    """Loads, and prescribed motions by the names of their inputs."""
+
+    loads: list[Load]
+    prescribed_motions: dict[str, RecordedHistory]
+
+
+class ExcitedSystem(NamedTuple):
+    """The system that moves in a dynamic trial, and what acts on it."""
+
+    system: LinearSystem
+    excitation: Excitation
+
+
+class RowsAtRest(NamedTuple):
+    """Consecutive rows of a trial at rest, in which the structure is the same."""
+
+    rows: slice
+    state: SystemState

@@ -1,0 +1,151 @@
+"""Loads and prescribed motions as functions of time, also between recorded samples."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, isfinite, pi, sqrt
+from typing import ClassVar, Protocol
+
+import numpy as np
+from fe.runtime.expression import Expression
+from scipy.interpolate import CubicSpline, PPoly
+
+from discrepancy.campaign.records import FloatArray, Hold
+
+SMOOTH_PARTS = 8
+"""Steps of an interval under a spline; straight lines on them err by 1e-6 of the input."""
+
+
+class LoadHistory(Protocol):
+    """What a load asks of its course in time."""
+
+    @property
+    def hold(self) -> Hold | None:
+        """How the load continues between samples."""
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Times at which the load jumps, begins or ends [s]."""
+
+    def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return the values (N,) at times, or a time derivative of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedHistory:
+    """A recorded load or prescribed motion over time.
+
+    Attributes
+    ----------
+    time, values : (N,) ndarray
+        The samples [s], [SI].
+    hold : Hold, optional
+        The course between the samples, linear by default. A load keeps its first value before the
+        first sample and its last value after the last one.
+    motion_order : int, optional
+        For a prescribed motion, which is `SMOOTH`: 0 if its displacement was recorded, 1 if its
+        velocity, 2 if its acceleration. The latter two begin at zero displacement, and an
+        acceleration at zero velocity too. None for a load.
+    """
+
+    time: FloatArray
+    values: FloatArray
+    hold: Hold | None = None
+    motion_order: int | None = None
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Times at which the history jumps or has a corner [s]."""
+        if self.hold is Hold.SMOOTH:
+            return ()
+        return tuple(self.time.tolist())
+
+    @cached_property
+    def _spline(self) -> PPoly:
+        """The spline through the load, or through the displacement of a prescribed motion."""
+        recorded: PPoly = CubicSpline(self.time, self.values)
+        if self.motion_order:
+            return recorded.antiderivative(self.motion_order)
+        return recorded
+
+    def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return values (N,) at times, or a time derivative; at a jump, that of just before it."""
+        if self.hold is Hold.SMOOTH:
+            is_load = self.motion_order is None
+            inside = np.clip(time, self.time[0], self.time[-1]) if is_load else time
+            return np.asarray(self._spline(inside, derivative))
+        if self.hold is not Hold.ZERO_ORDER and derivative == 0:
+            return np.asarray(np.interp(time, self.time, self.values))
+        if derivative == 0:
+            step_values = self.values
+        else:
+            # the slopes of the straight lines between the samples
+            rises = np.diff(self.values, append=self.values[-1])
+            step_values = rises / np.diff(self.time, append=np.inf)
+        just_before = time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time)
+        next_sample = np.searchsorted(self.time, just_before)
+        return np.asarray(step_values[np.maximum(next_sample - 1, 0)])
+
+
+@dataclass(frozen=True, eq=False)
+class FormulaHistory:
+    """A load by a formula in time, zero outside of its spans.
+
+    Attributes
+    ----------
+    formula : Expression
+        The load as a function of `time` [s].
+    spans : tuple of (float, float)
+        The begin and the end of each span [s]; without any the load acts always.
+    """
+
+    formula: Expression
+    spans: tuple[tuple[float, float], ...] = ()
+
+    hold: ClassVar[Hold | None] = Hold.SMOOTH
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Times at which the load begins or ends [s]."""
+        return tuple(edge for span in self.spans for edge in span if isfinite(edge))
+
+    def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return the values (N,) at times; a formula is never differentiated."""
+        spans = self.spans or ((-inf, inf),)
+        inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
+        return np.where(inside, self.formula.course(time, {"pi": pi}), 0.0)
+
+
+def equivalent_ramps(
+    values_at: Callable[[FloatArray], FloatArray], time: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return begin and end values of straight lines that replace a function in each step.
+
+    Each line goes through the function at the two Gauss-Legendre points of its step, so that it has
+    the same mean effect to fourth order in the step.
+
+    Parameters
+    ----------
+    values_at : callable
+        The function: times (K,) to values (K, ...).
+    time : (K + 1,) array
+        The boundaries of the steps [s].
+
+    Returns
+    -------
+    begin, end : (K, ...) arrays
+        The values of the lines at the begin and at the end of each step.
+    """
+    middle = 0.5 * (time[1:] + time[:-1])
+    half = 0.5 * np.diff(time)
+    at_first_point = values_at(middle + -1.0 * half / sqrt(3.0))
+    at_second_point = values_at(middle + 1.0 * half / sqrt(3.0))
+    mean = 0.5 * (at_first_point + at_second_point)
+    half_rise = 0.5 * sqrt(3.0) * (at_second_point - at_first_point)
+    return mean - half_rise, mean + half_rise
+
+
+def subdivide(time: FloatArray, parts: int) -> FloatArray:
+    """Return times (N,) with each interval between them divided into so many equal parts."""
+    position = np.arange((len(time) - 1) * parts + 1) / parts
+    return np.interp(position, np.arange(len(time)), time)
