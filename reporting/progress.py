@@ -8,6 +8,7 @@ Library code takes a `Progress` and need not know which one it is::
             stage.advance()
 """
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -20,6 +21,8 @@ if TYPE_CHECKING:  # rich takes long to import, and most code needs only the nam
 
 SECONDS_BETWEEN_LINES = 10.0
 """Longest time between two lines of a stage on a pipe, while the stage advances [s]."""
+LONGEST_SILENCE = 20.0
+"""Longest time between two lines of a stage on a pipe, also where the stage reports nothing [s]."""
 
 
 class Stage:
@@ -98,7 +101,10 @@ class _BarStage(Stage):
 
 
 class _LineStage(Stage):
-    """A stage on a pipe: a line now and then shows that the work goes on."""
+    """A stage on a pipe: a line now and then shows that the work goes on.
+
+    A thread shows the last detail again where the work reports nothing for `LONGEST_SILENCE`.
+    """
 
     def __init__(
         self, note: Callable[[str], None], description: str, total: int | None, unit: str
@@ -110,25 +116,50 @@ class _LineStage(Stage):
         self._start_time = time.perf_counter()
         self._time_of_last_line = self._start_time
         self._done = 0
+        self._detail: str | None = None
+        self._lines_shown = 0
+        self._has_ended = threading.Event()
         amount = f", {total} {unit}".rstrip() if total is not None else ""
         note(f"{description}{amount} ...")
+        threading.Thread(target=self._break_silence, daemon=True).start()
 
     def advance(self, amount: int = 1, detail: str | None = None) -> None:
         """Show how much is done, unless the last line is recent."""
         self._done += amount
+        self._detail = detail
         now = time.perf_counter()
-        if now - self._time_of_last_line < SECONDS_BETWEEN_LINES:
-            return
+        if now - self._time_of_last_line >= SECONDS_BETWEEN_LINES:
+            self._show(now)
+
+    def _show(self, now: float) -> None:
+        """Show how much is done at a time of the clock [s]."""
         self._time_of_last_line = now
-        amount_done = str(self._done)
+        self._lines_shown += 1
+        parts = []
         if self._total is not None:
-            amount_done += f" of {self._total} {self._unit}".rstrip()
-        if detail is not None:
-            amount_done += f", {detail}"
-        self._note(f"{self._description}: {amount_done}, {now - self._start_time:.0f} s ...")
+            parts.append(f"{self._done} of {self._total} {self._unit}".rstrip())
+        elif self._done:
+            parts.append(str(self._done))
+        if self._detail is not None:
+            parts.append(self._detail)
+        parts.append(f"{now - self._start_time:.0f} s ...")
+        self._note(f"{self._description}: {', '.join(parts)}")
+
+    def _break_silence(self) -> None:
+        """Show a line after each half of the longest silence in which none was shown."""
+        shown_before = self._lines_shown
+        while not self._has_ended.wait(0.5 * LONGEST_SILENCE):
+            if self._lines_shown == shown_before:
+                self._show(time.perf_counter())
+            shown_before = self._lines_shown
+
+    def stop(self) -> None:
+        """Show no further line."""
+        self._has_ended.set()
 
     def end(self) -> None:
         """Show that the stage is done, and how long it took."""
+        self.stop()
         duration = time.perf_counter() - self._start_time
         self._note(f"{self._description}: done, {duration:.1f} s")
 
@@ -156,7 +187,10 @@ class RichProgress(Progress):
         """Show a stage; stages may be nested."""
         if self._lines:
             stage = _LineStage(self.note, description, total, unit)
-            yield stage
+            try:
+                yield stage
+            finally:  # a stage that is interrupted must not look finished
+                stage.stop()
             stage.end()
             return
         is_outermost = self._bars is None
