@@ -395,9 +395,9 @@ class StaticReduction:
         """Return the fewest combinations (N, K) of the basis whose bound keeps a tolerance."""
         model = self.model()
         states = self.terms.training_states()
-        coordinates = [
-            response.coordinates for state in states for response in self.responses(model, state)
-        ]
+        coordinates: list[FloatArray] = []
+        for state in states:
+            coordinates += [response.coordinates for response in self.responses(model, state)]
 
         def keeps_tolerance(directions: FloatArray) -> bool:
             smaller_model = self.model(directions)

@@ -219,9 +219,14 @@ class ReductionTerms:
         last changes first. With many regions the corners of the box surround a single anchor.
         """
         if not self.splits.size:
-            return [[self.theta(state) for state in self.states(cube_corners(self.varied))]]
-        grid = itertools.product(*self.losses_at(0.25, 0.75).T)
-        return [[self.theta((*self.middle, *losses))] for losses in grid]
+            corner_states = self.states(cube_corners(self.varied))
+            return [[self.theta(state) for state in corner_states]]
+        anchors = []
+        losses_of_regions = self.losses_at(0.25, 0.75).T
+        for losses in itertools.product(*losses_of_regions):
+            state = (*self.middle, *losses)
+            anchors.append([self.theta(state)])
+        return anchors
 
     def states(self, fractions: FloatArray) -> list[State]:
         """Return states at fractions of the ranges.
@@ -265,10 +270,11 @@ class ReductionTerms:
 
         These are corners of the box under the corners of the box of masses, and states inside.
         """
-        mass_corners = list(itertools.product((0.0, 1.0), repeat=len(self.masses)))
-        pairs = itertools.product(cube_corners(self.varied), mass_corners[:MOST_MASS_CORNERS])
-        fractions = np.array([np.append(corner, masses) for corner, masses in pairs])
-        return self._modal_states(fractions, 4 * INNER_MODAL_STATES)
+        all_mass_corners = itertools.product((0.0, 1.0), repeat=len(self.masses))
+        mass_corners = list(itertools.islice(all_mass_corners, MOST_MASS_CORNERS))
+        pairs = itertools.product(cube_corners(self.varied), mass_corners)
+        fractions = [np.append(corner, masses) for corner, masses in pairs]
+        return self._modal_states(np.array(fractions), 4 * INNER_MODAL_STATES)
 
     def _modal_states(self, fractions: FloatArray, inner_count: int) -> list[ModalState]:
         """Return states at fractions of all ranges and masses, then `inner_count` states inside."""
@@ -312,9 +318,8 @@ class ReductionTerms:
     def _largest_load_coefficients(self) -> FloatArray:
         """Return the largest coefficient (L,) of each load in the ranges of controls and masses."""
         constant = (1.0, 1.0)
-        control_ranges = [self.structure.ranges[name] for name in self.structure.controls]
-        mass_ranges = [self.structure.ranges[name] for name in self.structure.masses]
+        control_ranges = _ranges_of(self.structure, tuple(self.structure.controls))
         controls = np.abs([constant, *control_ranges]).max(axis=1)
-        masses = np.abs([constant, *mass_ranges]).max(axis=1)
+        masses = np.abs([constant, *self.masses]).max(axis=1)
         control_numbers, mass_numbers = self.load_factors.T
         return np.asarray(controls[control_numbers] * masses[mass_numbers])

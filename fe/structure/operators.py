@@ -133,13 +133,14 @@ class _StiffnessParts(NamedTuple):
 
 def _stiffness_parts(design: MeshDesign, material_of: IntArray, region_of: IntArray) -> _StiffnessParts:
     """Return the parts of the stiffness from material and region (nc,) of each cell."""
-    parameters = [*(parameter.name for parameter in design.parameter), None]
-    regions = [*(region.name for region in design.damage), None]
+    parameters: list[str | None] = [parameter.name for parameter in design.parameter]
+    parameters.append(None)
+    regions: list[str | None] = [region.name for region in design.damage]
+    regions.append(None)
     parameter_of_material = np.array([parameters.index(material.scaled_by) for material in design.material])
     region_number = region_of % len(regions)  # -1 becomes the number of no region, the last one
-    pairs, part_of = np.unique(
-        np.column_stack((parameter_of_material[material_of], region_number)), axis=0, return_inverse=True
-    )
+    pair_of_cell = np.column_stack((parameter_of_material[material_of], region_number))
+    pairs, part_of = np.unique(pair_of_cell, axis=0, return_inverse=True)
     names = tuple((parameters[parameter], regions[region]) for parameter, region in pairs.tolist())
     return _StiffnessParts(part_of, names)
 

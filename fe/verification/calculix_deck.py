@@ -33,10 +33,10 @@ from fe.wing.operators import AffineOperators, wing_values
 
 CALCULIX_STRAINS = [0, 1, 2, 5, 4, 3]
 """Numbers of our strains in the order of CalculiX: xx, yy, zz, xy, xz, yz."""
-_UPPER_TRIANGLE = [(row, column) for column in range(6) for row in range(column + 1)]
-_ANISOTROPIC_ROWS = np.array([CALCULIX_STRAINS[row] for row, _ in _UPPER_TRIANGLE])
-_ANISOTROPIC_COLUMNS = np.array([CALCULIX_STRAINS[column] for _, column in _UPPER_TRIANGLE])
-"""Rows and columns of an elasticity in the order of CalculiX's 21 anisotropic constants."""
+# CalculiX's 21 anisotropic constants are the upper triangle of the elasticity, column by column.
+_COLUMNS, _ROWS = np.tril_indices(6)
+_ANISOTROPIC_ROWS = np.array(CALCULIX_STRAINS)[_ROWS]
+_ANISOTROPIC_COLUMNS = np.array(CALCULIX_STRAINS)[_COLUMNS]
 TEST_FORCE = 10.0
 """Upward force of the static test of a wing, and before its ring-down [N]."""
 _BLOCK_SIDE = 0.01

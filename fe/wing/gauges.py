@@ -92,11 +92,9 @@ def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
     csr (gauges, full)
         Rows [1/m], positive in compression.
     """
-    points = [
-        point
-        for gauge in range(len(mesh.design.gauges.positions))
-        for point in _gauge_points(mesh, gauge)
-    ]
+    points: list[_SkinPoint] = []
+    for gauge in range(len(mesh.design.gauges.positions)):
+        points += _gauge_points(mesh, gauge)
     cells = np.array([point.cell for point in points])
     local = np.array([point.local for point in points])
     weights = np.array([point.weight for point in points])
