@@ -376,13 +376,14 @@ class CellMesh:
         cells_at_once = max(BATCH, _SUMMED_ENTRIES // width**2)
         for start in range(0, len(cells), cells_at_once):
             end = min(start + cells_at_once, len(cells))
-            batches = [slice(first, min(first + BATCH, end)) for first in range(start, end, BATCH)]
-            values = np.concatenate([blocks(batch) for batch in batches])
             unknowns = self.unknowns_of(cells[start:end], components).astype(np.int32)
-            rows = np.repeat(unknowns, width, axis=1)
-            columns = np.tile(unknowns, (1, width))
-            entries = (rows.ravel(), columns.ravel())
-            summed = sparse.coo_array((values.ravel(), entries), shape=total.shape)
+            batches = [slice(first, min(first + BATCH, end)) for first in range(start, end, BATCH)]
+            values = [blocks(batch) for batch in batches]
+            rows = np.repeat(unknowns, width, axis=1).ravel()
+            columns = np.tile(unknowns, (1, width)).ravel()
+            summed = sparse.coo_array(
+                (np.concatenate(values).ravel(), (rows, columns)), shape=total.shape
+            )
             total = total + summed.tocsr()
         return total
 

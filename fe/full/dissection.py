@@ -146,6 +146,24 @@ def _coordinates(part: IntArray, edges: IntArray) -> list[FloatArray]:
     return [from_one_end - from_other_end, from_one_end, from_other_end]
 
 
+class _Parts(NamedTuple):
+    """Parts of a graph that are still to be cut.
+
+    Attributes
+    ----------
+    starts : (p,) array of int
+        The first position of each part in the order of elimination.
+    vertices : (v,) array of int
+        The vertices of all parts.
+    part : (v,) array of int
+        The number of the part of each vertex.
+    """
+
+    starts: IntArray
+    vertices: IntArray
+    part: IntArray
+
+
 def elimination_blocks(graph: sparse.csr_array, weight: FloatArray, leaf_weight: float) -> IntArray:
     """Dissect a graph until its parts are light: leaves, and separators between them.
 
@@ -171,39 +189,63 @@ def elimination_blocks(graph: sparse.csr_array, weight: FloatArray, leaf_weight:
     is_upper = entries.row < entries.col
     edges = np.stack((entries.row[is_upper], entries.col[is_upper])).astype(np.int64)
     position = np.zeros(size, dtype=np.int64)
-    # what is still to be cut: the first positions of the parts, the vertices and their parts
-    first = np.zeros(1, dtype=np.int64)
-    vertices = np.arange(size)
-    part = np.zeros(size, dtype=np.int64)
+    # the whole graph is the first part
+    parts = _Parts(np.zeros(1, dtype=np.int64), np.arange(size), np.zeros(size, dtype=np.int64))
     while True:
-        # leave out parts that are light enough
-        part_weight = np.bincount(part, weights=weight[vertices], minlength=len(first))
-        is_heavy = part_weight > leaf_weight
-        in_heavy_part = is_heavy[part]
-        new_number = np.cumsum(is_heavy) - 1
-        first = first[is_heavy]
-        vertices = vertices[in_heavy_part]
-        part = new_number[part[in_heavy_part]]
-        if not len(vertices):
+        parts = _heavy_parts(parts, weight, leaf_weight)
+        if not len(parts.vertices):
             return position
         # keep the edges inside parts, and number the vertices anew
         index = np.full(size, -1)
-        index[vertices] = np.arange(len(vertices))
+        index[parts.vertices] = np.arange(len(parts.vertices))
         is_inside = (index[edges] >= 0).all(axis=0) & (position[edges[0]] == position[edges[1]])
         edges = edges[:, is_inside]
-        cuts = best_cuts(part, weight[vertices], index[edges])
-        # each part that was cut becomes three blocks: two halves and a separator
-        in_cut_part = cuts.is_cut[part]
-        vertices = vertices[in_cut_part]
-        part_number = np.cumsum(cuts.is_cut) - 1
-        block_in_part = np.where(cuts.separator, 2, cuts.side)
-        block = (3 * part_number[part] + block_in_part)[in_cut_part]
-        count = np.bincount(block, minlength=3 * int(cuts.is_cut.sum())).reshape(-1, 3)
-        block_starts = first[cuts.is_cut, None] + np.cumsum(count, axis=1) - count
-        position[vertices] = block_starts.ravel()[block]
-        # the halves are the next parts
-        is_half = block % 3 < 2
-        vertices = vertices[is_half]
-        part = (block // 3 * 2 + block % 3)[is_half]
-        half_starts, _ = np.split(block_starts, [2], axis=1)
-        first = half_starts.ravel()
+        cuts = best_cuts(parts.part, weight[parts.vertices], index[edges])
+        parts = _halves(parts, cuts, position)
+
+
+def _heavy_parts(parts: _Parts, weight: FloatArray, leaf_weight: float) -> _Parts:
+    """Return the parts that are heavier than a leaf."""
+    part_weight = np.bincount(
+        parts.part, weights=weight[parts.vertices], minlength=len(parts.starts)
+    )
+    is_heavy = part_weight > leaf_weight
+    in_heavy_part = is_heavy[parts.part]
+    new_number = np.cumsum(is_heavy) - 1
+    return _Parts(
+        starts=parts.starts[is_heavy],
+        vertices=parts.vertices[in_heavy_part],
+        part=new_number[parts.part[in_heavy_part]],
+    )
+
+
+def _halves(parts: _Parts, cuts: Cuts, position: IntArray) -> _Parts:
+    """Return the halves of the parts that were cut, and set the positions of their vertices.
+
+    Parameters
+    ----------
+    parts : _Parts
+        The parts.
+    cuts : Cuts
+        Their cuts.
+    position : (n,) array of int
+        The first position of the block of each vertex; changed in place.
+    """
+    # each part that was cut becomes three blocks: two halves (0 and 1) and a separator (2)
+    in_cut_part = cuts.is_cut[parts.part]
+    vertices = parts.vertices[in_cut_part]
+    new_number = np.cumsum(cuts.is_cut) - 1
+    block_in_part = np.where(cuts.separator, 2, cuts.side)
+    block = (3 * new_number[parts.part] + block_in_part)[in_cut_part]
+    # the blocks of a part follow one another from its start
+    count = np.bincount(block, minlength=3 * int(cuts.is_cut.sum())).reshape(-1, 3)
+    block_starts = parts.starts[cuts.is_cut, None] + np.cumsum(count, axis=1) - count
+    position[vertices] = block_starts.ravel()[block]
+    # the halves are the next parts
+    is_half = block % 3 < 2
+    half_starts, _ = np.split(block_starts, [2], axis=1)
+    return _Parts(
+        starts=half_starts.ravel(),
+        vertices=vertices[is_half],
+        part=(block // 3 * 2 + block % 3)[is_half],
+    )

@@ -129,11 +129,13 @@ def _project_duals(
     displacements = factors.unwhitened(directions.swapaxes(0, 1).reshape(size, -1))
     displacements = displacements.reshape(size, count, -1)
     projections = []
+    # the outputs in batches, which limits the memory of the images
     for batch in np.array_split(np.arange(count), ceil(count / OUTPUTS_PER_BATCH)):
         flat = displacements[:, batch].reshape(size, -1)
         images = np.stack(
             [(term @ flat).reshape(size, len(batch), -1) for term in terms.stiffness_terms]
         )
+        # the images as whitened forces, all terms of an output side by side
         forces = factors.whitened(np.moveaxis(images, 0, 2).reshape(size, -1))
         forces_by_output = forces.reshape(size, len(batch), -1).swapaxes(0, 1)
         projected_terms = np.einsum(

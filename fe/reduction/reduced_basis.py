@@ -1,13 +1,20 @@
 """Make the reduced model of a structure, such as a wing, and measure its errors."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
-from fe.structure.affine import AffineStructure, natural_frequencies, static_response
+from fe.runtime.reduced import StaticResponse as ReducedResponse
+from fe.structure.affine import (
+    AffineStructure,
+    StaticResponse,
+    natural_frequencies,
+    static_response,
+)
 from fe.structure.tables import StructureSettings
 from reporting.progress import Progress, reporter
 
@@ -199,34 +206,55 @@ def measured_errors(
         If the full model cannot be solved.
     """
     vectors = _random_values(model, states, seed)
-    # relative errors and bounds (states, 2) of strains and of displacements
-    errors = np.full((states, 2), np.nan)
-    bounds = np.full((states, 2), np.nan)
+    errors = []
+    bounds = []
     frequency_error = 0.0
     for number, vector in enumerate(vectors):
         values = dict(zip(model.chosen, vector.tolist(), strict=True))
-        full = static_response(structure, values)
-        reduced = model.static_response(vector)
-        for kind, (exact, (approximation, bound)) in enumerate(
-            zip((full.strain, full.output), reduced.bounded, strict=True)
-        ):
-            if exact.size:
-                largest = np.abs(exact).max()
-                errors[number, kind] = np.abs(approximation - exact).max() / largest
-                bounds[number, kind] = bound / largest
+        exact = static_response(structure, values)
+        state_errors = _relative_errors(exact, model.static_response(vector))
+        errors.append(state_errors.errors)
+        bounds.append(state_errors.bounds)
         if number in (0, states - 1):
             exact_frequency, _ = natural_frequencies(structure, model.mode_count, values)
             relative_errors = np.abs(model.modes(vector).frequency / exact_frequency - 1.0)
             frequency_error = max(frequency_error, float(relative_errors.max()))
     strain_error, displacement_error = np.fmax.reduce(errors)
+    is_broken = (np.array(errors) > np.array(bounds)).any(axis=1)
     return MeasuredErrors(
         strain=float(strain_error),
         displacement=float(displacement_error),
         bound=float(np.nanmax(bounds)),
         frequency=frequency_error,
         states=states,
-        broken=int((errors > bounds).any(axis=1).sum()),
+        broken=int(is_broken.sum()),
     )
+
+
+class _RelativeErrors(NamedTuple):
+    """Errors of strains and of displacements, NaN if there are none.
+
+    Attributes
+    ----------
+    errors, bounds : (2,) array
+        The largest error and its certified bound, relative to the largest output.
+    """
+
+    errors: FloatArray
+    bounds: FloatArray
+
+
+def _relative_errors(exact: StaticResponse, reduced: ReducedResponse) -> _RelativeErrors:
+    """Return the errors of a reduced model's response against the exact one."""
+    errors = np.full(2, np.nan)
+    bounds = np.full(2, np.nan)
+    for kind, outputs in enumerate((exact.strain, exact.output)):
+        if outputs.size:
+            approximation, bound = reduced.bounded[kind]
+            largest = np.abs(outputs).max()
+            errors[kind] = np.abs(approximation - outputs).max() / largest
+            bounds[kind] = bound / largest
+    return _RelativeErrors(errors, bounds)
 
 
 def _random_values(model: ReducedModel, count: int, seed: int) -> FloatArray:

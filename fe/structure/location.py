@@ -108,8 +108,10 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     InvalidDesignError
         If the point lies outside.
     """
+    # cells that may hold the point, by the spheres around them
     distance = np.linalg.norm(mesh.centres - point, axis=1)
     cells = np.flatnonzero(distance <= 1.001 * mesh.cell_radius)
+    # the nearest local position in each of them: the cell holds the point if nothing remains
     whole_cells = _Parametrisation(
         cells,
         origin=np.zeros((len(cells), 3)),
@@ -122,6 +124,7 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     if is_inside.any():
         first = int(is_inside.argmax())
         return int(cells[first]), nearest.local[first]
+    # outside: the nearest point of the surface, if it is near enough
     surface_point = on_surface(mesh, point, where)
     return int(surface_point.cell[0]), surface_point.local[0]
 

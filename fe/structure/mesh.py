@@ -142,6 +142,7 @@ class StructureMesh(CellMesh):
             If there is no such set of cells, or it is empty.
         """
         sets = self.cell_sets
+        # The set of all cells is implied, unless the file has a set of this name in other letters.
         has_set_of_all = _set_named(sets, ALL_CELLS) is not None
         if name == ALL_CELLS or not has_set_of_all:
             sets = sets | {ALL_CELLS: sets.get(ALL_CELLS, np.arange(len(self.cells)))}

@@ -216,15 +216,18 @@ def _check_rigid_motions(mesh: StructureMesh, nodal: _NodeSupports, bodies: tupl
 
     Every resisting displacement counts alike: what matters is whether it resists, not how stiff it is.
     """
+    # what each rigid motion of the structure does to the displacements that are resisted
     centre = mesh.points.mean(axis=0)
     motions = rigid_motions(mesh.points, centre, mesh.size)
     resisted = [motions[nodal.resists.ravel()]]
     for body in bodies:
+        # a rigid set shifts with its point, and turns with the structure
         shifts = rigid_motions(body.point[None], centre, mesh.size)
         turns = np.eye(6)[3:]
         body_resists = body.held | (body.springs > 0.0)
         resisted.append(np.vstack((shifts, turns))[body_resists])
-    # Rows of zeros make the decomposition return all six directions.
+    # Motions with a singular value of zero are free. Rows of zeros make the decomposition return
+    # all six directions.
     rows = np.vstack((*resisted, np.zeros((6, 6))))
     _, values, directions = np.linalg.svd(rows, full_matrices=False)
     free = directions[values <= _FREE * max(float(values[0]), 1e-300)]
