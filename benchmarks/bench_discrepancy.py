@@ -11,10 +11,11 @@ from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.models.sensing import observe
-from discrepancy.models.structures import WingModel
-from discrepancy.search.strategy import Search, search
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import search
 from discrepancy.sources.examples import example_campaign, wing_plan
+from discrepancy.system.sensing import observe
+from discrepancy.system.structures import WingModel
 from fe.runtime.patch import ModelPatch, PowerDamping, RootCompliance
 
 SEED = 20210527

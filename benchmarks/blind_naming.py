@@ -23,9 +23,9 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
 from discrepancy.files.verdict import primitive_intervals
-from discrepancy.models.interface import Model
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.structures import WingModel
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.structures import WingModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import Investigation, investigate, patch_draws
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness

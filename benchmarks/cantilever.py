@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
-from discrepancy.models.acting import Acting, Course, Load, Shown, release_of
-from discrepancy.models.interface import ACROSS, Conditions, Model, Outputs, PortScale, Response, Scales
-from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.motion import motion_of
-from discrepancy.models.sensing import observe
+from discrepancy.system.excitation import Acting, Course, Load, Shown, release_of
+from discrepancy.system.interface import Model
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.motion import motion_of
+from discrepancy.system.response import ACROSS, Conditions, Outputs, Response
+from discrepancy.system.scales import PortScale, Scales
+from discrepancy.system.sensing import observe
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import (
     INTERNAL_FORCES,

@@ -12,8 +12,8 @@ from benchmarks.cantilever import Cantilever, campaign
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Quantity, Trial
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.models.interface import Conditions
-from discrepancy.models.sensing import observe
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 from reporting.figures import PREDICTION, REFERENCE, new_figure, publication_style, to_png
 
@@ -277,6 +277,9 @@ PICTURES: dict[str, Picture] = {
         {"drift_ratio": 0.1}, (change_over("time", ("g0", "g1")), load_line("g0", change=True)), "g0"
     ),
     "gauge_gain": Picture({"gain_error": 0.1}, (ratios("up", "flight"), load_line("g1")), "g1"),
+    "sensor_saturation": Picture(
+        {"lost_share": 0.2}, (load_line("g0", change=True), spectrum("g0", 20.0)), "g0"
+    ),
     "gauge_misalignment": Picture({"angle": 0.26}, (ratios("up", "flight"), load_line("g1")), "g1"),
     "high_pass": Picture({"corner_ratio": 0.2}, (ringdown("g0", end=1.5), spectrum("g0", 10.0)), "g0"),
     "load_place": Picture(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import meshio
 
-from discrepancy.models.lumped_file import SHIPPED_MODELS
+from discrepancy.system.lumped_file import SHIPPED_MODELS
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from scenarios import binding_files, scenario_files, structure_files
 

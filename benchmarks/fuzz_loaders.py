@@ -36,8 +36,8 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_patch, read_verdict_file
-from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.lumped import LumpedModel
+from discrepancy.fmu_models.description import FmuModelDescription
+from discrepancy.system.lumped import LumpedModel
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.wing_rows import PatchArrays
 from fe.structure.design import load_structure

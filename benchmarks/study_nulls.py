@@ -35,9 +35,10 @@ from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.location.locate import locate
 from discrepancy.model_choice import load_model
-from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.sensing import observe
 from discrepancy.search.honest_evidence import left_by
+from discrepancy.system.interface import Model
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 FATAL, LOCATED = 0.01, 0.05

@@ -18,10 +18,10 @@ from benchmarks.study_coverage import PROBABILITY, TARGET
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.model_choice import ModelChoice, ModelKind
-from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.parameters.calibration import calibrate_parameters
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_file import LumpedDescription
+from discrepancy.system.response import Conditions
 
 DEVIATION = {"spring": 0.05, "damping": 0.3, "mass": 0.05}
 FREEDOM, GAIN, ZERO, NOISE = 12, 0.01, 0.3, 0.02  # zero and noise: shares of what a channel shows

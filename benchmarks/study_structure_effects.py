@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.model_choice import load_model
-from discrepancy.models.acting import Acting, Shown
-from discrepancy.models.linear_system import LinearSystem
-from discrepancy.models.motion import motion_of
+from discrepancy.system.excitation import Acting, Shown
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.motion import motion_of
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.model_cache import reduced_structure
@@ -126,11 +126,10 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     rows = np.vstack([part.toarray() for part in (structure.displacement_output, structure.gauge_output)])
     names = (PORT, *structure.gauges)
     quantities = [Quantity.DISPLACEMENT, *[Quantity.STRAIN] * len(structure.gauges)]
-    damping = structure.damping_alpha * mass + structure.damping_beta * stiffness
+    rayleigh = structure.design.damping
+    damping = rayleigh.alpha * mass + rayleigh.beta * stiffness
     end = rows[0]
-    system = LinearSystem(
-        mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, structure.damping_beta
-    )
+    system = LinearSystem(mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, rayleigh.beta)
     laws = laws_of(ModelPatch(hidden.laws), system.ports)
     channels = {
         name: Channel(

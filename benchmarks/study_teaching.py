@@ -9,6 +9,7 @@ the decisions for 3g with z1 truly at or above the limit; the wing with nothing 
 
 import argparse
 import tempfile
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,15 +19,22 @@ from numpy.typing import NDArray
 
 import uav_twin
 from benchmarks.study_hidden_effects import beyond_the_limit, fly_mission, patch_text
-from fe.runtime.patch import LocalStiffnessLoss, PointMass, Primitive, RootCompliance, SensorGain
+from fe.runtime.patch import (
+    LocalStiffnessLoss,
+    PointMass,
+    Primitive,
+    RootCompliance,
+    SensorGain,
+    SensorSaturation,
+)
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch import teaching
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.opening import begun_watch
+from twin_master.watch.tutor import Tutor
 
 HIDDEN: dict[str, tuple[Primitive, ...]] = {
     "nothing": (),
@@ -35,6 +43,7 @@ HIDDEN: dict[str, tuple[Primitive, ...]] = {
     "gauge 17 shows 12 % too little": (SensorGain("strain[17]", -0.12),),
     "point mass of 0.2 kg at 1.6 m": (PointMass(0.2, 1.6),),
     "root compliance of 3e-5 rad/(N m)": (RootCompliance(3e-5),),
+    "all gauges saturate softly at 4000 microstrain": (SensorSaturation("*", 4e-3, "strain"),),
 }
 TURNS = 50
 WITHOUT = 30
@@ -63,7 +72,7 @@ def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
     text = "\n".join([*kept, "", "[notice]", ""])
     if known:
         file = atomic_write_text(place / "known.json", patch_text(known))
-        text = text.replace("[belief]\n", f'[belief]\npatch = "{file.name}"\n')
+        text = text.replace("[belief]\n", f'[belief]\npatch = "{file.resolve().as_posix()}"\n')
     return atomic_write_text(place / f"watched_{len(known)}.toml", text)
 
 
@@ -71,8 +80,12 @@ def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
     """Watch the strains of a run."""
     loaded = load_scenario(scenario)
     with begun_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
-        search = teaching.Search(folder, watch.scenario.mission.seed) if teach else None
-        watch.run(file_feed(run / "run.nc", watch.scenario), lambda _decision: None, search=search)
+        feed = file_feed(run / "run.nc", watch.scenario)
+        if teach:
+            with closing(Tutor(watch, wait=True)) as tutor:
+                watch.run(feed, lambda _decision: None, tutor.act)
+        else:
+            watch.run(feed, lambda _decision: None)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]
     turns = [record for record in lines if "filtered" in record]
     filtered, chosen = (np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control"))
@@ -132,7 +145,6 @@ def main() -> int:
     parser.add_argument("--only", help="numbers of hidden effects from 0, with commas")
     given = parser.parse_args()
     names = [*HIDDEN] if given.only is None else [[*HIDDEN][int(number)] for number in given.only.split(",")]
-    teaching.COURTESY = 0  # nothing else is to be served first
     with tempfile.TemporaryDirectory() as work:
         for seed in range(given.first_seed, given.first_seed + given.seeds):
             for name in names:

@@ -16,10 +16,10 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.catalogue.entry import Setting
-from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import LumpedDescription
-from discrepancy.models.sensing import observe
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_file import LumpedDescription
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 MODEL = """

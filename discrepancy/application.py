@@ -12,8 +12,8 @@ from discrepancy.errors import SENTENCES, DiscrepancyError, ModelError, said
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
-from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.proof_record import Proof
+from discrepancy.system.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState

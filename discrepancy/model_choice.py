@@ -8,15 +8,15 @@ from calibration.joint.wing_table import SHIPPED_PRIOR
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError, said
 from discrepancy.files.verdict import StoredPatch, read_patch
-from discrepancy.models.fmu import FmuModel
-from discrepancy.models.interface import Model
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.structures import StructureModel, WingModel
+from discrepancy.fmu_models.model import FmuModel
 from discrepancy.sources.from_run import run_model
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_file import SHIPPED_MODELS
+from discrepancy.system.structures import StructureModel, WingModel
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
-from fe.structure.design import is_structure
+from fe.structure.design import is_structure, load_structure, structure_hash
 from fe.wing.design import SHIPPED_DESIGN, WingDesign
 from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.files import hash_file, hash_record
@@ -210,10 +210,11 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
 
 def _structure(path: Path, progress: Progress | None) -> ModelChoice:
     with ModelError.instead_of(FiniteElementError):
-        reduced = reduced_structure(path, progress=progress)
-    source = reduced.design_hash
+        reduced = reduced_structure(path, progress=progress, with_ports=True)
+        source_hash = structure_hash(load_structure(path), path.parent, with_ports=True)
     model = StructureModel(reduced)
-    return ModelChoice(model, ModelKind.STRUCTURE, path.name, source, path=path, design_hash=source)
+    design_hash = reduced.design_hash
+    return ModelChoice(model, ModelKind.STRUCTURE, path.name, source_hash, path=path, design_hash=design_hash)
 
 
 def _fmu(path: Path) -> ModelChoice:

@@ -31,7 +31,7 @@ from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import DETECTED, as_predicted, began_before, usable
-from discrepancy.models.interface import Model
+from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from reporting.files import atomic_write_text

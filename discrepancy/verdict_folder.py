@@ -12,6 +12,7 @@ from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
 from discrepancy.self_calibration import SELF_CALIBRATION_NAME, write_self_calibration
 from discrepancy.verdict import VerdictKind
+from discrepancy.verdict_so_far import SO_FAR_NAME
 from discrepancy.workflow import patch_draws
 from reporting.errors import FileNotWrittenError
 from reporting.figures import save_figure
@@ -34,7 +35,10 @@ def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
     restore_folder(folder)
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
-    if not folder.is_dir() or not any(folder.iterdir()):
+    if not folder.is_dir():
+        return
+    names = {path.name for path in folder.iterdir()}
+    if names <= {SO_FAR_NAME}:  # nothing, or what an interrupted search left
         return
     if not (folder / files.VERDICT_NAME).is_file():
         raise FileNotWrittenError(said("models.no_verdict", folder=folder, name=files.VERDICT_NAME))

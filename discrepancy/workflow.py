@@ -34,6 +34,7 @@ from discrepancy.judgement.conclusion import (
     look_alike_remark,
     with_untested,
 )
+from discrepancy.judgement.exact_sensors import exact_sensor_remarks
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
@@ -42,17 +43,18 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce, seen_force
 from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
 from discrepancy.model_choice import load_model
-from discrepancy.models.interface import Model
-from discrepancy.models.lumped import LumpedModel
 from discrepancy.proof_record import Proof
 from discrepancy.search.starts import Tell
 from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import OnSearch, nobody_looks
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
-from reporting.words import be, brief, listing
+from reporting.words import brief, is_or_are, listing
 
 DRAWS = 400
 IMPLAUSIBLE = 4.0
@@ -115,6 +117,7 @@ def investigate(
     seed: int = 0,
     thorough: bool = True,
     progress: Progress | None = None,
+    on_search: OnSearch = nobody_looks,
 ) -> Investigation:
     """Find out what a model lacks.
 
@@ -133,6 +136,8 @@ def investigate(
         False: no map of residuals and no next experiment, for studies over many campaigns.
     progress : Progress, optional
         Where to report.
+    on_search : callable, optional
+        Takes each search as it begins, to look at while it goes on.
 
     Returns
     -------
@@ -166,7 +171,7 @@ def investigate(
         problem = without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = name(problem, catalogue, tell=tell)
+        verdict, search, fit = name(problem, catalogue, tell=tell, on_search=on_search)
         verdict = with_untested(verdict, setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
@@ -220,6 +225,8 @@ def _remarks(
 ) -> list[str]:
     """Return what has to be said beside a verdict."""
     remarks = [*problem.campaign.remarks, *strained(problem, fit), *without_port(problem.setting, catalogue)]
+    if verdict.kind not in NO_GAP:
+        remarks += exact_sensor_remarks(problem, search.none)
     alike = look_alike_remark(verdict, search.effects)
     remarks += [] if alike is None else [alike]
     if not problem.model.parameters:
@@ -285,7 +292,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             found = wrong_ends(residual, data.weight > 0.0, noise) & ~_taken_as_right(campaign, trial)
             for number in np.flatnonzero(found.any(axis=0)):
                 count = int(found[:, number].sum())
-                told = {"channel": trial.channels[number], "trial": trial.name, "are": be(count)}
+                told = {"channel": trial.channels[number], "trial": trial.name, "are": is_or_are(count)}
                 remarks.append(said("remarks.wrong_ends", count=count, total=len(found), **told))
             trials[trial.name] = replace(trial, used=trial.used & ~found)
     if len(remarks) == len(problem.campaign.remarks):

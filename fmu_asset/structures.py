@@ -39,7 +39,8 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     """Return the model file of a structure's FMU: forces, outputs, ports and parameters as its file has them.
 
     A control in N is a force, and one of the name load_factor the load factor of flights, which stand for any
-    rest under it. Where a load of 1 N at a point meets a displacement output along it, there is a port.
+    rest under it. Where a load of 1 N at a point meets a displacement output along it, there is a port. Ports
+    of the structure file are named in a comment alone: the FMU has no input for a force there.
 
     Parameters
     ----------

@@ -55,18 +55,6 @@ def run(
     parts.check_verdict_folder(folder, replace_it=replace)
     catalogue = parts.load_catalogue(effects or ())
     data, choice = _compared(campaign, from_run, from_turn, to_turn, model)
-    found = parts.investigate(data, choice.model, catalogue, seed=seed)
-    able, tried = None, None
-    if found.problem is not None:
-        with stage("What this campaign can decide"):
-            able = parts.separability(found.campaign, choice.model, found.problem.setting, catalogue)
-        if calibrate is not None:
-            workers = 1 if choice.kind is parts.ModelKind.FMU else 2  # an FMU is a process of its own
-            with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as shown:
-                tried = parts.self_calibrate(
-                    found.campaign, choice.model, catalogue, calibrate,
-                    seed=seed, workers=workers, advance=shown.advance,
-                )  # fmt: skip
     inputs = {"campaign": data.data_hash, "model": choice.source_hash}
     inputs |= {f"effects {path.name}": parts.hash_file(path) for path in effects or ()}
     asked = {"from-turn": from_turn, "to-turn": to_turn, "model": model and choice.file, "seed": seed}
@@ -79,11 +67,31 @@ def run(
         parts.collect_provenance(seed, input_hashes=inputs),
         choice.file,
     )
+    in_progress = parts.SearchInProgress()
+    with terminal.interruptible(lambda: _keep_so_far(folder, in_progress, origin)):
+        found = parts.investigate(data, choice.model, catalogue, seed=seed, on_search=in_progress.begin)
+    able, tried = None, None
+    if found.problem is not None:
+        with stage("What this campaign can decide"):
+            able = parts.separability(found.campaign, choice.model, found.problem.setting, catalogue)
+        if calibrate is not None:
+            workers = 1 if choice.kind is parts.ModelKind.FMU else 2  # an FMU is a process of its own
+            with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as shown:
+                tried = parts.self_calibrate(
+                    found.campaign, choice.model, catalogue, calibrate,
+                    seed=seed, workers=workers, advance=shown.advance,
+                )  # fmt: skip
     pack = None if choice.design is None else partial(parts.packed_beside, choice)
     content = parts.ReportInput(found, origin, able, tried, choice.design, pack=pack)
     with stage("Writing the verdict"):
         place = parts.write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
     _conclude(content, folder, None if no_report else place, json=json)
+
+
+def _keep_so_far(folder: Path, in_progress: "parts.SearchInProgress", origin: "parts.Origin") -> str:
+    """Write what an interrupted search has found, and say where; empty where it has found nothing yet."""
+    path = parts.write_so_far(folder, in_progress.hypotheses(), origin)
+    return "" if path is None else f"the hypotheses fitted until then are in {path}"
 
 
 def _conclude(content: "parts.ReportInput", folder: Path, report: Path | None, *, json: bool) -> None:
@@ -178,7 +186,7 @@ def check(
         given |= {"data": data, "model": chosen, "faults": faults, "catalogue": catalogue}
         options.show("check", words=WORDS, able=able, **given)
     if able is None:
-        raise terminal.failed("Mend the faults first: conclusions from these data would be wrong.")
+        raise terminal.error_exit("Mend the faults first: conclusions from these data would be wrong.")
 
 
 def _record(
@@ -250,7 +258,7 @@ def import_files(
     if asked and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
         raise typer.Exit(1)
-    parts.write_campaign(campaign, folder, si=True, units=found.units())
+    parts.write_campaign(campaign, folder, si=True, units=found.units(), left_out_as_empty=True)
     assumed = []
     if found.assumed:
         remedy = "give --zero and --gain, or correct offset_deviation and gain_deviation"

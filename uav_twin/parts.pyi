@@ -1,5 +1,6 @@
 """What commands take from the other packages: read by type checkers, by editors and by `parts.py`."""
 
+from calibration.dynamics.extremes import refine_by_extremes as refine_by_extremes
 from calibration.dynamics.figures import ring_down_figure as ring_down_figure
 from calibration.dynamics.records import read_records as read_records
 from calibration.dynamics.trials import FIRST_PEAK as FIRST_PEAK
@@ -7,7 +8,6 @@ from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS as PUBLISHED_DA
 from calibration.dynamics.trials import PUBLISHED_FREQUENCIES as PUBLISHED_FREQUENCIES
 from calibration.dynamics.trials import average as average
 from calibration.dynamics.trials import fit_trials as fit_trials
-from calibration.dynamics.trials import refine_by_extremes as refine_by_extremes
 from calibration.result.file import check_folder as check_folder
 from calibration.result.file import load_calibration as load_calibration
 from calibration.result.file import tailoring as tailoring
@@ -51,7 +51,6 @@ from discrepancy.model_choice import ModelChoice as ModelChoice
 from discrepancy.model_choice import ModelKind as ModelKind
 from discrepancy.model_choice import choice_of_run as choice_of_run
 from discrepancy.model_choice import choose_model as choose_model
-from discrepancy.models.interface import Model as Model
 from discrepancy.parameters.calibration import calibrate_parameters as calibrate_parameters
 from discrepancy.report.figures import ReportInput as ReportInput
 from discrepancy.report.page import said_on_page as said_on_page
@@ -67,9 +66,12 @@ from discrepancy.sources.examples import plan_of as plan_of
 from discrepancy.sources.examples import write_example as write_example
 from discrepancy.sources.from_run import run_campaign as run_campaign
 from discrepancy.sources.measured_rigs import write_rig_campaign as write_rig_campaign
+from discrepancy.system.interface import Model as Model
 from discrepancy.verdict import VerdictKind as VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder as check_verdict_folder
 from discrepancy.verdict_folder import write_verdict_folder as write_verdict_folder
+from discrepancy.verdict_so_far import SearchInProgress as SearchInProgress
+from discrepancy.verdict_so_far import write_so_far as write_so_far
 from discrepancy.workflow import checked as checked
 from discrepancy.workflow import investigate as investigate
 from fe.reduction.model_cache import reduced_model as reduced_model

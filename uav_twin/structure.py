@@ -70,7 +70,7 @@ def end_with(checks: "Sequence[parts.Check]") -> None:
     """End with 1, and say which limits are broken, if any is."""
     broken = [f"{check.group}, {check.name}" for check in checks if not check.passed]
     if broken:
-        raise terminal.failed(
+        raise terminal.error_exit(
             f"{len(broken)} of {len(checks)} checks broke their limit: {'; '.join(broken)}."
         )
 
@@ -195,6 +195,9 @@ def _parts(structure: "parts.Structure") -> Iterator[tuple[str, str, str | None,
             nodes = mesh.nodes_of(load.set, load.name)
             faces = len(mesh.faces_between(load.set, nodes))
             yield "load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes", ""
+    for port in design.port:
+        if port.set is not None:
+            yield "port", port.name, port.set, len(mesh.nodes_of(port.set, port.name)), "nodes", ""
     for gauge, distance in zip(design.gauge, structure.gauges_moved.tolist(), strict=True):
         moved = f"put onto the surface, {distance / mesh.unit:.3g} {mesh.unit_name} away"
         yield "gauge", gauge.name, "", 1, "place", moved if distance > 1e-6 * mesh.size else ""

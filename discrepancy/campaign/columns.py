@@ -1,17 +1,20 @@
 """A column of a laboratory's table as it is understood, and what its cells stand for."""
 
 import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
-from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.heads import load_or_time, times_among
+from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.campaign.sampling import as_meant
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError, said
+from reporting.words import counted, is_or_are, listing
 
 NOISE, LEFT_OUT, INPUT = "noise", "-", "input:"
 """Kind of a file of samples at rest, role of a column that is left out, and how that of an input begins."""
@@ -76,6 +79,25 @@ class Column:
         # two digits less than a float may need, so that no rounding shows: 4.387 mm is 0.004387 m
         shown = (f"{value * self.to_si:.15g}" for value in values.tolist())
         return tuple(cell and text for cell, text in zip(cells, shown, strict=True))
+
+
+def role_by_unit(head: str, heads: Sequence[str], units: Sequence[str], kinds: Collection[str]) -> str:
+    """Return the role of a column, of `kinds` "time" and "force", where its table leaves no doubt, else "".
+
+    Parameters
+    ----------
+    head : str
+        Name of the column.
+    heads, units : sequence of str
+        Those of all columns of the table.
+    kinds : collection of str
+        Roles that a unit may tell.
+    """
+    if head in times_among(heads, units):
+        return "time"
+    of_units = [load_or_time(unit) for unit in units]
+    kind = of_units[heads.index(head)]
+    return kind if kind in kinds and of_units.count(kind) == 1 else ""
 
 
 def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
@@ -164,6 +186,30 @@ def gain_deviation(head: str, answer: str) -> float | str:
     return float(amount[1]) / 100.0 if amount[2] else float(amount[1])
 
 
+def degrees_celsius(answer: str) -> float:
+    """Return a temperature [degC]; raises CampaignFileError where it is no number."""
+    try:
+        return float(answer)
+    except ValueError:
+        raise CampaignFileError(said("sheets.no_temperature", came=answer)) from None
+
+
+def possible_quantities(unit: str, answer: str | None) -> tuple[Quantity, ...]:
+    """Return the quantities that a column with a unit can be; one where that was said.
+
+    Raises
+    ------
+    ValueError
+        If none is measured in that unit, or what was said is no quantity.
+    """
+    if answer is not None and answer not in list(Quantity):
+        raise ValueError(f"a quantity is {listing(Quantity, 'or')}, and {answer!r} came")
+    able = quantities_of(unit) if answer is None else (Quantity(answer),)
+    if not able:
+        raise ValueError(f"{unit!r} is no unit of a quantity that is measured here")
+    return able
+
+
 def sampling_interval(answer: str) -> float:
     """Return a sampling interval [s]; raises CampaignFileError where it is no positive number."""
     amount = AMOUNT.fullmatch(answer)
@@ -172,14 +218,6 @@ def sampling_interval(answer: str) -> float:
             f"--interval must be a positive number of seconds such as 0.01, and {answer!r} came."
         )
     return float(amount[1])
-
-
-def load_or_time(unit: str) -> str:
-    """Return "time" or "force" where a unit is one of them."""
-    try:
-        return "time" if conversion(unit, "s") else ""
-    except ValueError:
-        return "force" if Quantity.FORCE in quantities_of(unit) else ""
 
 
 def release_in_si(answer: str) -> dict[str, Any]:
@@ -191,3 +229,49 @@ def release_in_si(answer: str) -> dict[str, Any]:
                 displacement = float(amount[1]) * conversion_of(quantity, amount[2])
                 return {"displacement": displacement, "unit": UNITS[quantity].si}
     raise CampaignFileError(said("campaign.release", given=answer))
+
+
+# ---------------------------------------------------------------- what is told of columns
+
+
+def units_read(columns: Iterable[Column], kinds: Mapping[str, str]) -> dict[str, str]:
+    """Return the unit in which each channel, input and force was read, of several the first.
+
+    Parameters
+    ----------
+    columns : iterable of Column
+        Of all tables.
+    kinds : mapping of str to str
+        What was done, by the name of the table.
+    """
+    units: dict[str, str] = {}
+    for column in columns:
+        if column.quantity is not None:
+            is_temperature = column.quantity is Quantity.TEMPERATURE
+            units.setdefault(column.title, column.si if is_temperature else column.read_in)
+        elif column.role == "force" and kinds[column.sheet.name] in (TrialKind.STATIC, TrialKind.FORCED):
+            units.setdefault("force", column.read_in)
+    return units
+
+
+def origin_of(sheet: Sheet, used: Sequence[Column], scales: Mapping[str, str]) -> str:
+    """Return the remark on where a table came from and what its columns were taken as."""
+    columns = listing(
+        f"{item.head!r} [{item.unit}]{f' times {scales[item.head]}' if item.head in scales else ''} "
+        f"is {item.role}"
+        for item in used
+    )
+    empty = sum(sheet.columns[sheet.heads.index(item.head)].count("") for item in used)
+    left = f"; {counted(empty, 'cell')} {is_or_are(empty)} empty" if empty else ""
+    return f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: {columns}{left}."
+
+
+def missing_answers(questions: Mapping[tuple[str, str], Sequence[str]]) -> str:
+    """Return which options are missing, by option and what it expects, and about which columns or files."""
+    count = sum(map(len, questions.values()))
+    options = [
+        f"--{option} {f'NAME=... for {listing(map(repr, of))}' if of[0] else '...'} ({expected})"
+        for (option, expected), of in questions.items()
+    ]
+    missing = f"{counted(count, 'answer')} {is_or_are(count)} missing, and nothing was written"
+    return f"{missing}: give {'; '.join(options)}."

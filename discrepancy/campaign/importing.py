@@ -6,6 +6,7 @@ from dataclasses import replace
 from math import isfinite
 from typing import Any
 
+from discrepancy.campaign.clocks import OneClock, on_one_clock, own_clocks
 from discrepancy.campaign.columns import (
     EXACT,
     FREE,
@@ -13,11 +14,16 @@ from discrepancy.campaign.columns import (
     LEFT_OUT,
     NOISE,
     Column,
+    degrees_celsius,
     gain_deviation,
-    load_or_time,
+    missing_answers,
+    origin_of,
+    possible_quantities,
     release_in_si,
+    role_by_unit,
     sampling_interval,
     scaled_unit,
+    units_read,
     zero_deviation,
 )
 from discrepancy.campaign.reading import TABLE_ERRORS, assemble
@@ -30,12 +36,11 @@ from discrepancy.campaign.units import (
     UNITS,
     conversion,
     conversion_of,
-    quantities_of,
 )
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import hash_record
 from reporting.table_file import TextTable
-from reporting.words import be, counted, listing
+from reporting.words import listing
 
 KINDS = (*TrialKind, NOISE)
 OF_COLUMNS = ("column", "unit", "quantity", "scale", "zero", "gain", "hold")
@@ -82,6 +87,7 @@ class Understanding:
         self.sheets, self.answers, self._quantity_of = sheets, answers, quantity_of
         self.questions: dict[tuple[str, str], list[str]] = {}
         self.assumptions: dict[tuple[str, str], dict[str, str]] = {}
+        self._clocks: dict[str, OneClock] = {}
         names = [sheet.name for sheet in sheets]
         if len({*names}) < len(names):
             raise CampaignFileError(said("sheets.one_name", names=listing(names)))
@@ -116,10 +122,7 @@ class Understanding:
         self.reference_temperature = None
         if any(column.role == "temperature" for column in self.columns):
             given = self._said("reference-temperature", "", "degC, at which the model's parameters hold")
-            try:
-                self.reference_temperature = float(given) if given else None
-            except ValueError:
-                raise CampaignFileError(said("sheets.no_temperature", came=given)) from None
+            self.reference_temperature = degrees_celsius(given) if given else None
 
     def with_answer(self, option: str, about: str, said: str) -> "Understanding":
         """Return what is understood once a question is answered."""
@@ -221,9 +224,7 @@ class Understanding:
         if not understood or self.kinds[sheet.name] not in _TIMED:
             return None
         answer = self._said("interval", sheet.name, "seconds between its rows, as no column is a time")
-        if not answer:
-            return None
-        return sampling_interval(answer)
+        return sampling_interval(answer) if answer else None
 
     def _is_held(self, column: Column) -> bool:
         """Whether it is a load that is known at samples only; motions are smooth."""
@@ -276,9 +277,7 @@ class Understanding:
         """Return the unit of a column's cells, that of its readings, and one cell's unit in the latter."""
         unit = self.answers.get("unit", {}).get(head, unit)
         scale = self.answers.get("scale", {}).get(head)
-        if scale is None:
-            return unit, unit, 1.0
-        return scaled_unit(head, unit, scale)
+        return (unit, unit, 1.0) if scale is None else scaled_unit(head, unit, scale)
 
     def _column(self, sheet: Sheet, head: str, unit: str) -> Column:
         cell_unit, unit, factor = self._scaled(head, unit)
@@ -320,10 +319,9 @@ class Understanding:
         driven = self.kinds[sheet.name] not in (TrialKind.STATIC, TrialKind.FORCED, TrialKind.RINGDOWN, NOISE)
         if answer is not None or (called in _SI and not (driven and called == "force")):
             return called if answer is None else answer
-        kind = load_or_time(unit)
-        kinds = [load_or_time(self._scaled(*pair)[1]) for pair in zip(sheet.heads, sheet.units, strict=True)]
-        if kinds.count(kind) == 1 and kind in (("time",) if driven else ("time", "force")):
-            return kind
+        units = [self._scaled(*pair)[1] for pair in zip(sheet.heads, sheet.units, strict=True)]
+        if role := role_by_unit(head, sheet.heads, units, ("time",) if driven else ("time", "force")):
+            return role
         if self._quantity_of is not None and self._quantity_of(head) is not None:
             return head
         what = f"{', '.join(INPUT_COLUMNS[:4])}, {INPUT}NAME, or {LEFT_OUT} to leave it out"
@@ -331,12 +329,7 @@ class Understanding:
 
     def _quantity(self, head: str, role: str, unit: str) -> Quantity | None:
         """Return the quantity of a channel or an input, None while that is open."""
-        answer = self.answers.get("quantity", {}).get(head)
-        if answer is not None and answer not in list(Quantity):
-            raise ValueError(f"a quantity is {listing(Quantity, 'or')}, and {answer!r} came")
-        able = quantities_of(unit) if answer is None else (Quantity(answer),)
-        if not able:
-            raise ValueError(f"{unit!r} is no unit of a quantity that is measured here")
+        able = possible_quantities(unit, self.answers.get("quantity", {}).get(head))
         if self._quantity_of is not None and role and INPUT not in role:
             modelled = self._quantity_of(role)
             if modelled is None:
@@ -358,13 +351,7 @@ class Understanding:
             A question is open, or as `read_campaign`; lines are those of the files that were given.
         """
         if self.questions:
-            count = sum(map(len, self.questions.values()))
-            options = [
-                f"--{option} {f'NAME=... for {listing(map(repr, of))}' if of[0] else '...'} ({expected})"
-                for (option, expected), of in self.questions.items()
-            ]
-            missing = f"{counted(count, 'answer')} {be(count)} missing, and nothing was written"
-            raise CampaignFileError(f"{missing}: give {'; '.join(options)}.")
+            raise CampaignFileError(missing_answers(self.questions))
         channels: dict[str, dict[str, Any]] = {}
         inputs: dict[str, dict[str, Any]] = {}
         for item in self.columns:
@@ -397,13 +384,8 @@ class Understanding:
         return {key: value for key, value in stated.items() if value is not None}
 
     def units(self) -> dict[str, str]:
-        """Return the unit in which each channel was read, of several the first."""
-        units: dict[str, str] = {}
-        for column in self.columns:
-            if column.is_channel:
-                is_temperature = column.quantity is Quantity.TEMPERATURE
-                units.setdefault(column.title, column.si if is_temperature else column.read_in)
-        return units
+        """Return the unit in which each channel, input and force was read, of several the first."""
+        return units_read(self.columns, self.kinds)
 
     def _trial(self, file: str) -> dict[str, Any]:
         places = self.answers.get("load-place", {})
@@ -422,12 +404,37 @@ class Understanding:
         given = {key: value for key, value in known.items() if value is not None}
         return {"name": _UNTITLED.sub("", file), "kind": self.kinds[file], "file": file, **given}
 
+    def clock_of(self, sheet: Sheet) -> OneClock | None:
+        """Return a table with several columns of times on one clock; None with one column, or with questions.
+
+        Raises
+        ------
+        CampaignFileError, CampaignDataError
+            As `own_clocks` and `on_one_clock`.
+        """
+        columns = [column for column in self.columns if column.sheet is sheet]
+        if self.questions or [column.role for column in columns].count("time") < 2:
+            return None
+        if sheet.name not in self._clocks:
+            kind, decimal = self.kinds[sheet.name], self.decimals[sheet.name]
+            self._clocks[sheet.name] = on_one_clock(own_clocks(columns), kind, decimal, self.holds)
+        return self._clocks[sheet.name]
+
+    @property
+    def clock_sentences(self) -> list[str]:
+        """How tables with several columns of times come to one."""
+        clocks = {sheet.name: self.clock_of(sheet) for sheet in self.sheets}
+        return [f"{name}: {clock.sentence}." for name, clock in clocks.items() if clock is not None]
+
     def _table(self, sheet: Sheet) -> TextTable:
         """Return the table of a trial in SI."""
         used = [item for item in self.columns if item.sheet is sheet and item.to_si is not None]
-        titles = [item.title for item in used]
+        clock = self.clock_of(sheet)
+        titles = [item.title for item in used if clock is None or item.role != "time"]
         if twice := next((title for title in titles if titles.count(title) > 1), None):
             raise CampaignFileError(said("sheets.twice", file=sheet.name, title=twice))
+        if clock is not None:
+            return TextTable(sheet.name, clock.cells, clock.lines, TABLE_ERRORS)
         columns = {item.title: item.in_si(self.decimals[sheet.name]) for item in used}
         interval = self.intervals[sheet.name]
         if interval is not None:
@@ -437,12 +444,6 @@ class Understanding:
 
     def _origin(self, sheet: Sheet) -> str:
         used = [item for item in self.columns if item.sheet is sheet and item.role != LEFT_OUT]
-        scales = self.answers.get("scale", {})
-        columns = listing(
-            f"{item.head!r} [{item.unit}]{f' times {scales[item.head]}' if item.head in scales else ''} "
-            f"is {item.role}"
-            for item in used
-        )
-        empty = sum(sheet.columns[sheet.heads.index(item.head)].count("") for item in used)
-        left = f"; {counted(empty, 'cell')} {be(empty)} empty" if empty else ""
-        return f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: {columns}{left}."
+        clock = self.clock_of(sheet)
+        on_one_clock = f" {clock.sentence}." if clock is not None else ""
+        return origin_of(sheet, used, self.answers.get("scale", {})) + on_one_clock

@@ -26,12 +26,12 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.sampling import check_sampling, nearly_even, spacing_sentence
-from discrepancy.campaign.units import conversion_of
+from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.files import hash_file, hash_record
 from reporting.table_file import TableErrors, TextTable, read_table
 from reporting.toml_file import read_toml
-from reporting.words import be, counted
+from reporting.words import counted, is_or_are
 
 CAMPAIGN_FILE = "campaign.toml"
 """Name of the file that describes a campaign, in its folder."""
@@ -199,7 +199,7 @@ def _trial(
         values=np.stack(columns, axis=1),
         used=np.stack(used, axis=1),
         time=time,
-        force=table.numbers("force", user) if forced else next(pushing, zeros),
+        force=_force(table, campaign, user) if forced else next(pushing, zeros),
         load_factor=table.numbers("load_factor", user) if section.kind is TrialKind.FLIGHT else zeros,
         temperature=_temperature(section, table, campaign, user),
         start=start,
@@ -220,6 +220,11 @@ def _inputs(
         return ()
     there = (item for item in campaign.input if item.table_column in table.columns)
     return tuple(replace(item, values=_numbers(table, item, user)) for item in there)
+
+
+def _force(table: TextTable, campaign: schema.CampaignSection, user: str) -> FloatArray:
+    """Return the column `force` [N]."""
+    return table.numbers("force", user) * conversion(campaign.force_unit, schema.FORCE_UNIT)
 
 
 def _numbers(table: TextTable, item: InTables, user: str, *, empty_allowed: bool = False) -> FloatArray:
@@ -298,7 +303,7 @@ def _readings(
         rows = np.arange(len(values))
         values[~used] = np.interp(rows[~used], rows[used], values[used])
         count = int((~used).sum())
-        are = f"{be(count)} empty"
+        are = f"{is_or_are(count)} empty"
         remarks.append(said("remarks.left_out", count=count, total=len(values), are=are, **told))
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):

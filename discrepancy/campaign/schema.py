@@ -12,7 +12,7 @@ from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Relea
 from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignFileError, said
 from fe.runtime.patch import EVERY_CHANNEL
-from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, checked
+from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, validate
 
 FORMAT = 1
 """Version of the format."""
@@ -20,6 +20,8 @@ INPUT_COLUMNS = (
     "time", "force", "load_factor", "temperature", "z1", "z2", "z1_deviation", "z2_deviation",
 )  # fmt: skip
 """Columns of the tables that are no channels."""
+FORCE_UNIT = "N"
+"""Unit of the column `force` where the file says no other."""
 OF_REGION = "health."
 """Begins the column of the losses of a damage region by its name."""
 
@@ -74,6 +76,11 @@ def _read_input(item: records.RecordedInput) -> records.RecordedInput:
     if smooth and item.hold not in (None, records.Hold.SMOOTH):
         raise ValueError(said("campaign.motion", item=item))
     return replace(item, offset_deviation=held, hold=records.Hold.SMOOTH if smooth else item.hold)
+
+
+def _force_unit(unit: str) -> str:
+    conversion_of(records.Quantity.FORCE, unit)
+    return unit
 
 
 def _in_si(release: Release) -> Release:
@@ -141,6 +148,7 @@ class CampaignSection(Section):
 
     format: Literal[1]
     name: str
+    force_unit: Annotated[Name, pydantic.AfterValidator(_force_unit)] = FORCE_UNIT
     reference_temperature: Annotated[Number, pydantic.Field(ge=-273.15)] | None = None
     parameters: dict[Name, ParameterSection] = pydantic.Field(default_factory=dict)
     noise: NoiseFileSection | None = None
@@ -213,4 +221,4 @@ def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
     came = table.get("format", FORMAT)
     if came != FORMAT or isinstance(came, bool):
         raise CampaignFileError(said("campaign.format", source=source, came=came, wanted=FORMAT))
-    return checked(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")
+    return validate(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")

@@ -18,17 +18,18 @@ from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 
-from discrepancy.campaign.units import conversion, quantities_of
+from discrepancy.campaign.heads import is_unit, named, plain_unit, times_among
+from discrepancy.campaign.matlab_file import read_matlab
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import hash_file
 from reporting.text_file import read_text
-from reporting.toml_file import shown
+from reporting.toml_file import short_repr
 from reporting.words import counted, listing, one_line
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
+MATLAB = ".mat"
 EXCEL = (".xlsx", ".xlsm")
 OTHER_FORMATS = {
-    ".mat": ("a MATLAB file", "save the table as text: writetable(T, 'FILE.csv')"),
     ".xls": ("an Excel file of before 2007", "save it as .xlsx or as CSV"),
     ".ods": ("an OpenDocument spreadsheet", "save it as .xlsx or as CSV"),
     ".tdms": (
@@ -39,7 +40,6 @@ OTHER_FORMATS = {
     ".unv": ("a universal file", "export its records as text, or read them with pyuff and write a CSV file"),
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
-_LONGEST_HEAD = 200
 _LOOKED_AT = 500
 """Lines by which the separator is chosen."""
 _GROUPS = "'’ \u00a0\u202f"
@@ -62,9 +62,6 @@ _CLOCK = re.compile(
 """Date, clock, fraction of a second, half of the day, and offset from UTC."""
 _HALF_DAY, _DAY = 43_200, 86_400
 _LOGICAL = {"true": "1", "false": "0"}
-_HEAD = re.compile(r"(.+?)(?:(?!\S\d+\S$)\s*(?:\[([^][]+)\]|\(([^()]+)\))|\s+/\s+(.+)|,\s+(.+)|\s+in\s+(.+))")
-"""Name and unit; a number that touches its name, as in `strain[1]`, is part of it."""
-
 Rows = list[tuple[int, list[str]]]
 
 
@@ -124,19 +121,21 @@ def read_sheet(path: Path) -> Sheet:
     if ending in OTHER_FORMATS:
         what, remedy = OTHER_FORMATS[ending]
         raise CampaignFileError(f"{file.name} is {what}, which is not read: {remedy}.")
+    if ending == MATLAB:
+        return _matlab_sheet(file)
     excel = ending in EXCEL
     rows, separator = (_excel_rows(file, path.name.partition("#")[2]), "") if excel else _text_rows(file)
     where = f"{path.name}, {'row' if excel else 'line'}"
     head, units, body, below = _laid_out(rows, path.name, where)
-    lines, names, columns, left = tuple(line for line, _ in body), [], [], ""
+    lines = tuple(line for line, _ in body)
+    names, columns, left = [], [], ""
+    texts_of_rows = [tuple(row[at] if at < len(row) else "" for _, row in body) for at in range(len(head))]
+    seconds = _clock_times(texts_of_rows, [f"{where} {line}" for line in lines])
     for at, title in enumerate(head):
-        cells = tuple(row[at] if at < len(row) else "" for _, row in body)
-        name, unit = _named(title or f"column {at + 1}", units[at])
-        if any(map(_CLOCK.fullmatch, cells)):
-            times = [_time(cell, f"{where} {line}") for cell, line in zip(cells, lines, strict=True)]
-            if not any(_has_date(cell) for cell in cells):
-                times = _past_midnight(times)
-            unit, cells = "s", tuple(_Typed(time - times[0]) for time in times)
+        cells = texts_of_rows[at]
+        name, unit = named(title or f"column {at + 1}", units[at])
+        if at in seconds:
+            unit, cells = "s", seconds[at]
         if texts := [cell for cell in cells if cell and not _is_value(cell)]:
             count = sum(map(bool, cells)) - len(texts)
             held = f"{counted(count, 'number')} and {counted(len(texts), 'text')}" if count else "no numbers"
@@ -149,12 +148,20 @@ def read_sheet(path: Path) -> Sheet:
     heads = [name for name, _ in names]
     earlier = [heads[:at].count(name) for at, name in enumerate(heads)]
     heads = [f"{name} {count + 1}" if count else name for name, count in zip(heads, earlier, strict=True)]
-    between = f", {SEPARATORS[separator]} between cells" if separator else ""
+    between = f", {SEPARATORS[separator]} between cells" if separator and len(head) > 1 else ""
     remark = f"{where.rpartition(' ')[2]}s {lines[0]} to {lines[-1]}{between}{left}{below}"
     return Sheet(
         path.name, hash_file(file), tuple(heads), tuple(unit for _, unit in names), tuple(columns), lines,
         *_decimal(columns, lines, where, separator), remark,
     )  # fmt: skip
+
+
+def _matlab_sheet(path: Path) -> Sheet:
+    table = read_matlab(path)
+    columns = tuple(tuple(cell and _Typed(cell) for cell in cells) for cells in table.columns)
+    units = ("",) * len(columns)
+    lines = tuple(range(1, len(columns[0]) + 1))
+    return Sheet(path.name, hash_file(path), table.heads, units, columns, lines, ".", "", table.remark)
 
 
 # ---------------------------------------------------------------- cells
@@ -196,6 +203,31 @@ def _time(cell: str, where: str) -> Decimal:
     raise CampaignFileError(said("sheets.no_time", where=where, cell=cell))
 
 
+def _clock_times(columns: Sequence[tuple[str, ...]], places: Sequence[str]) -> dict[int, tuple[str, ...]]:
+    """Return the clock times of columns by their number, in seconds since the first of all.
+
+    Times with a date and times of day count from the first of their own kind.
+    """
+    moments: dict[int, dict[int, Decimal]] = {}
+    starts: dict[bool, Decimal] = {}
+    for number, cells in enumerate(columns):
+        if not any(map(_CLOCK.fullmatch, cells)):
+            continue
+        filled = {row: _time(cell, places[row]) for row, cell in enumerate(cells) if cell}
+        is_dated = any(map(_has_date, cells))
+        if not is_dated:
+            filled = dict(zip(filled, _past_midnight([*filled.values()]), strict=True))
+        moments[number] = filled
+        first = next(iter(filled.values()))
+        starts[is_dated] = min(first, starts.get(is_dated, first))
+    found = {}
+    for number, filled in moments.items():
+        start = starts[any(map(_has_date, columns[number]))]
+        rows = range(len(columns[number]))
+        found[number] = tuple(_Typed(filled[row] - start) if row in filled else "" for row in rows)
+    return found
+
+
 def _offset_seconds(offset: str) -> int:
     """Return an offset from UTC such as `Z`, `+01:00` or `-0530` in seconds."""
     if offset in ("", "Z"):
@@ -235,29 +267,6 @@ def _decimal(
         # What commas stand between, and in none of, has points for decimals.
         return ("." if separator == "," and "," not in unclear.rpartition(" in ")[0] else None), unclear
     return next(iter(sure), "."), unclear
-
-
-def _named(text: str, unit: str) -> tuple[str, str]:
-    """Return name and unit of a head such as `Weg [mm]`, `F (kN)` or `t / s`; a row of units goes first."""
-    found = _HEAD.fullmatch(text[:_LONGEST_HEAD])
-    said = "" if found is None else next(filter(None, found.groups()[1:]), "").strip()
-    if found is not None and _is_unit(said):
-        return found[1].strip(), unit or _plain(said)
-    return text, unit
-
-
-def _plain(text: str) -> str:
-    """Return a unit without brackets; a dash is that of a plain number."""
-    text = text.strip("[]() ")
-    return "1" if text in ("-", "–") else text
-
-
-def _is_unit(text: str) -> bool:
-    unit = _plain(text)
-    try:
-        return bool(quantities_of(unit)) or bool(conversion(unit, "s"))
-    except ValueError:
-        return False
 
 
 # ---------------------------------------------------------------- rows
@@ -320,10 +329,56 @@ def _excel_text(cell: object) -> str:
     return "" if cell is None else str(cell).strip()
 
 
+def _is_one_column(rows: Rows) -> bool:
+    """Whether rows of one cell each are titles, and numbers under the last of them.
+
+    What looks like several cells with another mark between them is no single column.
+    """
+    cells = [row[0] for _, row in rows]
+    is_number = [_is_value(cell) for cell in cells]
+    first = is_number.index(True) if True in is_number else 0
+    if first == 0 or any(any(row[1:]) for _, row in rows):
+        return False
+    numbers = [cell for cell, is_one in zip(cells, is_number, strict=True) if is_one]
+    has_blanks = any(" " in cell and not _CLOCK.fullmatch(cell) for cell in numbers)
+    is_separated = any(mark in cells[first - 1] and mark in " ".join(numbers) for mark in SEPARATORS)
+    return 2 * len(numbers) > len(cells) - first and not has_blanks and not is_separated
+
+
+def _rows_of_longer_clocks(
+    rows: Rows, first: int, head: Sequence[str], units: Sequence[str], values: Sequence[set[int]]
+) -> list[int]:
+    """Return the rows right below a table in which only a later one of its columns of times goes on.
+
+    Parameters
+    ----------
+    rows : list
+        Those below.
+    first : int
+        Number of the first of them.
+    head, units : sequence of str
+        Of the table.
+    values : sequence of set of int
+        Places of the values of all rows.
+    """
+    heads, units_of_heads = zip(*map(named, head, units), strict=True)
+    times = times_among(heads, units_of_heads)
+    places = {at for at, title in enumerate(heads) if title in times}
+    found: list[int] = []
+    for number, (_, row) in enumerate(rows, start=first):
+        filled = {at for at, cell in enumerate(row) if cell}
+        if len(places) < 2 or not filled & places or filled - values[number]:
+            break
+        found.append(number)
+    return found
+
+
 def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], Rows, str]:
     """Return head, units and rows of the table, and what was passed over."""
     values = [{at for at, cell in enumerate(row) if _is_value(cell)} for _, row in rows]
     dense = [found for found in values if len(found) > 1]
+    if not dense and _is_one_column(rows):
+        dense = [found for found in values if found]
     often = Counter(at for found in dense for at in found)
     core = sorted(at for at, count in often.items() if 2 * count >= len(dense))
     texts = [
@@ -337,8 +392,10 @@ def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], 
     body = [at for at in range(first, last + 1) if texts[at] is None and values[at]]
     head, units = rows[first - 1][1], [""] * len(rows[first - 1][1])
     above = rows[first - 2][1] if first > 1 else []
-    if sum(map(bool, above)) >= sum(map(bool, head)) and all(_is_unit(cell) for cell in head if cell):
-        head, units = above, [_plain(cell) for cell in head]
+    if sum(map(bool, above)) >= sum(map(bool, head)) and all(is_unit(cell) for cell in head if cell):
+        head, units = above, [plain_unit(cell) for cell in head]
+    body += _rows_of_longer_clocks(rows[last + 1 :], last + 1, head, units, values)
+    last = body[-1]
     filled = max(at for row in body for at, cell in enumerate(rows[row][1]) if cell) + 1
     named = sum(map(bool, head))
     if 2 * named <= filled or len(head) < filled:
@@ -348,10 +405,15 @@ def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], 
     left = {*range(first, last), *(at for at in torn if 2 * len(values[at] & {*core}) >= len(core))} - {*body}
     for line, row in (rows[at] for at in sorted(left) if rows[at][1] not in (head, rows[first - 1][1])):
         if not row[0].startswith("#"):
-            came = shown(listing(filter(None, row)))
+            came = short_repr(listing(filter(None, row)))
             raise CampaignFileError(
                 said("sheets.no_row", place=f"{where} {line}", name=head[core[0]], came=came)
             )
+    if filled == 1 and (gap := next((at for at in body[1:] if rows[at][0] != rows[at - 1][0] + 1), None)):
+        raise CampaignFileError(
+            f"{where} {rows[gap][0] - 1} is empty, and the only column has numbers above and below: "
+            "remove the line, or give the table a column of times."
+        )
     below = [line for line, _ in rows[last + 1 :]]
     remark = f"; what stands from {below[0]} on is left out" if below else ""
     names = [cell.lstrip("# ") for cell in head[:filled]]

@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.campaign import records, schema
 from discrepancy.campaign.reading import CAMPAIGN_FILE, placed_events
-from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion_of
+from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
@@ -25,10 +25,24 @@ _EXACT_DIGITS, _SHOWN_DIGITS = 17, 15
 
 @dataclass(frozen=True)
 class _Layout:
-    """Units of the channels in the files, and significant digits of readings."""
+    """Units of channels, inputs and `force` in the files by name, and significant digits of their values."""
 
     units: Mapping[str, str]
     digits: int
+    left_out_as_empty: bool
+
+    def in_unit(self, values: records.FloatArray, name: str, to_si: float) -> records.FloatArray:
+        """Return values [SI] of a channel or an input in its unit, of which one is `to_si`."""
+        in_unit = values / to_si
+        if self.digits == _EXACT_DIGITS or name not in self.units:
+            return in_unit
+        return np.array([float(f"{value:.{self.digits}g}") for value in in_unit.tolist()])
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the column `force`; a channel of another quantity may be called so."""
+        unit = self.units.get("force", schema.FORCE_UNIT)
+        return unit if records.Quantity.FORCE in quantities_of(unit) else schema.FORCE_UNIT
 
 
 def write_campaign(
@@ -37,6 +51,7 @@ def write_campaign(
     *,
     si: bool = False,
     units: Mapping[str, str] | None = None,
+    left_out_as_empty: bool = False,
 ) -> Path:
     """Write a campaign; `read_campaign` gives it back, equal to rounding but for its hash.
 
@@ -52,8 +67,10 @@ def write_campaign(
     si : bool
         Write strain and displacement in SI, too.
     units : mapping of str to str, optional
-        Unit of each channel in the files, by the channel's name, in the place of these; readings have 15
-        significant digits then.
+        Unit of each channel and input in the files, by its name, in the place of these, and of the force of
+        static and forced trials by "force"; their values have 15 significant digits then.
+    left_out_as_empty : bool
+        Leave the cells of readings empty that are left out, in the place of `left_out` of the trial.
 
     Returns
     -------
@@ -69,9 +86,11 @@ def write_campaign(
         As `reporting.files.atomic_file`.
     """
     folder = Path(folder)
+    usual = {name: _unit(channel, si) for name, channel in campaign.channels.items()}
     layout = _Layout(
-        units={name: _unit(channel, si) for name, channel in campaign.channels.items()} | dict(units or {}),
+        units=usual | dict(units or {}),
         digits=_EXACT_DIGITS if units is None else _SHOWN_DIGITS,
+        left_out_as_empty=left_out_as_empty,
     )
     slugs = (re.sub(r"[^a-z0-9]+", "_", trial.name.lower()).strip("_")[:40] for trial in campaign.trials)
     files = [f"{number:02d}_{slug or 'trial'}.csv" for number, slug in enumerate(slugs, start=1)]
@@ -96,7 +115,7 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, layout: _Layo
     if trial.is_dynamic or np.any(trial.time != trial.start):
         columns["time"] = trial.time
     if trial.kind in (records.TrialKind.STATIC, records.TrialKind.FORCED):
-        columns["force"] = trial.force
+        columns["force"] = layout.in_unit(trial.force, "force", conversion(layout.force_unit, "N"))
     if trial.kind is records.TrialKind.FLIGHT:
         columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
@@ -108,9 +127,15 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, layout: _Layo
         for key, values in ((name, trial.health), (f"{name}_deviation", trial.health_deviation)):
             if np.any(values[:, index] != 0.0):
                 columns[key] = values[:, index]
-    columns |= {item.name: item.values for item in trial.inputs}
+    for item in trial.inputs:
+        to_si = conversion_of(item.quantity, _input_unit(item, layout))
+        columns[item.name] = layout.in_unit(item.values, item.name, to_si)
     for index, name in enumerate(trial.channels):
-        columns[name] = _in_unit(trial.values[:, index], campaign.channels[name], layout)
+        to_si = conversion_of(campaign.channels[name].quantity, layout.units[name])
+        values = trial.values[:, index]
+        if layout.left_out_as_empty:
+            values = np.where(trial.used[:, index], values, np.nan)
+        columns[name] = layout.in_unit(values, name, to_si)
     return table_text(columns)
 
 
@@ -120,11 +145,8 @@ def _unit(item: records.InTables, si: bool) -> str:
     return UNITS[item.quantity].si if si else UNITS[item.quantity].written
 
 
-def _in_unit(values: records.FloatArray, channel: records.Channel, layout: _Layout) -> records.FloatArray:
-    in_unit = values / conversion_of(channel.quantity, layout.units[channel.name])
-    if layout.digits == _EXACT_DIGITS:
-        return in_unit
-    return np.array([float(f"{value:.{layout.digits}g}") for value in in_unit.tolist()])
+def _input_unit(item: records.RecordedInput, layout: _Layout) -> str:
+    return layout.units.get(item.name) or _unit(item, True)
 
 
 def _noise_table(campaign: records.Campaign, layout: _Layout) -> tuple[str, float] | None:
@@ -144,7 +166,8 @@ def _noise_table(campaign: records.Campaign, layout: _Layout) -> tuple[str, floa
     columns: dict[str, records.FloatArray] = {"time": interval * np.arange(float(longest))}
     for name, (samples, _) in recorded.items():
         columns[name] = np.full(longest, np.nan)
-        columns[name][: len(samples)] = _in_unit(samples, campaign.channels[name], layout)
+        to_si = conversion_of(campaign.channels[name].quantity, layout.units[name])
+        columns[name][: len(samples)] = layout.in_unit(samples, name, to_si)
     return table_text(columns), interval
 
 
@@ -159,6 +182,7 @@ def _campaign_text(
     section = schema.CampaignSection.model_construct(
         format=schema.FORMAT,
         name=campaign.name,
+        force_unit=layout.force_unit,
         reference_temperature=campaign.reference_temperature,
         remarks=campaign.remarks,
         parameters={
@@ -169,8 +193,8 @@ def _campaign_text(
         loggers=dict(campaign.loggers),
         accept=campaign.accept,
         channel=tuple(_channel(channel, layout) for channel in campaign.channels.values()),
-        input=tuple(_input(item) for item in inputs.values()),
-        trial=tuple(_trial(campaign, *pair) for pair in zip(campaign.trials, files, strict=True)),
+        input=tuple(_input(item, layout) for item in inputs.values()),
+        trial=tuple(_trial(campaign, *pair, layout) for pair in zip(campaign.trials, files, strict=True)),
         event=tuple(placed_events(campaign.events, campaign.trials, source)),
     )
     content = section.model_dump(mode="json", exclude_defaults=True)
@@ -186,17 +210,25 @@ def _channel(channel: records.Channel, layout: _Layout) -> records.Channel:
     return replace(channel, unit=layout.units[channel.name], column="", noise=noise)
 
 
-def _input(item: records.RecordedInput) -> records.RecordedInput:
+def _input(item: records.RecordedInput, layout: _Layout) -> records.RecordedInput:
     reference = bool(item.quantity.moving) and item.hold is not records.Hold.SMOOTH
-    return replace(item, unit=_unit(item, True), column="", reference=reference)
+    unit = _input_unit(item, layout)
+    deviation = item.offset_deviation / conversion_of(item.quantity, unit)
+    return replace(item, unit=unit, offset_deviation=deviation, column="", reference=reference)
 
 
-def _trial(campaign: records.Campaign, trial: records.Trial, file: str) -> schema.TrialSection:
-    left_out = {
-        name: tuple((np.flatnonzero(~trial.used[:, index]) + 1).tolist())
-        for index, name in enumerate(trial.channels)
-        if not trial.used[:, index].all()
-    }
+def _trial(
+    campaign: records.Campaign, trial: records.Trial, file: str, layout: _Layout
+) -> schema.TrialSection:
+    left_out = (
+        {}
+        if layout.left_out_as_empty
+        else {
+            name: tuple((np.flatnonzero(~trial.used[:, index]) + 1).tolist())
+            for index, name in enumerate(trial.channels)
+            if not trial.used[:, index].all()
+        }
+    )
     driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed
     said = driven or trial.begins is not records.Start.SETTLED
     in_order = list(trial.channels) == [name for name in campaign.channels if name in trial.channels]

@@ -24,7 +24,7 @@ A TOML file describes one effect at its top level, or several as tables `[[effec
     station = "0.5 * length"
 
 Keys that may be left out: `confusable` (identifiers), `places` (names, or a word of `PLACES` such as
-"ports"), `preferred` (ports that stand for all where the model has them), `needs` (words of `NEEDS`),
+"ports"), `preferred` (ports of a wing that stand for its others), `needs` (words of `NEEDS`),
 `spectral` (see `Effect`), `[[shape]]` (as a parameter, with `canonical` in place of `unit` and `magnitude`),
 `levels` of a parameter. Names in arithmetic are the parameters and `SCALES`. Text values of a primitive
 (port, channel, run) are taken as they are; "place" stands for the place, "quantity of the place" for what it
@@ -62,11 +62,11 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Effect, EffectKeys, Setting
 from discrepancy.catalogue.needs import DYNAMIC, NEEDS, PLACES, Asked, EffectSection, Target
 from discrepancy.errors import CatalogueError, said
-from discrepancy.models.interface import PortScale
+from discrepancy.system.scales import PortScale
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import EVERY_CHANNEL, PRIMITIVES, ModelPatch, Primitive, Window
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import read_toml, validate
 
 # ---------------------------------------------------------------- names in arithmetic
 LARGEST_SHARE = 0.9
@@ -211,7 +211,7 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
 
 
 def _effect(row: object, where: str) -> Effect:
-    section = checked(EffectSection, row, where, CatalogueError, what="an effect")
+    section = validate(EffectSection, row, where, CatalogueError, what="an effect")
     names = frozenset([*(item.name for item in section.parameters), *(item.name for item in section.shape)])
     moments = frozenset(word for name in section.events for word in (name, f"{name}_until"))
     _check_words(section, names, where)

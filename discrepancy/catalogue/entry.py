@@ -9,7 +9,8 @@ from pydantic import ConfigDict, Field, Strict
 from scipy.special import ndtr, ndtri
 
 from discrepancy.campaign.records import Campaign, TrialKind
-from discrepancy.models.interface import Model, Scales
+from discrepancy.system.interface import Model
+from discrepancy.system.scales import Scales
 from fe.runtime.patch import ModelPatch
 
 NINETY = 1.6448536269514722

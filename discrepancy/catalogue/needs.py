@@ -11,9 +11,13 @@ from pydantic import Field
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import SENTENCES, said
-from discrepancy.models.interface import ACROSS, PortScale
+from discrepancy.system.interface import Model
+from discrepancy.system.response import ACROSS
+from discrepancy.system.scales import PortScale
+from discrepancy.system.structures import StructureModel
 from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
+from fe.runtime.wing_rows import PORTS
 
 from .entry import ROW, EffectKeys, Number, Setting
 
@@ -27,6 +31,8 @@ EVERY_PORT = "every port"
 """Place of a law that acts at all ports of states alike."""
 ALL = "all "
 """Begins the place that stands for all channels of a quantity."""
+CHANNELS_OR_ALL_OF_A_QUANTITY = "channels, or all of a quantity"
+"""Word for places that are channels, and all channels of a quantity alike."""
 
 
 USUAL = ("trial", "event", "law", "place")
@@ -47,6 +53,11 @@ class EffectSection(EffectKeys):
     events: tuple[str, ...] = ()
 
 
+def _has_ports_of_a_wing(model: Model) -> bool:
+    """Return whether one port of a model may stand for the others; the file of a structure names its own."""
+    return set(model.ports) <= set(PORTS) and not isinstance(model, StructureModel)
+
+
 @dataclass(frozen=True)
 class Asked:
     """An effect in a setting, as its file says: where it may act, and why it cannot be tested.
@@ -57,7 +68,7 @@ class Asked:
         Campaign and model.
     section : EffectSection
         What its file says. Its `places` are a word of `PLACES`, the places themselves, or none: there is no
-        choice; `preferred` are ports that stand for all where the model has one of them. The port "planform"
+        choice; `preferred` are ports of a wing that stand for its others. The port "planform"
         of a force that is spread over an area is "span" in a model without one.
     primitives : tuple of type
         What it is made of.
@@ -98,12 +109,11 @@ class Asked:
         return tuple(name for name, scale in self.setting.scales.ports.items() if scale.of_state)
 
     def force_ports(self, chosen: Callable[[PortScale], bool] = lambda scale: True) -> Names:
-        """Return the ports where forces act: those of `preferred` that the model has, else all."""
-        flows, scales = self.state_ports, self.setting.scales.ports
-        known = tuple(port for port in self.setting.model.ports if port not in flows)
-        wanted = [
-            "span" if name == PLANFORM and name not in scales else name for name in self.section.preferred
-        ]
+        """Return the ports where forces act: of a wing those of `preferred` that it has, else all."""
+        model, flows, scales = self.setting.model, self.state_ports, self.setting.scales.ports
+        known = tuple(port for port in model.ports if port not in flows)
+        preferred = self.section.preferred if _has_ports_of_a_wing(model) else ()
+        wanted = ["span" if name == PLANFORM and name not in scales else name for name in preferred]
         found = tuple(name for name in wanted if name in known or name == PLANFORM) or known
         return tuple(name for name in found if name not in scales or chosen(scales[name]))
 
@@ -136,12 +146,17 @@ class Asked:
         if place == EVERY_PORT:
             return tuple(map(Target, self.state_ports))
         if self.section.places == "mains lines":
-            line, _, name = place.partition(", ")
-            frequency = float(line.split()[0])
-            if name.startswith(ALL) and name not in self.setting.campaign.channels:
-                return (Target(EVERY_CHANNEL, name.removeprefix(ALL), frequency),)
-            return (Target(name, number=frequency),)
+            line, _, channels = place.partition(", ")
+            return (replace(self._channels_at(channels), number=float(line.split()[0])),)
+        if self.section.places == CHANNELS_OR_ALL_OF_A_QUANTITY:
+            return (self._channels_at(place),)
         return (Target(place or EVERY_CHANNEL),)
+
+    def _channels_at(self, place: str) -> "Target":
+        """Return what a place stands for that is a channel, or "all strain" and the like."""
+        if place.startswith(ALL) and place not in self.setting.campaign.channels:
+            return Target(EVERY_CHANNEL, place.removeprefix(ALL))
+        return Target(place)
 
 
 @dataclass(frozen=True)
@@ -214,11 +229,16 @@ def mains_lines(setting: Setting) -> Names:
     return tuple(" or ".join(f"{frequency:g}" for frequency in group) + " Hz" for group in groups)
 
 
-def _seen_lines(asked: Asked) -> Names:
-    """Return the mains lines at channels, and at "all strain" and the like for several of a quantity."""
+def _channels_or_all_of_a_quantity(asked: Asked) -> Names:
+    """Return the channels, and "all strain" and the like before them where several have a quantity."""
     quantities = [channel.quantity.value for channel in asked.channels]
     several = dict.fromkeys(ALL + quantity for quantity in quantities if quantities.count(quantity) > 1)
-    seen = (*several, *asked.channels_of())
+    return (*several, *asked.channels_of())
+
+
+def _seen_lines(asked: Asked) -> Names:
+    """Return the mains lines at channels, and at all channels of a quantity."""
+    seen = _channels_or_all_of_a_quantity(asked)
     return tuple(f"{line}, {name}" for line in mains_lines(asked.setting) for name in seen)
 
 
@@ -226,6 +246,7 @@ PLACES: dict[str, Callable[[Asked], Names]] = {
     "ports": lambda asked: asked.setting.model.ports,
     "channels": Asked.channels_of,
     "channels, or all": lambda asked: _or_all(asked.channels_of()),
+    CHANNELS_OR_ALL_OF_A_QUANTITY: _channels_or_all_of_a_quantity,
     "strain channels": lambda asked: asked.strain_channels,
     "strain channels, or all": lambda asked: _or_all(asked.strain_channels),
     "runs": lambda asked: tuple(dict.fromkeys(trial.run for trial in asked.setting.campaign.fitted)),

@@ -27,8 +27,9 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit, normal_equations
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.separability import begun
-from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.sensing import observe
+from discrepancy.system.interface import Model
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 from .fault import DataFault, FaultKind, fault, unit_slips, with_acceptance

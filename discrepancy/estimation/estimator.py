@@ -18,6 +18,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.missing_force.filtered import LEAST_PRECISION, Process, Regression, Solution, without
+from discrepancy.missing_force.process_search import prior_log_density
 from discrepancy.missing_force.trial import SeenTrial
 
 from .laws import ForceAlong
@@ -41,8 +42,6 @@ FACTORS = (3.0, 1.7, 1.3)
 """Of size and time of a missing force, by which the most probable ones are looked for."""
 DECLINE = 12.0
 """Evidence [nat] below the best by which lower missing forces are given up."""
-SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
-"""Prior deviations of the logarithms of size and correlation time of a missing force."""
 
 
 class Laws(Protocol):
@@ -356,9 +355,4 @@ class Estimator:
 
     def _log_prior(self, processes: Mapping[int, Process]) -> float:
         """Return the logarithm of the prior of missing forces [nat], up to a constant."""
-        total = 0.0
-        for port, process in processes.items():
-            usual = self.usual[port]
-            total -= 0.5 * (np.log(process.size / usual.size) / SIZE_DOUBT) ** 2
-            total -= 0.5 * (np.log(process.time / usual.time) / TIME_DOUBT) ** 2
-        return float(total)
+        return prior_log_density(self.usual, processes)

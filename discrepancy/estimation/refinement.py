@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.missing_force.explained import Explained
 from discrepancy.missing_force.filtered import Solution
-from discrepancy.missing_force.naming import Explained, ForceSearch
+from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import SeenTrial
 from discrepancy.missing_force.view import Motion
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Quantity, Start, Trial, TrialKind
-from discrepancy.models.interface import Conditions, Model
+from discrepancy.system.interface import Model
+from discrepancy.system.response import Conditions
 
 FREE_MOTION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""

@@ -17,7 +17,7 @@ from discrepancy.errors import said
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.naming import Explained
+from discrepancy.missing_force.explained import Explained
 from discrepancy.search.starts import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import (

@@ -21,7 +21,8 @@ from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate
 from discrepancy.fits.predictive import residual_set
-from discrepancy.missing_force.naming import Explained, ForceSearch
+from discrepancy.missing_force.explained import Explained
+from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share, missing_force
 from discrepancy.proof_record import ClosedShare
 from discrepancy.search.honest_evidence import noise_levels, refitted

@@ -166,9 +166,11 @@ def _verdict_of(court: Court, first: Verdict) -> Outcome:
     if court.grew(best):
         return _unexplained(court, first, best)
     probability = court.probability(*members)
-    has_evidence = best.log_evidence - court.nothing.log_evidence >= SEARCH.bayes_factor
-    if probability < SEARCH.sure or not has_evidence:
+    if probability < SEARCH.sure:
         return _unexplained(court, first, best)
+    log_bayes_factor = best.log_evidence - court.nothing.log_evidence
+    if log_bayes_factor < SEARCH.bayes_factor:
+        return _unexplained(court, first, best, _too_little_evidence(log_bayes_factor))
     if len(members) > 1:
         if all(map(court.passes_absolute_fit, members)):
             return _group(court, members, probability)
@@ -176,6 +178,14 @@ def _verdict_of(court: Court, first: Verdict) -> Outcome:
         why = f"it leaves more than noise, and these data do not tell it from {others}"
         return _unexplained(court, first, best, why)
     return _in_part(court, best, probability)
+
+
+def _too_little_evidence(log_bayes_factor: float) -> str:
+    """Return why a hypothesis is no name that explains little more than a force without any law does."""
+    return (
+        "a missing force without any law explains the readings as well "
+        f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs {SEARCH.bayes_factor:g})"
+    )
 
 
 def _in_part(court: Court, best: Hypothetic, probability: float) -> Outcome:

@@ -15,7 +15,8 @@ from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.search.starts import Tell, acts_within, in_silence
-from discrepancy.search.strategy import Search, search
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import OnSearch, nobody_looks, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, Verdict, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
@@ -268,7 +269,12 @@ def _family_probability(found: Search, family: str) -> float:
 INSTRUMENTS = (LoadGain, *SENSORS)
 
 
-def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Outcome:
+def name(
+    problem: Problem,
+    effects: Sequence[Effect],
+    tell: Tell = in_silence,
+    on_search: OnSearch = nobody_looks,
+) -> Outcome:
     """Name what is missing.
 
     Parameters
@@ -279,6 +285,8 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
         The catalogue.
     tell : callable
         Takes a few words on what is fitted, and how much is left.
+    on_search : callable
+        Takes each search as it begins.
 
     Returns
     -------
@@ -287,15 +295,15 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
         stands for the verdict: of the named set, of the family, of the most probable member of a group or of
         what is too small to tell; else the one without effect.
     """
-    verdict, found, fit = checked_verdict(_searched(problem, effects, tell))
+    verdict, found, fit = checked_verdict(_searched(problem, effects, tell, on_search))
     moved = moved_unknowns(problem, found.none)
     sentence = f"{verdict.sentence} {moved_sentence(moved)}".strip()
     return Outcome(replace(verdict, sentence=sentence, moved=moved), found, fit)
 
 
-def _searched(problem: Problem, effects: Sequence[Effect], tell: Tell) -> Outcome:
+def _searched(problem: Problem, effects: Sequence[Effect], tell: Tell, on_search: OnSearch) -> Outcome:
     """Return the verdict on a search along the missing force, or else on whole simulations."""
-    found = search(problem, effects, tell)
+    found = search(problem, effects, tell, on_search)
     first = _named(found)
     if not found.forces or first.verdict.kind is not VerdictKind.UNEXPLAINED:
         return first
@@ -303,6 +311,7 @@ def _searched(problem: Problem, effects: Sequence[Effect], tell: Tell) -> Outcom
     again = attempt(problem, Candidate(), found.none.point)  # time steps may be finer by now
     second = Search(problem, found.effects, again or found.none, tell=tell)
     second.force = found.force
+    on_search(second)
     second.singles()
     second.sets()
     other = _named(second)

@@ -21,7 +21,7 @@ from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen
 from discrepancy.fits.trial_data import stand_in
-from discrepancy.models.interface import Model
+from discrepancy.system.interface import Model
 
 CONFUSED = 9.0
 """Squared distance [sigma^2] below which two effects form a confusion group."""

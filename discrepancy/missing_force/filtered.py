@@ -9,13 +9,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray
 
-from .kalman import Steps, discretised, forward, later
+from .backward import later
+from .kalman import Steps, discretised, forward
 from .trial import SeenTrial
 
 
@@ -51,6 +53,43 @@ class Process:
         return 2.0 / self.time if self.rough else 4.0 * np.sqrt(3.0) / self.time
 
 
+class StateSpace(NamedTuple):
+    """A trial's system with its missing forces and coloured noises as states (n,), in units of size one.
+
+    Attributes
+    ----------
+    generator, intensity : (n, n) ndarray
+        Rates of the state, and the spectral density of the white noise that drives it.
+    output_rows : (C, n) ndarray
+        What the readings show of the state, over the white part of their noise.
+    start_covariance : (n, n) ndarray
+        Covariance of the state at the first sample.
+    """
+
+    generator: FloatArray
+    intensity: FloatArray
+    output_rows: FloatArray
+    start_covariance: FloatArray
+
+
+class Smoothed(NamedTuple):
+    """What readings show of a trial of F fine stamps and N samples, with P missing forces.
+
+    Attributes
+    ----------
+    state : (F, n) ndarray
+        State that the missing forces add.
+    forces : (P, F) ndarray
+        The missing forces.
+    deviations : (2 P, N) ndarray
+        Standard deviations of the forces, then of the speeds of their ports, at the samples.
+    """
+
+    state: FloatArray
+    forces: FloatArray
+    deviations: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class Filtered:
     """A trial with missing forces at ports.
@@ -58,9 +97,9 @@ class Filtered:
     Attributes
     ----------
     trial : SeenTrial
-        Which.
+        The trial.
     processes : sequence of (int, Process)
-        Forces, each with the number of its port; there may be several at one.
+        Forces, each with the number of its port; there may be several at one port.
     """
 
     trial: SeenTrial
@@ -70,69 +109,82 @@ class Filtered:
     def units(self) -> FloatArray:
         """Units (n,) of the state: those of a force of `size` at the frequencies of the system."""
         system = self.trial.system
-        n = len(system.generator)
-        pace = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
-        pushes = [np.abs(system.actions[p]).max(initial=0.0) * one.size for p, one in self.processes]
-        push = max(*pushes, 1e-300)
-        units = np.full(n, push / pace)
-        half = n // 2 if 2 * (n // 2) == n else 0
-        units[:half] /= pace
+        state_count = len(system.generator)
+        fastest = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
+        pushes = [
+            np.abs(system.actions[port]).max(initial=0.0) * process.size for port, process in self.processes
+        ]
+        largest_push = max(*pushes, 1e-300)
+        units = np.full(state_count, largest_push / fastest)
+        has_positions = state_count % 2 == 0  # the first half are positions, the second their speeds
+        if has_positions:
+            units[: state_count // 2] /= fastest
         return units
 
     @cached_property
     def places(self) -> list[int]:
-        """Where each force stands in the whole state."""
-        counts = [len(one.generator) for _, one in self.processes]
+        """Index of each force in the whole state."""
+        counts = [len(process.generator) for _, process in self.processes]
         begin = len(self.trial.system.generator)
         return [begin + sum(counts[:number]) for number in range(len(counts))]
 
     @cached_property
     def white(self) -> FloatArray:
-        """Deviation (C,) of each channel's noise over that of what is white of it."""
-        found = np.ones(len(self.trial.deviation))
-        for channel, share, _ in self.trial.coloured:
-            found[channel] = 1.0 / np.sqrt(1.0 - share)
-        return found
+        """Standard deviation (C,) of each channel's noise over that of its white part."""
+        ratios = np.ones(len(self.trial.deviation))
+        for channel, coloured_share, _ in self.trial.coloured:
+            ratios[channel] = 1.0 / np.sqrt(1.0 - coloured_share)
+        return ratios
 
     @cached_property
-    def system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Generator, noise intensity, rows of the readings, covariance at the first sample."""
+    def system(self) -> StateSpace:
+        """The system, its missing forces and the coloured parts of noises, in this order."""
         trial = self.trial
-        n, units, noises = len(trial.system.generator), self.units, len(trial.coloured)
-        begin = n + sum(len(one.generator) for _, one in self.processes)
-        whole = begin + noises
-        generator, intensity, start = np.zeros((3, whole, whole))
-        generator[:n, :n] = trial.system.generator * units / units[:, None]
-        rows = np.zeros((len(trial.deviation), whole))
-        rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
-        for (port, one), at in zip(self.processes, self.places, strict=True):
-            force = slice(at, at + len(one.generator))
-            generator[:n, at] = -trial.system.actions[port] * one.size / units
-            generator[force, force] = one.generator
-            intensity[force.stop - 1, force.stop - 1] = one.intensity
-            rows[:, at] = -trial.system.through[port] * one.size / trial.deviation
-            start[force, force] = np.eye(len(one.generator))
-            if trial.settled:  # at rest under the missing force too
-                begun = np.linalg.lstsq(generator[:n, :n], -generator[:n, at], rcond=1e-12)[0]
-                start[:n, :n] += np.outer(begun, begun)
-                start[:n, at] = start[at, :n] = begun
-        for at, (channel, share, rate) in enumerate(trial.coloured, begin):
-            generator[at, at], intensity[at, at], start[at, at] = -rate, 2.0 * rate, 1.0
-            rows[channel, at] = np.sqrt(share)
+        motion = slice(0, len(trial.system.generator))
+        first_noise = motion.stop + sum(len(process.generator) for _, process in self.processes)
+        size = first_noise + len(trial.coloured)
+        generator = np.zeros((size, size))
+        intensity = np.zeros((size, size))
+        start = np.zeros((size, size))
+        rows = np.zeros((len(trial.deviation), size))
+        # the motion
+        generator[motion, motion] = trial.system.generator * self.units / self.units[:, None]
+        rows[:, motion] = trial.system.outputs * self.units / trial.deviation[:, None]
+        # the missing forces, which push it and are seen directly where a reading is an acceleration
+        for (port, process), place in zip(self.processes, self.places, strict=True):
+            force = slice(place, place + len(process.generator))
+            generator[motion, place] = -trial.system.actions[port] * process.size / self.units
+            generator[force, force] = process.generator
+            intensity[force.stop - 1, force.stop - 1] = process.intensity
+            rows[:, place] = -trial.system.through[port] * process.size / trial.deviation
+            start[force, force] = np.eye(len(process.generator))
+            if trial.settled:  # the trial begins at rest under the missing force too
+                at_rest = np.linalg.lstsq(generator[motion, motion], -generator[motion, place], rcond=1e-12)[
+                    0
+                ]
+                start[motion, motion] += np.outer(at_rest, at_rest)
+                start[motion, place] = at_rest
+                start[place, motion] = at_rest
+        # the coloured parts of noises, which decay
+        for place, (channel, coloured_share, rate) in enumerate(trial.coloured, first_noise):
+            generator[place, place] = -rate
+            intensity[place, place] = 2.0 * rate
+            start[place, place] = 1.0
+            rows[channel, place] = np.sqrt(coloured_share)
         rows *= self.white[:, None]
-        return generator, intensity, rows, start
+        return StateSpace(generator, intensity, rows, start)
 
     @property
     def key(self) -> tuple[bytes, ...]:
-        """What trials of one system and grid have alike, which are filtered together."""
+        """What trials of one system and one grid of samples share; they are filtered together."""
         return tuple(item.tobytes() for item in (*self.system, *self.trial.steps, self.trial.used))
 
     def steps(self, columns: FloatArray) -> Steps:
         """Return the record with columns (K, N, C) to be filtered."""
-        generator, intensity, rows, _ = self.system
         lengths, _ = self.trial.steps
-        given = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
-        return Steps(*discretised(generator, intensity, lengths), rows, self.trial.used, given)
+        transitions, noises = discretised(self.system.generator, self.system.intensity, lengths)
+        whitened = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
+        return Steps(transitions, noises, self.system.output_rows, self.trial.used, whitened)
 
     def products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return products (K, K) of columns (K, N, C), whitened, and what they take from the evidence [nat].
@@ -140,44 +192,78 @@ class Filtered:
         Half the sum of the logarithms of the readings' variances given those before: infinite under forces
         far larger than what is read.
         """
-        steps, which = self.steps(columns), self.trial.steps[1]
-        end = np.array([len(which)])
-        _, _, products, halves = steps.before(which, 0, steps.begin(self.system[3]), end)
+        steps = self.steps(columns)
+        _, step_of_sample = self.trial.steps
+        end = np.array([len(step_of_sample)])
+        begin = steps.begin(self.system.start_covariance)
+        _, _, products, halves = steps.before(step_of_sample, 0, begin, end)
         return products[0], halves[0] - np.sum(np.log(self.white) * self.trial.used)
 
-    def smoothed(self, readings: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what readings (N, C) show: state, forces, and how well forces and speeds are known.
+    def smoothed(self, readings: FloatArray) -> Smoothed:
+        """Return the state and forces that readings (N, C) show, and how well they are known."""
+        steps = self.steps(readings[None])
+        _, step_of_sample = self.trial.steps
+        covariance, mean, *_ = steps.begin(self.system.start_covariance)
+        every_sample = np.arange(1, len(readings) + 1)
+        record = (steps.moves, steps.noises, step_of_sample, steps.rows, steps.used)
+        covariances, means, white, _, gains, variances = forward(
+            *record, steps.columns, 0, covariance, mean, every_sample
+        )
+        additions, informations = later(
+            steps.moves, step_of_sample, steps.rows, steps.used, white, gains, variances
+        )
+        states = self._between_samples(means, covariances, additions)
+        posterior = covariances - covariances @ informations @ covariances
+        sizes = np.array([process.size for _, process in self.processes])
+        return Smoothed(
+            state=states[:, : len(self.units)] * self.units,
+            forces=states[:, self.places].T * sizes[:, None],
+            deviations=self._deviations(posterior),
+        )
 
-        The added state (F, n) and the missing forces (P, F) are at the fine stamps, the deviations (2 P, N)
-        of these forces, and of the speeds of their ports, at the samples.
+    def _between_samples(
+        self, means: FloatArray, covariances: FloatArray, additions: FloatArray
+    ) -> FloatArray:
+        """Return the smoothed state (F, n) at all fine stamps.
+
+        Parameters
+        ----------
+        means, covariances : (N, n, 1), (N, n, n) ndarray
+            State after the readings of each sample.
+        additions : (N, n) ndarray
+            What readings from a sample on add there, as of `later`.
         """
-        steps, parts = self.steps(readings[None]), self.trial.parts
-        lengths, which = self.trial.steps
-        cover, mean, *_ = steps.begin(self.system[3])
-        every = np.arange(1, len(readings) + 1)
-        given = steps.moves, steps.noises, which, steps.rows, steps.used
-        covers, means, white, _, gains, sizes = forward(*given, steps.columns, 0, cover, mean, every)
-        adds, knows = later(steps.moves, *given[2:], white, gains, sizes)
-        fine, more = discretised(*self.system[:2], lengths / parts)
-        step = which[1:]
-        moves = fine[step]
-        back = [adds[1:, :, None]]
+        parts = self.trial.parts
+        lengths, step_of_sample = self.trial.steps
+        fine_transitions, fine_noises = discretised(
+            self.system.generator, self.system.intensity, lengths / parts
+        )
+        kind = step_of_sample[1:]
+        transitions = fine_transitions[kind]
+        # what later readings add, carried back from the next sample to each fine stamp before it
+        carried_back = [additions[1:, :, None]]
         for _ in range(parts):
-            back.append(moves.mT @ back[-1])
-        state, noise, found = means[:-1] + covers[:-1] @ back[-1], np.zeros_like(fine), []
-        for add in back[:0:-1]:
-            found.append(state + noise[step] @ add)
-            state, noise = moves @ state, fine @ noise @ fine.mT + more
-        states = np.concatenate((np.stack(found, axis=1).reshape(-1, len(mean)), means[-1:, :, 0]))
-        sizes_of = np.array([one.size for _, one in self.processes])
-        n, count = len(self.units), len(self.processes)
-        shown = np.zeros((2 * count, len(mean)))
-        for number, (port, one) in enumerate(self.processes):
-            shown[number, self.places[number]] = one.size
-            shown[count + number, :n] = self.trial.system.speeds[port] * self.units
-        squares = np.sum((shown @ (covers - covers @ knows @ covers)) * shown, axis=-1)
-        forces = states[:, self.places].T * sizes_of[:, None]
-        return states[:, :n] * self.units, forces, np.sqrt(np.maximum(squares, 0.0)).T
+            carried_back.append(transitions.mT @ carried_back[-1])
+        # the state, carried forward from each sample with what it may have gathered on the way
+        state = means[:-1] + covariances[:-1] @ carried_back[-1]
+        gathered = np.zeros_like(fine_transitions)
+        fine_states = []
+        for addition in carried_back[:0:-1]:
+            fine_states.append(state + gathered[kind] @ addition)
+            state = transitions @ state
+            gathered = fine_transitions @ gathered @ fine_transitions.mT + fine_noises
+        size = means.shape[1]
+        return np.concatenate((np.stack(fine_states, axis=1).reshape(-1, size), means[-1:, :, 0]))
+
+    def _deviations(self, covariances: FloatArray) -> FloatArray:
+        """Return deviations (2 P, N) of forces and speeds, of covariances (N, n, n) of the state."""
+        count = len(self.processes)
+        shown = np.zeros((2 * count, covariances.shape[-1]))
+        for number, (port, process) in enumerate(self.processes):
+            shown[number, self.places[number]] = process.size
+            shown[count + number, : len(self.units)] = self.trial.system.speeds[port] * self.units
+        variances = np.sum((shown @ covariances) * shown, axis=-1)
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
 
 
 ROUNDING = 1e-12
@@ -212,17 +298,22 @@ class Regression:
 
     def solve(self, chosen: Sequence[int], precision: FloatArray) -> Solution:
         """Return evidence and values of some of the columns (from 0), of given prior precisions (K,)."""
-        at = np.array([0, *(1 + k for k in chosen)])
-        part = self.products[np.ix_(at, at)]
+        rows = np.array([0, *(1 + k for k in chosen)])
+        products = self.products[np.ix_(rows, rows)]
         prior = np.maximum(precision, LEAST_PRECISION)
-        size = 1.0 / np.sqrt(np.diag(part)[1:] + prior)  # columns may be of any scale, and nearly one another
-        scaled = (part[1:, 1:] + np.diag(prior)) * np.outer(size, size) + ROUNDING * np.eye(len(size))
-        factor = cho_factor(scaled)
-        mean = size * cho_solve(factor, size * part[1:, 0])
-        left = np.r_[1.0, -mean]
-        value = -0.5 * float(left @ part @ left + mean @ (prior * mean)) - self.log_determinant
-        value -= float(np.sum(np.log(np.diag(factor[0]) / size)) - 0.5 * np.sum(np.log(prior)))
-        return Solution(value, mean, np.outer(size, size) * cho_solve(factor, np.eye(len(prior))))
+        # columns may be of any scale and nearly equal: the normal equations are scaled to a unit diagonal
+        scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior)
+        normal = (products[1:, 1:] + np.diag(prior)) * np.outer(scale, scale)
+        factor = cho_factor(normal + ROUNDING * np.eye(len(scale)))
+        mean = scale * cho_solve(factor, scale * products[1:, 0])
+        covariance = np.outer(scale, scale) * cho_solve(factor, np.eye(len(prior)))
+        # Laplace's evidence, exact for a linear model
+        combination = np.r_[1.0, -mean]
+        misfit = float(combination @ products @ combination + mean @ (prior * mean))
+        evidence = -0.5 * misfit - self.log_determinant
+        log_determinant = np.sum(np.log(np.diag(factor[0]) / scale))
+        evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior)))
+        return Solution(evidence, mean, covariance)
 
 
 def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -230,25 +321,29 @@ def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> 
     if not len(precision):
         return products, halves
     prior = np.maximum(precision, LEAST_PRECISION)
-    count = products.shape[-1] - len(prior)
-    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
-    along = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
-    halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
-    return products[..., :count, :count] - along.mT @ along, halves
+    kept = products.shape[-1] - len(prior)
+    # Schur complement of the last columns
+    root = np.linalg.cholesky(products[..., kept:, kept:] + np.diag(prior))
+    projected = np.asarray(np.linalg.solve(root, products[..., kept:, :kept]))
+    half_log_determinants = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
+    remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior).sum()
+    return products[..., :kept, :kept] - projected.mT @ projected, remaining_halves
 
 
 def regression(filtered: Sequence[Filtered], rows: Sequence[FloatArray]) -> Regression:
     """Return the products of residuals and columns (1 + K + L, N, C), of a trial each, whitened alike."""
+    alike: dict[tuple[bytes, ...], list[tuple[Filtered, FloatArray]]] = {}
+    for trial, columns in zip(filtered, rows, strict=True):
+        alike.setdefault(trial.key, []).append((trial, columns))
     total: FloatArray | float = 0.0
     log_determinant = 0.0
-    alike: dict[tuple[bytes, ...], list[tuple[Filtered, FloatArray]]] = {}
-    for one, given in zip(filtered, rows, strict=True):
-        alike.setdefault(one.key, []).append((one, given))
     for group in alike.values():
-        whole, half_of = group[0][0].products(np.concatenate([given for _, given in group]))
-        ends = np.cumsum([0, *(len(given) for _, given in group)]).tolist()
-        for (one, _), (begin, end) in zip(group, pairwise(ends), strict=True):
-            products, half = without(whole[begin:end, begin:end], half_of, one.trial.local_precision)
+        first_trial, _ = group[0]
+        together, half = first_trial.products(np.concatenate([columns for _, columns in group]))
+        ends = np.cumsum([0, *(len(columns) for _, columns in group)]).tolist()
+        for (trial, _), (begin, end) in zip(group, pairwise(ends), strict=True):
+            own = together[begin:end, begin:end]
+            products, half_with_local = without(own, half, trial.trial.local_precision)
             total = total + products
-            log_determinant += float(half)
+            log_determinant += float(half_with_local)
     return Regression(np.asarray(total), log_determinant)

@@ -18,9 +18,9 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import Response
-from discrepancy.models.sensing import observe_response
 from discrepancy.search_settings import SEARCH
+from discrepancy.system.response import Response
+from discrepancy.system.sensing import observe_response
 from fe.compilation import compiled, law_functions
 from fe.runtime.arrays import HEAD, PLACE
 from fe.runtime.errors import InvalidPatchError
@@ -31,8 +31,9 @@ from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of
 
 from .filtered import Process
+from .process_search import Processes
 from .trial import Part, SeenTrial, seen_trial
-from .view import Column, Motion, Processes, View, combined
+from .view import Column, Motion, View, combined
 
 LEVELS = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which the numbers of an effect that are no magnitudes are tried."""

@@ -6,8 +6,8 @@ motion, new columns: an iterated smoother whose fixed point is the most probable
 Laplace's.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import product
 
@@ -21,11 +21,12 @@ from discrepancy.fits.problem import Problem
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
-from .filtered import Process, Solution
+from .explained import NOTHING, Explained, seen
+from .filtered import Process
 from .hypotheses import Columns, log_prior, scaled, variants
-from .view import MOST_STEPS, Column, Motion, Processes, View, combined
+from .process_search import MOST_STEPS
+from .view import Column, Motion, View, combined
 
-NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 WIDE = 3.0
 """Prior deviation of that size: so many times what would explain all of the gap."""
 SIZES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
@@ -49,87 +50,8 @@ SETTLED = 0.05
 """Steps of the unknowns of an effect: how many, the longest, and that after which no other follows."""
 LEAST_PART = 0.2
 """Least part of a step that is taken where steps turn back."""
-ALONG = 0.5
-"""Share of what is left of an unknown law that may be hidden along a named one: without it intervals beside a
-weaker law hold 4 of 9 hidden values."""
 SLOPE = 0.05
 """Standard normal step of the derivatives of an effect."""
-
-
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """A hypothesis.
-
-    Attributes
-    ----------
-    candidate : Candidate
-        Its effects; none: missing forces alone.
-    effect : (E,) ndarray
-        Their unknowns, standard normal before.
-    processes : mapping of int to Process
-        Missing forces beside them, by the numbers of their ports.
-    log_evidence : float
-        [nat], with the prior of the processes.
-    view : View
-        Trials and columns.
-    solution : Solution
-        Shared unknowns first, those of the effects last.
-    local : sequence of (L,) ndarray
-        Unknowns of the trials.
-    motions : sequence of Motion
-        By trial.
-    """
-
-    candidate: Candidate
-    effect: FloatArray
-    processes: Processes
-    log_evidence: float
-    view: View
-    solution: Solution
-    local: Sequence[FloatArray]
-    motions: Sequence[Motion]
-
-    @property
-    def effect_covariance(self) -> FloatArray:
-        """Of the effects' unknowns (E, E), beside the missing force as it is."""
-        at = len(self.view.shared_precision)
-        return self.solution.covariance[at:, at:]
-
-    @cached_property
-    def shared(self) -> FloatArray:
-        """Shared unknowns (K,) at the values of the effects, which may not have settled."""
-        at = len(self.view.shared_precision)
-        mean, covariance = self.solution.mean, self.solution.covariance
-        if not len(self.effect):
-            return mean[:at]
-        step = np.linalg.solve(covariance[at:, at:], self.effect - mean[at:])
-        return np.asarray(mean[:at] + covariance[:at, at:] @ step)
-
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """Of all unknowns, shared ones first, wide enough for what is left to lie along the laws in part.
-
-        The process is a force in time that has nothing to do with the motion. What is left of another law
-        has: as much of it as is seen beside the columns may be hidden along them.
-        """
-        at, covariance = len(self.view.shared_precision), self.solution.covariance
-        if not len(self.effect):
-            return covariance
-        wider = np.zeros((len(self.effect),) * 2)
-        for port, process in self.processes.items():
-            rows = []
-            for number, trial in enumerate(self.view.trials):
-                nothing = np.zeros(len(trial.fine_time))
-                forces = [item[number].forces.get(port, nothing) for item in self.view.effects]
-                rows.append(np.array([np.asarray(force)[:: trial.parts] for force in forces]))
-            columns = np.concatenate(rows, axis=-1)  # the forces (E, T) at the samples of all trials
-            acting = np.flatnonzero(columns.any(axis=1))
-            if len(acting):
-                size = (ALONG * process.size) ** 2
-                gram = columns[acting] @ columns[acting].T / columns.shape[1]
-                wider[np.ix_(acting, acting)] += size * np.linalg.inv(gram + size * np.eye(len(acting)))
-        follow = np.linalg.lstsq(covariance[at:, at:], covariance[at:], rcond=None)[0].T
-        return np.asarray(covariance + follow @ wider @ follow.T)
 
 
 class ForceSearch:
@@ -239,7 +161,9 @@ class ForceSearch:
 
     # ---------------------------------------------------------------- what
 
-    def name(self, effects: Sequence[Effect]) -> list[Explained]:
+    def name(
+        self, effects: Sequence[Effect], tell: Callable[[str], None] = lambda words: None
+    ) -> list[Explained]:
         """Return hypotheses, the most probable first: sets of effects that were found one after another.
 
         Each effect alone, with its own shape and with a free one; the best of these with one more effect,
@@ -251,10 +175,15 @@ class ForceSearch:
             best = self._ranked(found, len(effects))[0]
             longer: dict[Key, Explained] = {}
             for base in beam:
-                for _, term, starts in self.screened(base, effects)[:width]:
+                beside = f" beside {base.candidate.words}" if base.candidate.terms else ""
+                tell(f"comparing all effects{beside} with the missing force")
+                promising = self.screened(base, effects)[:width]
+                for number, (_, term, starts) in enumerate(promising):
                     candidate = base.candidate.plus(term)
                     if candidate.key in longer:
                         continue
+                    remaining = len(promising) - number - 1
+                    tell(f"following {candidate.words} along the missing force, {remaining} more")
                     begun = (np.concatenate((base.effect, start)) for start in starts)
                     ends = [one for at in begun if (one := self.followed(base, candidate, at)) is not None]
                     if ends:
@@ -281,29 +210,38 @@ class ForceSearch:
         Best first, each at each of its places, from all values that do as well within `TIED`: in proportion
         to its size a dead zone does the same whatever its stiffness, and ends elsewhere from each.
         """
-        tried: list[tuple[Term, FloatArray]] = []
+        terms: list[Term] = []
+        values_of_terms: list[FloatArray] = []
         columns: list[Column] = []
-        there = {(term.effect.identifier, term.place) for term in base.candidate.terms}
+        for term in self._terms_beside(base, effects):
+            for values in variants(term):
+                column = self.columns.of(base.view, base.motions, Candidate((term,)), values)
+                if column is not None and any(np.any(part.readings) for part in column):
+                    terms.append(term)
+                    values_of_terms.append(values)
+                    columns.append(column)
+        starts_of_terms: dict[Term, list[tuple[float, FloatArray]]] = {}
+        for number, (log_evidence, factor) in self._weighed(base, columns, terms).items():
+            term = terms[number]
+            start = term.sized(values_of_terms[number], factor, -LARGEST_EFFECT, LARGEST_EFFECT)
+            starts_of_terms.setdefault(term, []).append((log_evidence, start))
+        rows = []
+        for term, starts in starts_of_terms.items():
+            best = max(log_evidence for log_evidence, _ in starts)
+            as_good = [start for log_evidence, start in starts if log_evidence > best - TIED]
+            rows.append((best, term, as_good))
+        return sorted(rows, key=lambda row: -row[0])
+
+    def _terms_beside(self, base: Explained, effects: Iterable[Effect]) -> Iterator[Term]:
+        """Yield effects at places where a hypothesis does not have them, also with a free shape."""
+        in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
         for effect in effects:
             for place in effect.places(self.problem.setting):
-                if (effect.identifier, place) in there:
+                if (effect.identifier, place) in in_base:
                     continue
-                for term in dict.fromkeys((Term(effect, place), Term(effect, place, bool(effect.shape)))):
-                    for values in variants(term):
-                        column = self.columns.of(base.view, base.motions, Candidate((term,)), values)
-                        if column is not None and any(np.any(part.readings) for part in column):
-                            tried.append((term, values))
-                            columns.append(column)
-        found: dict[Term, list[tuple[float, FloatArray]]] = {}
-        for number, (value, size) in self._weighed(base, columns, [term for term, _ in tried]).items():
-            term, values = tried[number]
-            start = term.sized(values, size, -LARGEST_EFFECT, LARGEST_EFFECT)
-            found.setdefault(term, []).append((value, start))
-        rows = []
-        for term, starts in found.items():
-            top = max(value for value, _ in starts)
-            rows.append((top, term, [start for value, start in starts if value > top - TIED]))
-        return sorted(rows, key=lambda row: -row[0])
+                yield Term(effect, place)
+                if effect.shape:
+                    yield Term(effect, place, True)
 
     def _weighed(
         self, base: Explained, columns: Sequence[Column], terms: Sequence[Term]
@@ -311,29 +249,38 @@ class ForceSearch:
         """Return for columns (by number) evidence and factor, beside processes around the base's."""
         if not columns:
             return {}
-        gap = [self._gap(base, None), self._gap(base, base.motions)]
-        precision = []
+        with_columns = replace(
+            base.view,
+            motions=base.motions,
+            effects=(*base.view.effects, *columns),
+            precision=(*base.view.precision, *self._prior_precisions(base, columns)),
+        )
+        known_count = len(base.view.precisions)
+        best: dict[int, tuple[float, float]] = {}
+        for size, time in product(SIZES, TIMES):
+            products = with_columns.products(scaled(base.processes, size, time))
+            for number, term in enumerate(terms):
+                chosen = [*range(known_count), known_count + number]
+                solution = products.solve(chosen, with_columns.precisions[chosen])
+                factor = float(solution.mean[-1])
+                is_better = number not in best or best[number][0] < solution.evidence
+                may_be = np.isfinite(solution.evidence) and (factor > 0.0 or term.may_turn)
+                if is_better and may_be:
+                    best[number] = (solution.evidence, factor)
+        return best
+
+    def _prior_precisions(self, base: Explained, columns: Sequence[Column]) -> list[float]:
+        """Return prior precisions of factors of columns: `WIDE` times what would explain all of the gap."""
+        gap_of_readings = self._gap(base, None)
+        gap_of_forces = self._gap(base, base.motions)
+        precisions = []
         for column in columns:
             forces = [np.ravel(force) for part in column for force in part.forces.values()]
-            sizes = forces or [part.readings.ravel() for part in column]
-            own = float(np.sqrt(np.mean(np.concatenate(sizes) ** 2)))
-            precision.append(min(max(own, 1e-300) / (WIDE * gap[bool(forces)]), LARGEST_RATIO) ** 2)
-        whole = replace(
-            base.view, motions=base.motions, effects=(*base.view.effects, *columns),
-            precision=(*base.view.precision, *precision),
-        )  # fmt: skip
-        count = len(base.view.precisions)
-        found: dict[int, tuple[float, float]] = {}
-        for size, time in product(SIZES, TIMES):
-            products = whole.products(scaled(base.processes, size, time))
-            for number, term in enumerate(terms):
-                chosen = [*range(count), count + number]
-                solution = products.solve(chosen, whole.precisions[chosen])
-                factor = float(solution.mean[-1])
-                better = number not in found or found[number][0] < solution.evidence
-                if better and np.isfinite(solution.evidence) and (factor > 0.0 or term.may_turn):
-                    found[number] = (solution.evidence, factor)
-        return found
+            acting = forces or [part.readings.ravel() for part in column]
+            gap = gap_of_forces if forces else gap_of_readings
+            size = max(float(np.sqrt(np.mean(np.concatenate(acting) ** 2))), 1e-300)
+            precisions.append(min(size / (WIDE * gap), LARGEST_RATIO) ** 2)
+        return precisions
 
     @staticmethod
     def _gap(base: Explained, motions: Sequence[Motion] | None) -> float:
@@ -345,69 +292,74 @@ class ForceSearch:
         return max(float(np.sqrt(np.mean(np.concatenate(values) ** 2))), 1e-300)
 
     def followed(self, base: Explained, candidate: Candidate, effect: FloatArray) -> Explained | None:
-        """Return a hypothesis at its most probable values, begun beside another; None: it cannot be."""
-        processes, motions, share, settled = base.processes, base.motions, 1.0, False
+        """Return a hypothesis at its most probable values, begun beside another; None: it cannot be.
+
+        Steps of an iterated smoother: each takes the laws along the motion that the one before has found.
+        """
+        processes, motions = base.processes, base.motions
+        settled = False
+        damping = 1.0
+        last_step = np.zeros(len(effect))
         best: Explained | None = None
-        before = np.zeros(len(effect))
         for turn in range(ROUNDS):
             view = self.linear(base.view, motions, candidate, effect)
             if view is None:
                 break
-            most = MOST_STEPS if settled or turn == ROUNDS - 1 else 0
-            about = self.about(processes)
-            found = seen(view, about, processes, candidate, effect, near=turn > 0, most=most)
-            processes = found.processes
+            most_steps = MOST_STEPS if settled or turn == ROUNDS - 1 else 0
+            median = self.about(processes)
+            found = seen(view, median, processes, candidate, effect, near=turn > 0, most_steps=most_steps)
             step = found.solution.mean[len(view.shared_precision) :] - effect
-            far = np.where(np.abs(step) > SETTLED, step, 0.0)
-            if far.any():  # a value that it cannot reach is not its own
-                loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
-                found = replace(found, log_evidence=found.log_evidence - loss)
+            found = _less_what_is_out_of_reach(found, step)
             if settled:
                 return replace(found, effect=effect + step)
             # along the motion of its base, which follows the readings, a hypothesis looks better than it is
             if best is None or turn == 1 or found.log_evidence > best.log_evidence:
                 best = found
-            turns_back = step @ before < -0.5 * (before @ before)
-            share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
-            move = share * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+            turns_back = step @ last_step < -0.5 * (last_step @ last_step)
+            damping = max(0.5 * damping, LEAST_PART) if turns_back else min(1.0, 1.5 * damping)
+            move = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
             effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
-            size, last = (float(np.abs(one).max(initial=0.0)) for one in (step, before))
-            # small steps that hardly become smaller have far to go
-            settled = turn > 0 and size < SETTLED * (1.0 if size < 0.5 * last else 0.1)
-            motions, before = found.motions, step
+            settled = turn > 0 and _is_last_step(step, last_step)
+            processes, motions = found.processes, found.motions
+            last_step = step
         return best
 
     def linear(
         self, view: View, motions: Sequence[Motion], candidate: Candidate, effect: FloatArray
     ) -> View | None:
         """Return the view of a hypothesis, linear about values of its unknowns and along motions."""
-        columns = self.columns
-        at = columns.of(view, motions, candidate, effect) if candidate.terms else ()
-        if at is None:
+        if not candidate.terms:
+            return replace(self.columns.along(view, motions, None), effects=(), precision=())
+        at_values = self.columns.of(view, motions, candidate, effect)
+        if at_values is None:
             return None
         slopes = []
         for k in range(len(effect)):
             step = np.zeros(len(effect))
             step[k] = SLOPE
-            ends = [columns.of(view, motions, candidate, effect + sign * step) for sign in (1.0, -1.0)]
-            if ends[0] is None or ends[1] is None:
+            ahead = self.columns.of(view, motions, candidate, effect + step)
+            back = self.columns.of(view, motions, candidate, effect - step)
+            if ahead is None or back is None:
                 return None
-            slopes.append(combined((ends[0], ends[1]), (0.5 / SLOPE, -0.5 / SLOPE)))
-        known = combined((at, *slopes), (1.0, *-effect)) if at else None
-        view = columns.along(view, motions, known)
+            slopes.append(combined((ahead, back), (0.5 / SLOPE, -0.5 / SLOPE)))
+        # linear in the unknowns: what acts where they are zero, and a column for a unit of each
+        at_zero = combined((at_values, *slopes), (1.0, *-effect))
+        view = self.columns.along(view, motions, at_zero)
         return replace(view, effects=tuple(slopes), precision=(1.0,) * len(effect))
 
 
-def seen(
-    view: View,
-    about: Processes,
-    begin: Processes,
-    candidate: Candidate = NOTHING,
-    effect: FloatArray = NO_VALUES,
-    *,
-    near: bool = False,
-    most: int = MOST_STEPS,
-) -> Explained:
-    """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begin, near=near, most=most)
-    return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))
+def _less_what_is_out_of_reach(found: Explained, step: FloatArray) -> Explained:
+    """Return a hypothesis without the evidence of values that it has not reached: they are not its own."""
+    far = np.where(np.abs(step) > SETTLED, step, 0.0)
+    if not far.any():
+        return found
+    loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
+    return replace(found, log_evidence=found.log_evidence - loss)
+
+
+def _is_last_step(step: FloatArray, last_step: FloatArray) -> bool:
+    """Return whether no step need follow; small steps that hardly become smaller have far to go."""
+    size = float(np.abs(step).max(initial=0.0))
+    last_size = float(np.abs(last_step).max(initial=0.0))
+    becomes_smaller = size < 0.5 * last_size
+    return size < SETTLED * (1.0 if becomes_smaller else 0.1)

@@ -17,8 +17,9 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import ForceAtPort, ForceLeft, ForceMoment
 
+from .explained import Explained
 from .hypotheses import Columns, scaled, sees_forces
-from .naming import Explained, ForceSearch
+from .naming import ForceSearch
 from .trial import SeenTrial
 from .view import Motion, View
 

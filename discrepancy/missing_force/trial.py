@@ -19,9 +19,9 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
-from discrepancy.models.acting import divided
-from discrepancy.models.interface import PortedSystem
-from discrepancy.models.sensing import in_own_clock
+from discrepancy.system.excitation import divided
+from discrepancy.system.response import PortedSystem
+from discrepancy.system.sensing import in_own_clock
 from fe.runtime.patch import ModelPatch
 
 from .kalman import driven
@@ -58,12 +58,16 @@ class Part:
 
     def plus(self, other: "Part", factor: float) -> "Part":
         """Return the sum with another part that is taken `factor` times."""
-        added = [item * part.added for item, part in ((1.0, self), (factor, other)) if part.added is not None]
         forces = dict(self.forces)
         for port, force in other.forces.items():
             forces[port] = forces.get(port, 0.0) + factor * force
-        readings = self.readings + factor * other.readings
-        return Part(readings, sum(added[1:], added[0]) if added else None, forces)
+        if other.added is None:
+            added = self.added
+        elif self.added is None:
+            added = factor * other.added
+        else:
+            added = self.added + factor * other.added
+        return Part(self.readings + factor * other.readings, added, forces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,13 +141,23 @@ class SeenTrial:
 
     @cached_property
     def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Transition (J, n, n) of a fine step, and what a push at its begin and end does (J, n, n)."""
-        n, lengths = len(self.system.generator), self.steps[0][:, None, None] / self.parts
+        """Transition (J, n, n) of a fine step, and what a push at its begin and end does (J, n, n).
+
+        By one exponential of the system with its push and the push's rate as states (Van Loan 1978, IEEE
+        Transactions on Automatic Control 23, 395-404).
+        """
+        n = len(self.system.generator)
+        lengths = self.steps[0][:, None, None] / self.parts
         blocks = np.zeros((len(lengths), 3 * n, 3 * n))
-        blocks[:, :n, :n], blocks[:, :n, n : 2 * n] = self.system.generator * lengths, np.eye(n) * lengths
-        blocks[:, n : 2 * n, 2 * n :] = np.eye(n)
-        move, held, end = (np.ascontiguousarray(item) for item in np.split(expm(blocks)[:, :n], 3, axis=2))
-        return move, held - end, end
+        state, push, push_rate = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
+        blocks[:, state, state] = self.system.generator * lengths
+        blocks[:, state, push] = np.eye(n) * lengths
+        blocks[:, push, push_rate] = np.eye(n)
+        exponential = expm(blocks)
+        transition = np.ascontiguousarray(exponential[:, state, state])
+        by_constant_push = np.ascontiguousarray(exponential[:, state, push])
+        by_rising_push = np.ascontiguousarray(exponential[:, state, push_rate])
+        return transition, by_constant_push - by_rising_push, by_rising_push
 
     @cached_property
     def fine_time(self) -> FloatArray:
@@ -234,55 +248,106 @@ def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, flo
 
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     """Return a dynamic trial of a problem, linear about a point; its model must tell how ports move."""
-    data, model = problem.trials[number], problem.model
-    trial, shared, unknowns = data.trial, problem.shared, data.unknowns
-    parts = problem.linearise(number, point, Candidate())
-    gains = 1.0 + shared.gains(point.shared, trial.channels)
-    gain_unknowns = []
+    data = problem.trials[number]
+    trial = data.trial
+    gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
+    system, slopes = _ported(problem, trial, point.shared)
+    system = _with_gains(system, gains)
+    parts = _fine_steps(system, trial.time)
+    positions_and_speeds, by_unknowns = _port_motion(problem, number, point, parts)
+    residual, by_shared, by_local = _linear_readings(problem, number, point)
+    deviation = trial.noise_factor * np.array([noise.static_deviation for noise in data.noise])
+    return SeenTrial(
+        name=trial.name,
+        time=trial.time,
+        residual=residual / deviation * trial.used,
+        used=trial.used,
+        deviation=deviation,
+        coloured=_coloured_noises(data.noise, trial.whitened_at),
+        shared=by_shared / deviation * trial.used,
+        local=by_local / deviation * trial.used,
+        local_precision=data.unknowns.precision,
+        system=system,
+        slopes=[None if slope is None else _with_gains(slope, gains) for slope in slopes],
+        parts=parts,
+        positions=positions_and_speeds[0],
+        speeds=positions_and_speeds[1],
+        settled=trial.begins.value == "settled" and trial.kind.value != "ringdown",
+        about=np.concatenate((point.shared, point.local[number])),
+        gains=_gain_unknowns(problem, trial, gains),
+        by_unknowns=by_unknowns,
+    )
+
+
+def _linear_readings(
+    problem: Problem, number: int, point: Point
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return readings (N, C) less the linear model with all unknowns zero, and what units of these do.
+
+    The latter are (K, N, C) of the shared unknowns and (L, N, C) of the trial's own.
+    """
+    data = problem.trials[number]
+    linear = problem.linearise(number, point, Candidate())
+    columns, shared_of_column = problem.columns(number, point, linear, Candidate())
+    by_local = columns[: data.unknowns.size]
+    by_shared = np.zeros((problem.shared.size, *linear.response.shape))
+    by_shared[shared_of_column] = columns[data.unknowns.size :]
+    residual = data.trial.values - problem.prediction(number, point, linear.response)
+    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
+    return residual, by_shared, by_local
+
+
+def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[tuple[int, int, float]]:
+    """Return the shared unknowns that are gains of the trial's channels, as `SeenTrial.gains` has them."""
+    shared = problem.shared
+    unknowns = []
     for row, name in enumerate(shared.gain_channels):
         if name in trial.channels:
-            column, scale = trial.channels.index(name), float(shared.scale[shared.count + row])
-            gain_unknowns.append((shared.count + row, column, scale / float(gains[column])))
-    columns, index = problem.columns(number, point, parts, Candidate())
-    by_local, by_shared = columns[: unknowns.size], np.zeros((shared.size, *parts.response.shape))
-    by_shared[index] = columns[unknowns.size :]
-    residual = trial.values - problem.prediction(number, point, parts.response)
-    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
-    base, slopes = _ported(problem, trial, point.shared)
-    base = _shown(base, gains)
-    slopes = [None if item is None else _shown(item, gains) for item in slopes]
-    used = trial.used
-    deviation = trial.noise_factor * np.array([item.static_deviation for item in data.noise])
-    coloured = [
-        (number, *part)
-        for number, item in enumerate(data.noise)
-        if (part := decaying_part(item, trial.whitened_at)) is not None
-    ]
-    interval = float(np.median(np.diff(trial.time)))
-    fastest = float(np.max(np.abs(np.linalg.eigvals(base.generator)), initial=0.0))
-    count = int(np.clip(np.ceil(fastest * interval / FINE_PHASE), COARSEST, FINEST))
+            number = shared.count + row
+            channel = trial.channels.index(name)
+            unknowns.append((number, channel, float(shared.scale[number]) / float(gains[channel])))
+    return unknowns
 
-    from_its_begin, _ = in_own_clock(trial, ModelPatch())
 
-    def moving(of_all: FloatArray, local: FloatArray) -> FloatArray:
-        conditions = unknowns.conditions(trial, shared.parameters(of_all), local)
-        return np.stack(model.port_motion(from_its_begin, conditions, count))
+def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> list[tuple[int, float, float]]:
+    """Return the channels whose noise has a decaying part, with its share of the variance and its rate."""
+    coloured = []
+    for channel, noise in enumerate(noises):
+        part = decaying_part(noise, interval)
+        if part is not None:
+            coloured.append((channel, *part))
+    return coloured
+
+
+def _fine_steps(system: PortedSystem, time: FloatArray) -> int:
+    """Return in how many steps an interval between samples is divided, by the fastest mode."""
+    interval = float(np.median(np.diff(time)))
+    fastest = float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0))
+    return int(np.clip(np.ceil(fastest * interval / FINE_PHASE), COARSEST, FINEST))
+
+
+def _port_motion(
+    problem: Problem, number: int, point: Point, parts: int
+) -> tuple[FloatArray, dict[int, FloatArray]]:
+    """Return positions and speeds (2, F, P) of the ports by the model, and their derivatives by unknowns."""
+    data, shared = problem.trials[number], problem.shared
+    trial_in_own_clock, _ = in_own_clock(data.trial, ModelPatch())
+
+    def motion(of_all: FloatArray, own: FloatArray) -> FloatArray:
+        conditions = data.unknowns.conditions(data.trial, shared.parameters(of_all), own)
+        return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, parts))
 
     local = point.local[number]
-    here = moving(point.shared, local)
-    ways = {k: (moved(point.shared, k), local) for k in range(shared.count)}
-    ways |= {shared.size + k: (point.shared, moved(local, k)) for k in range(unknowns.zeros, unknowns.size)}
-    by_unknowns = {k: (moving(*there) - here) / PARAMETER_STEP for k, there in ways.items()}
-    residual, by_shared, by_local = (item / deviation * used for item in (residual, by_shared, by_local))
-    return SeenTrial(
-        trial.name, trial.time, residual, used,
-        deviation, coloured, by_shared, by_local, unknowns.precision, base, slopes, count,
-        here[0], here[1], trial.begins.value == "settled" and trial.kind.value != "ringdown",
-        np.concatenate((point.shared, local)), gain_unknowns, by_unknowns,
-    )  # fmt: skip
+    here = motion(point.shared, local)
+    by_unknowns = {}
+    for k in range(shared.count):
+        by_unknowns[k] = (motion(moved(point.shared, k), local) - here) / PARAMETER_STEP
+    for k in range(data.unknowns.zeros, data.unknowns.size):
+        by_unknowns[shared.size + k] = (motion(point.shared, moved(local, k)) - here) / PARAMETER_STEP
+    return here, by_unknowns
 
 
-def _shown(system: PortedSystem, gains: FloatArray) -> PortedSystem:
+def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
     """Return a system whose outputs are shown with gains (C,)."""
     return replace(system, outputs=system.outputs * gains[:, None], through=system.through * gains)
 

@@ -1,33 +1,27 @@
 """The missing forces of all trials: their processes, their courses, and the motion beside them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 
-from .filtered import LEAST_PRECISION, Filtered, Process, Regression, Solution, regression
+from .filtered import (
+    LEAST_PRECISION,
+    Filtered,
+    Process,
+    Regression,
+    Smoothed,
+    Solution,
+    regression,
+)
+from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
 from .trial import Part, SeenTrial
 
-Processes = Mapping[int, Process]
-"""Missing forces by the numbers of their ports."""
-
-SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
-"""Prior deviations of the logarithms of a process's size and correlation time."""
-DOUBTS = np.array((SIZE_DOUBT, TIME_DOUBT))
-STARTS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
-"""Logarithms of sizes and times, over some, at the best of which Newton's method begins: what is left beside
-a law is a part of what was missing."""
-NEAR, LONGEST, AT_TOP, MOST_STEPS = 0.02, 1.5, 1e-4, 20
-"""Of Newton's method: difference of logarithms by which slopes are found, the longest step that is taken, the
-shortest, and how many are taken."""
 LATER = 200
 """Samples after which more of them tell nothing of a moment."""
-FARTHEST = 5.0
-"""Prior deviations within which processes are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,33 +109,40 @@ class View:
     @cached_property
     def parts(self) -> list[dict[int, tuple[Part, float]]]:
         """What a unit of unknowns, by number, does along the motion, and which values are in it; by trial."""
-        found: list[dict[int, tuple[Part, float]]] = [{} for _ in self.trials]
-        for trial, motion, of_trial in zip(self.trials, self.motions, found, strict=False):
-            for k, slope in enumerate(trial.slopes):
+        by_trial: list[dict[int, tuple[Part, float]]] = [{} for _ in self.trials]
+        for trial, motion, parts in zip(self.trials, self.motions, by_trial, strict=False):
+            # calibrated parameters change the system along the motion
+            for unknown, slope in enumerate(trial.slopes):
                 if slope is not None:
-                    of_trial[k] = trial.turned(slope, motion.added, motion.forces), float(trial.about[k])
+                    part = trial.turned(slope, motion.added, motion.forces)
+                    parts[unknown] = (part, float(trial.about[unknown]))
+            # gains change the readings of their channel
             shown = trial.readings(motion.added, motion.forces)
-            for k, channel, scale in trial.gains:
-                of_trial[k] = Part(shown * scale * np.eye(shown.shape[1])[channel]), float(trial.about[k])
-        for k, effect in enumerate(self.effects, start=len(self.shared_precision)):
-            for part, of_trial in zip(effect, found, strict=True):
-                of_trial[k] = part, 0.0
-        return found
+            for unknown, channel, scale in trial.gains:
+                part = Part(shown * scale * np.eye(shown.shape[1])[channel])
+                parts[unknown] = (part, float(trial.about[unknown]))
+        for unknown, effect in enumerate(self.effects, start=len(self.shared_precision)):
+            for part, parts in zip(effect, by_trial, strict=True):
+                parts[unknown] = (part, 0.0)
+        return by_trial
 
     @cached_property
     def rows(self) -> list[FloatArray]:
         """Residuals beside what is known, and what all unknowns do to them (1 + K + L, N, C), by trial."""
-        found, count = [], 1 + len(self.precisions)
+        by_trial = []
+        first_local = 1 + len(self.precisions)
         for number, trial in enumerate(self.trials):
-            rows = np.moveaxis(np.zeros((*trial.residual.shape, count + len(trial.local))), -1, 0)
-            known = [item[number].readings for item in (self.known, self.own) if item is not None]
-            rows[0] = trial.residual - sum(known)
-            rows[1 : 1 + len(trial.shared)], rows[count:] = trial.shared, trial.local
-            for k, (part, there) in self.parts[number].items():
-                rows[1 + k] += part.readings
-                rows[0] += there * part.readings
-            found.append(rows)
-        return found
+            row_count = first_local + len(trial.local)
+            rows = np.moveaxis(np.zeros((*trial.residual.shape, row_count)), -1, 0)
+            acting = [column[number].readings for column in (self.known, self.own) if column is not None]
+            rows[0] = trial.residual - sum(acting)
+            rows[1 : 1 + len(trial.shared)] = trial.shared
+            rows[first_local:] = trial.local
+            for unknown, (part, value) in self.parts[number].items():
+                rows[1 + unknown] += part.readings
+                rows[0] += value * part.readings
+            by_trial.append(rows)
+        return by_trial
 
     def filtered(self, processes: Processes) -> list[Filtered]:
         """Return the filters of missing forces."""
@@ -157,62 +158,27 @@ class View:
 
     @np.errstate(invalid="ignore")
     def most_probable(
-        self, about: Processes, begin: Processes, *, near: bool = False, most: int = MOST_STEPS
+        self, median: Processes, begin: Processes, *, near: bool = False, most_steps: int = MOST_STEPS
     ) -> tuple[dict[int, Process], float]:
         """Return the processes of the largest evidence times their prior, and its logarithm [nat].
 
-        By Newton's method within `FARTHEST` and `times`. Where a search ends before the top a rounding
-        decides; the top does not depend on it.
-
         Parameters
         ----------
-        about : mapping of int to Process
+        median : mapping of int to Process
             Medians of the prior.
         begin : mapping of int to Process
-            From which they are looked for: port after port from the best of `STARTS`.
+            Processes to begin with; the search begins at the best of a grid around them.
         near : bool
-            From `begin` itself instead.
-        most : int
-            Steps of Newton's method.
+            Begin at `begin` itself instead.
+        most_steps : int
+            Steps of Newton's method, at most.
         """
 
-        def at(logs: FloatArray) -> dict[int, Process]:
-            items = zip(begin.items(), np.exp(logs).tolist(), strict=True)
-            return {port: replace(one, size=size, time=time) for (port, one), (size, time) in items}
+        def log_evidence(processes: Processes) -> float:
+            return self.evidence(median, processes)
 
-        def value(logs: FloatArray) -> float:
-            return self.evidence(about, at(logs))
-
-        median, logs = (np.log([(of[port].size, of[port].time) for port in begin]) for of in (about, begin))
-        low, high = median - FARTHEST * DOUBTS, median + FARTHEST * DOUBTS
-        low[:, 1], high[:, 1] = np.clip((low[:, 1], high[:, 1]), *np.log(self.times))
-        logs = np.clip(logs, low, high)
-        for port in () if near else np.eye(len(logs)):
-            logs = max((np.clip(logs + np.outer(port, start), low, high) for start in STARTS), key=value)
-        top, far, units = value(logs), np.inf, NEAR * np.eye(logs.size).reshape(-1, *logs.shape)
-        for _ in range(most):
-            ahead, back = (np.array([value(logs + step) for step in steps]) for steps in (units, -units))
-            if far > NEAR:
-                bend = np.diag(ahead + back - 2.0 * top)
-                for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-                    both = value(logs + units[i] + units[k])
-                    bend[i, k] = bend[k, i] = both - ahead[i] - ahead[k] + top
-            if not np.isfinite((*bend.flat, *ahead, *back)).all():
-                break
-            up = 0.5 * NEAR * (ahead - back)
-            free = np.flatnonzero(np.where(up > 0.0, np.ravel(logs < high), np.ravel(logs > low)))
-            values, axes = np.linalg.eigh(bend[np.ix_(free, free)])  # uphill where it is hollow, too
-            step = np.zeros(logs.size)
-            step[free] = axes @ (axes.T @ up[free] / np.maximum(np.abs(values), 1e-300))
-            step = step.reshape(logs.shape) / max(1.0, np.abs(step).max() / LONGEST)
-            there, after = logs, -np.inf
-            while after < top and np.abs(step).max() > AT_TOP:
-                there = np.clip(logs + step, low, high)
-                after, step = value(there), 0.5 * step
-            if after < top:
-                break
-            logs, top, far = there, after, np.abs(there - logs).max()
-        return at(logs), top
+        search = ProcessSearch.around(log_evidence, median, begin, self.times)
+        return search.most_probable(from_grid=not near, most_steps=most_steps)
 
     @cached_property
     def times(self) -> tuple[float, float]:
@@ -220,41 +186,61 @@ class View:
         stamps = [trial.time for trial in self.trials]
         return min(float(np.median(np.diff(t))) for t in stamps), max(float(t[-1] - t[0]) for t in stamps)
 
-    def evidence(self, about: Processes, processes: Processes) -> float:
-        """Return the evidence of processes times their prior, as a logarithm [nat]."""
-        away = [
-            np.log((one.size / about[port].size, one.time / about[port].time)) / DOUBTS
-            for port, one in processes.items()
-        ]
-        value = self.solve(processes).evidence
-        return float(value - 0.5 * np.sum(np.square(away)))
+    def evidence(self, median: Processes, processes: Processes) -> float:
+        """Return the logarithm of the evidence of processes times their prior [nat]."""
+        return self.solve(processes).evidence + prior_log_density(median, processes)
 
     def smoothed(
         self, processes: Processes, given: Solution | None = None
     ) -> tuple[Solution, list[FloatArray], list[Motion]]:
         """Return the unknowns, those of the trials alone, and motion and missing forces of each trial."""
         solution = given or self.solve(processes)
-        motions, local = [], []
-        count = len(self.shared_precision)
-        for number, one in enumerate(self.filtered(processes)):
-            trial = one.trial
+        local_values, motions = [], []
+        for number, filtered in enumerate(self.filtered(processes)):
             rows = self.rows[number]
-            left = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
-            products, _ = one.products(np.concatenate((left[None], trial.local)))
-            prior = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
-            values = np.linalg.solve(products[1:, 1:] + prior, products[1:, 0])
-            left = left - np.tensordot(values, trial.local, 1)
-            free, forces, deviations = one.smoothed(left)
-            remaining = dict(zip(processes, forces, strict=True))
-            what = Part(left, free, remaining)
-            for k, (part, there) in self.parts[number].items():
-                what = what.plus(part, float(solution.mean[k] - there))
-            what = what if self.known is None else what.plus(self.known[number], 1.0)
-            moved = what if self.own is None else what.plus(self.own[number], 1.0)
-            assert moved.added is not None
-            moving = trial.port_motion(np.concatenate((solution.mean[:count], values)), moved.added)
-            known = zip(processes, *np.split(deviations, 2), strict=True)
-            doubts = {port: (force, float(speed[-LATER:][0])) for port, force, speed in known}
-            motions.append(Motion(moved.added, what.forces, remaining, moved.added - free, *moving, doubts))
-            local.append(values)
-        return solution, local, motions
+            unexplained = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
+            local = _local_unknowns(filtered, unexplained)
+            unexplained = unexplained - np.tensordot(local, filtered.trial.local, 1)
+            motions.append(self._motion(number, processes, filtered.smoothed(unexplained), solution, local))
+            local_values.append(local)
+        return solution, local_values, motions
+
+    def _motion(
+        self, number: int, processes: Processes, smoothed: Smoothed, solution: Solution, local: FloatArray
+    ) -> Motion:
+        """Return the motion of a trial, with what unknowns, hypothesis and model add to it."""
+        trial = self.trials[number]
+        missing = dict(zip(processes, smoothed.forces, strict=True))
+        unused_readings = np.zeros_like(trial.residual)
+        acting = Part(unused_readings, smoothed.state, missing)
+        for unknown, (part, value) in self.parts[number].items():
+            acting = acting.plus(part, float(solution.mean[unknown] - value))
+        if self.known is not None:
+            acting = acting.plus(self.known[number], 1.0)
+        with_own_laws = acting if self.own is None else acting.plus(self.own[number], 1.0)
+        added = with_own_laws.added
+        assert added is not None
+        unknowns = np.concatenate((solution.mean[: len(self.shared_precision)], local))
+        positions, speeds = trial.port_motion(unknowns, added)
+        force_deviations, speed_deviations = np.split(smoothed.deviations, 2)
+        deviations = {
+            port: (force, float(speed[-LATER:][0]))
+            for port, force, speed in zip(processes, force_deviations, speed_deviations, strict=True)
+        }
+        return Motion(
+            added=added,
+            forces=acting.forces,
+            left=missing,
+            explained=added - smoothed.state,
+            positions=positions,
+            speeds=speeds,
+            deviations=deviations,
+        )
+
+
+def _local_unknowns(filtered: Filtered, unexplained: FloatArray) -> FloatArray:
+    """Return the unknowns (L,) of a trial alone that explain most of its residuals (N, C)."""
+    trial = filtered.trial
+    products, _ = filtered.products(np.concatenate((unexplained[None], trial.local)))
+    prior = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
+    return np.linalg.solve(products[1:, 1:] + prior, products[1:, 0])

@@ -16,13 +16,15 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.models.interface import PortedSystem
+from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
-from .events import GROUND, MOST_EVENTS, Events, changes, events, throughout
+from .events import GROUND, MOST_EVENTS, Events, events, throughout
+from .explained import Explained, seen
 from .filtered import Process
-from .naming import Explained, ForceSearch, seen
+from .naming import ForceSearch
 from .shares import of_nothing
+from .switched_record import changes
 from .trial import SeenTrial
 from .view import View
 

@@ -18,8 +18,9 @@ from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.closed_share import closed_text, share_text
 from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
-from discrepancy.models.interface import EITHER, MOVES, TURNS, Model
 from discrepancy.proof_record import Proof, Scores
+from discrepancy.system.interface import Model
+from discrepancy.system.response import EITHER, MOVES, TURNS
 from discrepancy.verdict import (
     Estimate,
     ForceAtPort,

@@ -9,7 +9,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import LARGEST_EFFECT, objective
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.naming import Explained
+from discrepancy.missing_force.explained import Explained
 from discrepancy.search_settings import SEARCH
 
 

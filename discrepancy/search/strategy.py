@@ -9,17 +9,16 @@ import numpy as np
 from scipy.special import logsumexp
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.estimation.refinement import refined
-from discrepancy.fits.beginnings import refitted_from_beginnings
 from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, attempt, fit, free_shape
+from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
+from discrepancy.missing_force.explained import Explained
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
-from discrepancy.missing_force.naming import Explained, ForceSearch
+from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
 from .other_optima import canonical_relatives, restarts, sets_at_other_places
@@ -253,7 +252,7 @@ class Search:
     def by_force(self, force: ForceSearch) -> None:
         """Compare the sets of effects that follow the missing force best, in place of what was fitted."""
         self.exact, self.rough = {(): self.none}, {}
-        self.forces = refined(force, force.name(self.effects), len(self.effects), self.tell)
+        self.forces = refined(force, force.name(self.effects, self.tell), len(self.effects), self.tell)
         able = [
             one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
             if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
@@ -401,42 +400,3 @@ class Search:
             self.keep(item, exact=False)
         rough.sort(key=lambda item: -self.score(item))
         self.refine(rough, self.score(self.best()) - SEARCH.close)
-
-
-def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
-    """Fit the model without effect, then search the catalogue.
-
-    Parameters
-    ----------
-    problem : Problem
-        Campaign and model.
-    effects : sequence of Effect
-        The catalogue; what is unavailable here is left out, and what an event of the campaign may have begun
-        or ended is tried so too.
-    tell : callable
-        Takes a few words on what is fitted, and how much is left.
-
-    Returns
-    -------
-    Search
-        All candidates with their evidence.
-    """
-    tell("fitting the model as it is")
-    none = fit(problem, Candidate(), problem.start(Candidate()), iterations=SEARCH.none_steps)
-    none = refitted_from_beginnings(problem, none, iterations=SEARCH.none_steps)
-    usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
-    usable = (*usable, *in_events(usable, problem.setting))
-    found = Search(problem, usable, none, tell=tell)
-    if len(problem.model.apart()[1]) and found.force is not None and found.unexplained():
-        # a law of its own, as dry friction that ends a motion, has many optima
-        again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
-        if again is not None and again.objective < none.objective - SEARCH.worth_fitting:
-            found = Search(problem, usable, again, tell=tell)
-    force = found.force if found.moves else None
-    if force is None or len(force.ports) > 1:  # forces at several ports take up nearly any law at one
-        found.singles()
-        if force is None or not found.unexplained():
-            found.sets()
-            return found
-    found.by_force(force)
-    return found

@@ -14,8 +14,9 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.checks.model_check import prior_mean
 from discrepancy.errors import CampaignFileError, ModelError, said
-from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.sensing import observe
+from discrepancy.system.interface import Model
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 ExampleKind = Literal["static", "ringdown", "flight", "laboratory", "complete"]
@@ -173,7 +174,7 @@ def example_campaign(
     CampaignFileError
         If there is no such kind of example.
     ModelError, CatalogueError
-        As `discrepancy.models.sensing.observe`.
+        As `discrepancy.system.sensing.observe`.
     """
     if kind not in _KINDS:
         raise CampaignFileError(f"There is no example {kind!r}: the kinds are {', '.join(_KINDS)}.")

@@ -16,7 +16,7 @@ from calibration.errors import CalibrationError
 from calibration.result.file import load_calibration
 from discrepancy.campaign import records
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError, said
-from discrepancy.models.structures import WingModel
+from discrepancy.system.structures import WingModel
 from fmu_asset.door.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
@@ -151,7 +151,7 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
     """Return the model that the twin of a run believed, and the files of its wing and of its patch, if any.
 
     The wing is that of a calibration or a design. The whole patch of the twin's model is in it, sensors too:
-    they act in `discrepancy.models.sensing.observe`.
+    they act in `discrepancy.system.sensing.observe`.
 
     Raises
     ------

@@ -8,7 +8,7 @@ integrated exactly on straight cells, while CalculiX integrates it at the points
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
 from typing import NamedTuple, cast
@@ -326,6 +326,19 @@ KINDS = {
     for kind in (TETRAHEDRA_4, TETRAHEDRA_10, HEXAHEDRA_8, HEXAHEDRA_20, WEDGES_6, WEDGES_15)
 }
 """The kinds by their names in meshio."""
+
+HEXAHEDRA_20_REDUCED = replace(
+    HEXAHEDRA_20,
+    name="20-node hexahedra of reduced integration",
+    calculix="C3D20R",
+    stiffness_rule=gauss_points(2),
+)
+REDUCED = "hexahedron20 reduced"
+DECK_KINDS = KINDS | {REDUCED: HEXAHEDRA_20_REDUCED}
+"""The kinds that decks can ask for, by their names in a `Deck`.
+
+The names in meshio do not suffice: they are of cells, and not of their integration.
+"""
 
 
 def meshio_with_wedges() -> ModuleType:

@@ -222,7 +222,11 @@ def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> 
 
 
 def reduced_structure(
-    file: Path | str, progress: Progress | None = None, *, memory_limit: float | None = None
+    file: Path | str,
+    progress: Progress | None = None,
+    *,
+    memory_limit: float | None = None,
+    with_ports: bool = False,
 ) -> ReducedModel:
     """Return the reduced model of a structure file, from the cache if it is there.
 
@@ -235,6 +239,9 @@ def reduced_structure(
     memory_limit : float, optional
         Bytes that assembly and factorisation may take, as in
         `fe.structure.operators.load_and_assemble`.
+    with_ports : bool
+        Whether the model also has the force and the displacement at each port of the file, see
+        `AffineStructure.pushed_at_ports`. Its `design_hash` is that of the model without them.
 
     Raises
     ------
@@ -247,9 +254,12 @@ def reduced_structure(
 
         with reporter(progress).stage("Reading the mesh and assembling"):
             structure = assemble_structure(file, memory_limit)
+        if with_ports:
+            structure = structure.pushed_at_ports()
         return reduce_structure(structure, progress=progress).model
 
-    return _cached(ReducedModel, _structure_cache_file(Path(file)), build)
+    path = _structure_cache_file(Path(file), with_ports=with_ports)
+    return _cached(ReducedModel, path, build)
 
 
 def check_structure(file: Path | str) -> None:
@@ -264,10 +274,11 @@ def check_structure(file: Path | str) -> None:
         assemble_structure(file)
 
 
-def _structure_cache_file(file: Path) -> Path:
+def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
     """Return the cache file of the reduced model of a structure file."""
     design = load_structure(file)
-    return cache_file("structure", structure_hash(design, file.parent), design.reduction)
+    design_hash = structure_hash(design, file.parent, with_ports=with_ports)
+    return cache_file("structure", design_hash, design.reduction)
 
 
 def field_basis(operators: AffineOperators, reduction: "Reduction") -> WingFields:

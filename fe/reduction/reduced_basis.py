@@ -142,7 +142,7 @@ def _design_fields(terms: ReductionTerms) -> DesignFields:
         "parameters": tuple(structure.parameters),
         "masses": tuple(structure.masses),
         "controls": tuple(structure.controls),
-        "control_units": tuple(control.unit for control in design.control),
+        "control_units": tuple(structure.control_units.values()),
         "gauges": structure.gauges,
         "displacements": structure.displacements,
         "accelerations": structure.accelerations,

@@ -6,14 +6,10 @@ primitives; which physical effect a set of them stands for is not known here (`d
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
-from math import pi, sqrt
 from typing import Annotated, Any, ClassVar
 
-import numpy as np
-
-from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .laws import LAWS
 from .laws.interface import PortForce as PortForce
@@ -27,13 +23,23 @@ from .laws.speed import PowerDamping as PowerDamping
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window
 from .primitive import course_of as course_of
-
-EVERY_CHANNEL = "*"
-"""Name that stands for every channel of the primitive's quantity."""
-CHANNEL_UNIT = "channel's unit"
-PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
-"""Units of numbers that are shown by a channel."""
-
+from .sensor_primitives import CHANNEL_UNIT as CHANNEL_UNIT
+from .sensor_primitives import EVERY_CHANNEL as EVERY_CHANNEL
+from .sensor_primitives import PER_RELEASE as PER_RELEASE
+from .sensor_primitives import ChannelOffset as ChannelOffset
+from .sensor_primitives import Clock as Clock
+from .sensor_primitives import DecayingLine as DecayingLine
+from .sensor_primitives import HighPass as HighPass
+from .sensor_primitives import Line as Line
+from .sensor_primitives import LoggerClock as LoggerClock
+from .sensor_primitives import RunOffset as RunOffset
+from .sensor_primitives import Sensor as Sensor
+from .sensor_primitives import SensorDrift as SensorDrift
+from .sensor_primitives import SensorGain as SensorGain
+from .sensor_primitives import SensorRecord as SensorRecord
+from .sensor_primitives import SensorRotation as SensorRotation
+from .sensor_primitives import SensorSaturation as SensorSaturation
+from .sensor_primitives import ThermalStrain as ThermalStrain
 
 # ---------------------------------------------------------------- mass and stiffness
 
@@ -118,216 +124,6 @@ class PortLoad(Primitive):
     force: str
 
 
-# ---------------------------------------------------------------- what is read
-# `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
-
-
-@dataclass(frozen=True)
-class SensorRecord:
-    """The record that sensors show.
-
-    Attributes
-    ----------
-    channels : sequence of (str, str)
-        Name and quantity of each column.
-    kind : str
-        "static", "flight", "ringdown", "forced" or "driven".
-    time : (N,) ndarray
-        Dynamic: since the trial's start [s]. Static, flight: since the campaign's start [s].
-    start, release : float
-        Of a dynamic trial since the campaign's start [s]; amplitude of a ring-down [m or the signal's unit].
-    temperature : (N,) ndarray
-        Less the reference temperature [K].
-    run : str
-        Label of the run.
-    settled : bool
-        Whether it does not begin in an unknown motion.
-    """
-
-    channels: Sequence[tuple[str, str]]
-    kind: str
-    time: FloatArray
-    start: float
-    temperature: FloatArray
-    run: str = ""
-    release: float = 1.0
-    settled: bool = True
-
-    @property
-    def is_dynamic(self) -> bool:
-        """Whether the rows are samples of a motion."""
-        return self.kind in ("ringdown", "forced", "driven")
-
-
-class Sensor(Primitive):
-    """A primitive that changes what is read, not what happens."""
-
-    of_strain: ClassVar[bool] = False
-    """Whether it is for strain gauges alone."""
-
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample of a record, and the rate of that."""
-        return 0.0, 0.0
-
-
-class SensorGain(Sensor):
-    """A channel shows (1 + `gain`) times what it should."""
-
-    in_windows: ClassVar[bool] = True
-    channel: str
-    gain: Annotated[float, "1"]
-    quantity: str = ""
-
-
-class SensorDrift(Sensor):
-    """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
-
-    in_windows: ClassVar[bool] = True
-    channel: str
-    amplitude: Annotated[float, CHANNEL_UNIT]
-    time: Annotated[float, "s"]
-    exponent: Annotated[float, "1"] = 1.0
-    quantity: str = ""
-
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        if self.time <= 0.0:
-            raise InvalidPatchError(f"The time of a sensor's drift must be positive, but is {self.time} s.")
-        since = record.time + (record.start if record.is_dynamic else 0.0)
-        share = np.maximum(since, 0.0) / self.time
-        if self.exponent == 1.0:
-            return self.amplitude * share, np.full_like(share, self.amplitude / self.time)
-        moving = share > 0.0  # before and at the start there is no drift yet, whatever the exponent
-        safe = np.where(moving, share, 1.0)
-        value = np.where(moving, self.amplitude * safe**self.exponent, 0.0)
-        return value, np.where(moving, self.exponent * value / (safe * self.time), 0.0)
-
-
-class ChannelOffset(Sensor):
-    """A channel shows `offset` more, a formula in `time` [s] of the trial, in the channel's unit."""
-
-    in_windows: ClassVar[bool] = True
-    courses: ClassVar[tuple[str, ...]] = ("offset",)
-    channel: str
-    offset: str
-    quantity: str = ""
-
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        course = course_of(self.offset, self.kind).course(record.time, {"pi": pi})
-        return course, np.gradient(course, record.time) if record.is_dynamic else 0.0
-
-
-class SensorRotation(Sensor):
-    """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
-
-    of_strain: ClassVar[bool] = True
-    channel: str
-    angle: Annotated[float, "rad"]
-
-
-class ThermalStrain(Sensor):
-    """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
-
-    of_strain: ClassVar[bool] = True
-    in_windows: ClassVar[bool] = True
-    channel: str
-    coefficient: Annotated[float, "1/K"]
-
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        return self.coefficient * record.temperature, 0.0
-
-
-class HighPass(Sensor):
-    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s]."""
-
-    channel: str
-    time_constant: Annotated[float, "s"]
-    order: Annotated[float, "1"] = 1.0
-    quantity: str = ""
-
-
-class Clock(Sensor):
-    """A sample stamped t was taken at (1 + `rate`) t + `zero` [s], t since the record's first stamp."""
-
-    rate: Annotated[float, "1"]
-    zero: Annotated[float, "s"]
-
-
-class LoggerClock(Sensor):
-    """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
-
-    t counts from the record's first stamp.
-    `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
-    """
-
-    logger: str
-    rate: Annotated[float, "1"]
-
-
-class Line(Sensor):
-    """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
-
-    Amplitudes in the channel's unit. It is in the noise record too.
-    """
-
-    in_windows: ClassVar[bool] = True
-    channel: str
-    frequency: Annotated[float, "Hz"]
-    cosine: Annotated[float, CHANNEL_UNIT]
-    sine: Annotated[float, CHANNEL_UNIT]
-    quantity: str = ""
-
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        if not record.is_dynamic:
-            return 0.0, 0.0
-        omega = 2.0 * pi * self.frequency
-        c, s = np.cos(omega * record.time), np.sin(omega * record.time)
-        return self.cosine * c + self.sine * s, omega * (self.sine * c - self.cosine * s)
-
-
-class DecayingLine(Sensor):
-    """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
-
-    t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
-    """
-
-    channel: str
-    frequency: Annotated[float, "Hz"]
-    damping_ratio: Annotated[float, "1"]
-    cosine: Annotated[float, PER_RELEASE]
-    sine: Annotated[float, PER_RELEASE]
-    quantity: str = ""
-
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        if record.kind != "ringdown":
-            return 0.0, 0.0
-        omega, zeta = 2.0 * pi * self.frequency, self.damping_ratio
-        if not -1.0 < zeta < 1.0:
-            raise InvalidPatchError(f"The damping ratio of a decaying line must be below one, but is {zeta}.")
-        damped = omega * sqrt(1.0 - zeta**2)
-        envelope = record.release * np.exp(-zeta * omega * record.time)
-        c, s = np.cos(damped * record.time), np.sin(damped * record.time)
-        value = envelope * (self.cosine * c + self.sine * s)
-        return value, -zeta * omega * value + envelope * damped * (self.sine * c - self.cosine * s)
-
-
-class RunOffset(Sensor):
-    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
-
-    run: str
-    offset: Annotated[float, CHANNEL_UNIT]
-    channel: str = EVERY_CHANNEL
-    quantity: str = "displacement"
-
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        return self.offset if record.kind == "static" and record.run == self.run else 0.0, 0.0
-
-
 STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
 """Primitives that change the linear structure: it is solved anew."""
 INTERNAL_FORCES = (*LAWS, StiffnessDrift)
@@ -335,8 +131,8 @@ INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
 """Primitives that change the loads that are known."""
 SENSORS = (
-    SensorGain, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, Clock, LoggerClock, Line,
-    DecayingLine, RunOffset,
+    SensorGain, SensorSaturation, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, Clock,
+    LoggerClock, Line, DecayingLine, RunOffset,
 )  # fmt: skip
 """Primitives that change what is read, not what happens."""
 _EVERY: tuple[type[Primitive], ...] = (*STRUCTURE, StiffnessDrift, *LAWS, *LOADS, PortLoad, *SENSORS)

@@ -1,4 +1,4 @@
-"""What sensors make of a response: gain, drift, rotation, thermal strain, high-pass, lines, offset of a run.
+"""What sensors make of a response: gain, saturation, drift, rotation, thermal strain, high-pass, lines, zero.
 
 Pure functions on arrays for the primitives of `fe.runtime.patch.SENSORS`; clocks are not here, because they
 say when the response is taken and so belong to whoever computes it. Without sensors the input comes back
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .modal_system import exponential
-from .patch import EVERY_CHANNEL, Clock, HighPass, LoggerClock, ModelPatch, Sensor, SensorGain, SensorRotation
+from .patch import EVERY_CHANNEL, Clock, HighPass, LoggerClock, ModelPatch, Sensor, SensorRotation
 from .patch import SensorRecord as SensorRecord
 from .primitive import Primitive
 
@@ -100,8 +100,8 @@ def apply_sensors(
     Raises
     ------
     InvalidPatchError
-        If a gauge is turned and the components are missing, or a time constant, an order or a drift's time
-        is not positive.
+        If a gauge is turned and the components are missing, or a time constant, an order, a drift's time or
+        a limit is not positive.
     """
     active = [
         item for item in patch if isinstance(item, Sensor) and not isinstance(item, Clock | LoggerClock)
@@ -131,11 +131,8 @@ def apply_sensors(
         if not columns.size or isinstance(item, SensorRotation):
             continue
         signal, slope = shown[:, columns], slopes[:, columns]
-        if isinstance(item, SensorGain):
-            read = (1.0 + item.gain) * signal, (1.0 + item.gain) * slope
-        elif not isinstance(item, HighPass):
-            added, rate = item.added(record)
-            read = signal + np.reshape(added, (-1, 1)), slope + np.reshape(rate, (-1, 1))
+        if not isinstance(item, HighPass):
+            read = item.reading(record, signal, slope)
         elif record.is_dynamic:
             read = filtered(item, record, signal, slope)
         else:

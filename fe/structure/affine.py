@@ -6,7 +6,7 @@ the controls u, where acceleration fields act on the free masses, too.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -21,6 +21,11 @@ from fe.runtime.state import losses_of
 from .tables import StructureDesign
 
 Values = Mapping[str, float]
+PORT_PREFIX = "port."
+"""Begins the names of force and displacement at a port, see `AffineStructure.pushed_at_ports`.
+
+No name in a structure file has a dot.
+"""
 
 
 def affine_sum(coefficients: ArrayLike, terms: Sequence[sparse.csr_array]) -> sparse.csr_array:
@@ -81,6 +86,8 @@ class AffineStructure:
         The design.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
+    control_units : dict of str to str
+        Unit of each control.
     ranges : dict of str to (float, float)
         Least and largest value for which a reduced model is to hold, of parameters, losses, free
         masses and controls, by name.
@@ -96,10 +103,14 @@ class AffineStructure:
         The parts of the loads.
     gauges, displacements, accelerations : tuple of str
         Names of the outputs.
+    ports : tuple of str
+        Names of the ports where a force that the model lacks may act.
     gauge_output : csr (gauges, n)
         Strain of each gauge, positive in tension [1/m].
     displacement_output, acceleration_output : csr (m, n)
         Rows that give a displacement, or with second derivatives an acceleration [1].
+    port_output : csr (ports, n)
+        Rows that give the displacement of a port; transposed, a force of 1 N there.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
     design_hash : str
@@ -110,6 +121,7 @@ class AffineStructure:
     parameters: dict[str, float]
     masses: dict[str, float]
     controls: dict[str, float]
+    control_units: dict[str, str]
     ranges: dict[str, tuple[float, float]]
     regions: tuple[str, ...]
     stiffness_terms: tuple[StiffnessTerm, ...]
@@ -119,9 +131,11 @@ class AffineStructure:
     gauges: tuple[str, ...]
     displacements: tuple[str, ...]
     accelerations: tuple[str, ...]
+    ports: tuple[str, ...]
     gauge_output: sparse.csr_array
     displacement_output: sparse.csr_array
     acceleration_output: sparse.csr_array
+    port_output: sparse.csr_array
     expansion: sparse.csr_array
     design_hash: str
 
@@ -230,6 +244,25 @@ class AffineStructure:
             return {name: values[name] for name in names if name in values}
 
         return SplitValues(among(self.parameters), among(self.regions), among(self.masses))
+
+    def pushed_at_ports(self) -> "AffineStructure":
+        """Return the structure with a force [N] and a displacement [m] at each port, named `port.NAME`.
+
+        The force is a control whose nominal value is zero, so that it acts only where something asks for it.
+        """
+        names = tuple(f"{PORT_PREFIX}{port}" for port in self.ports)
+        unit_forces = zip(names, self.port_output.toarray(), strict=True)
+        port_loads = [LoadTerm(name, vector) for name, vector in unit_forces]
+        return replace(
+            self,
+            controls=self.controls | dict.fromkeys(names, 0.0),
+            control_units=self.control_units | dict.fromkeys(names, "N"),
+            ranges=self.ranges | dict.fromkeys(names, (-1.0, 1.0)),
+            loads=self.loads | dict(zip(names, names, strict=True)),
+            load_terms=(*self.load_terms, *port_loads),
+            displacements=(*self.displacements, *names),
+            displacement_output=sparse.vstack((self.displacement_output, self.port_output), format="csr"),
+        )
 
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Return the displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""

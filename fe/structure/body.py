@@ -121,7 +121,7 @@ class Body(Generic[Mesh]):
         loads : iterable of (full,) array
             Its loads, as in `fe.structure.affine.affine_fields`.
         outputs : OutputRows
-            Rows of its gauges, displacements and accelerations.
+            Rows of its gauges, displacements, accelerations and ports.
         """
         components = sparse.eye_array(3)
         weights = (sparse.csr_array(point_mass.weights) for point_mass in self.masses)

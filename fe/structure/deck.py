@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fe.elements.elasticity import axes_of
-from fe.elements.kinds import KINDS, ElementKind
+from fe.elements.kinds import DECK_KINDS, ElementKind
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from fe.sentences import said
 from reporting.text_file import read_text
-from reporting.toml_file import parse_toml, shown
+from reporting.toml_file import parse_toml, short_repr
 
 from .mesh import StructureMesh
 
@@ -97,9 +97,9 @@ def whole(where: str, text: str) -> int:
     try:
         number = int(text)
     except ValueError:
-        fail(where, f"a whole number is expected, but {shown(text)} came.")
+        fail(where, f"a whole number is expected, but {short_repr(text)} came.")
     if abs(number) > _LARGEST_NUMBER:
-        fail(where, f"the number {shown(text)} is too large.")
+        fail(where, f"the number {short_repr(text)} is too large.")
     return number
 
 
@@ -110,7 +110,7 @@ def real(where: str, text: str) -> float:
     except ValueError:
         number = nan
     if not isfinite(number):
-        fail(where, f"a real number is expected, but {shown(text)} came.")
+        fail(where, f"a real number is expected, but {short_repr(text)} came.")
     return number
 
 
@@ -137,7 +137,12 @@ class Deck:
         self._solids: dict[str, str] = {}
         """Where each type of solid elements came first."""
         self._unknown: dict[str, list[str]] = {}
+        self._remarks: dict[str, None] = {}
         self._room = _MOST_NUMBERS
+
+    def remark(self, sentence: str) -> None:
+        """Add a sentence on how the file was read, once."""
+        self._remarks.setdefault(sentence)
 
     def word(self, word: str, where: str) -> None:
         """Pass over a word that is no part of the mesh; refuse what must not be lost, note the unknown."""
@@ -234,22 +239,25 @@ class Deck:
             cell_sets=cell_sets,
             face_sets=face_sets,
             loose=own[~used],
-            remarks=tuple(
-                f"{notes[0]}{f' ({len(notes)} times)' * (len(notes) > 1)} is not known and was passed over; "
-                "make sure that the model may do without."
-                for notes in self._unknown.values()
-            ),
+            remarks=(*self._remarks, *self._passed_over()),
         )
+
+    def _passed_over(self) -> Iterator[str]:
+        """Yield a sentence on each word that is not known."""
+        for notes in self._unknown.values():
+            times = f" ({len(notes)} times)" if len(notes) > 1 else ""
+            advice = "make sure that the model may do without"
+            yield f"{notes[0]}{times} is not known and was passed over; {advice}."
 
     def _kind(self) -> ElementKind:
         """Return the one kind of the solid elements."""
         counts = Counter(kind for kind, _ in self.elements.values() if kind not in FLAT)
-        if len(counts) != 1 or not counts.keys() <= KINDS.keys():
-            named = {name: kind.name for name, kind in KINDS.items()}
+        if len(counts) != 1 or not counts.keys() <= DECK_KINDS.keys():
+            named = {name: kind.name for name, kind in DECK_KINDS.items()}
             came = ", ".join(f"{count} {named.get(name, name)}" for name, count in counts.items())
             sentence = said("deck.kinds", known=", ".join(named.values()), came=came or "none that is solid")
             fail([str(self.path), *self._solids.values()][-1], sentence)
-        return KINDS[next(iter(counts))]
+        return DECK_KINDS[next(iter(counts))]
 
     def _places(self, members: Iterable[int], what: str) -> list[int]:
         """Return the places of nodes by their numbers."""
@@ -280,7 +288,7 @@ class Deck:
             label, last = face.upper(), len(kind.faces)
             number = int(label[1:]) if re.fullmatch("S[1-6]", label) else 0
             if not 1 <= number <= last:
-                fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {shown(face)} came.")
+                fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {short_repr(face)} came.")
             for element in {*self.named("ELSET", where, member)}:
                 if element not in solid:
                     fail(where, f"the surface names element {element}, which is not a solid element.")

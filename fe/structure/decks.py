@@ -6,29 +6,33 @@ Cartesian and passes rigid elements over. Nor does it name the line of a fault.
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from fe.elements.kinds import KINDS
+from fe.elements.kinds import DECK_KINDS, KINDS
 from fe.runtime.arrays import FloatArray
-from reporting.toml_file import shown
+from reporting.toml_file import short_repr
 
 from .deck import FLAT, GLOBAL, Deck, System, fail, frame, lines_of, real, whole, words_of
 
 _ABAQUS_COMMENT = re.compile(r"^\s*\*\*.*")
 _ABAQUS_INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
-_VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
-"""Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
+_MESHIO_NAMES = {"C3D8RH": "C3D8", "C3D10MH": "C3D10", "C3D20RH": "C3D20"}
+"""What meshio calls hexahedra and tetrahedra that are no special ones."""
+_SAME_STIFFNESS = re.compile(r"(C3D(?:4|6|8|10|15|20|20R))[HT]")
+"""Hybrid elements, and those with a temperature: the plain ones where the material is compressible."""
+_VARIANT = re.compile(r"(C3D\d+)[A-Z]+")
 _OTHER_STIFFNESS = {
-    "C3D8I": "enhanced by incompatible modes",
-    "C3D8R": "integrated at one point",
+    "C3D8I": "enhanced by incompatible modes and softer in bending",
+    "C3D8R": "integrated at one point and softer in bending",
+    "C3D10M": "modified for contact",
 }
-"""Variants of C3D8 that are other elements; meshio writes every hexahedron as C3D8RH, which stays one."""
-_TYPES = {kind.calculix: (kind.file_type, kind.node_count) for kind in KINDS.values()}
+_TYPES = {kind.calculix: (name, kind.node_count) for name, kind in DECK_KINDS.items()}
 _TYPES |= {name: (kind, FLAT[kind][0]) for name, kind in words_of("abaqus").flat.items()}
 
 
@@ -64,7 +68,9 @@ def read_abaqus(path: Path) -> Deck:
             deck.word(block.keyword, block.where)
             continue
         for key in (key for key in block.parameters if key not in words.read[block.keyword]):
-            fail(block.where, f"*{block.keyword} with {shown(key)} is not read; write what it makes out.")
+            fail(
+                block.where, f"*{block.keyword} with {short_repr(key)} is not read; write what it makes out."
+            )
         if block.keyword == "NODE":
             _add_nodes(deck, block, system)
         elif block.keyword == "ELEMENT":
@@ -125,19 +131,28 @@ def _add_nodes(deck: Deck, block: _Block, system: System) -> None:
         deck.members("NSET", block.name("NSET")).extend(numbers)
 
 
+def _plain_type(name: str, where: str) -> str:
+    """Return the element that is built for a type of a deck; refuse one that is none of ours."""
+    same = _SAME_STIFFNESS.fullmatch(name)
+    plain = _MESHIO_NAMES.get(name) or (same[1] if same else name)
+    if plain not in _TYPES:
+        readable = ", ".join(kind.calculix for kind in DECK_KINDS.values())
+        variant = _VARIANT.fullmatch(name)
+        if variant is None or variant[1] not in _TYPES:
+            fail(where, f"elements of type {short_repr(name)} cannot be read; {readable} can.")
+        why = f"they are {_OTHER_STIFFNESS.get(name, 'other elements')}, not {variant[1]}"
+        remedy = f"write {variant[1]} if that is meant"
+        if variant[1] == "C3D8":
+            remedy = f"mesh with second-order elements (C3D20, C3D20R or C3D10), or {remedy}"
+        fail(where, f"elements of type {name} cannot be read: {why}; {remedy}. {readable} can be read.")
+    return plain
+
+
 def _add_elements(deck: Deck, block: _Block) -> None:
     name = block.name("TYPE").upper()
-    variant = _VARIANT.fullmatch(name)
-    plain = variant[1] if variant else name
-    if plain == "C3D8" and name in _OTHER_STIFFNESS:
-        fail(
-            block.where,
-            f"elements of type {name} cannot be read: they are {_OTHER_STIFFNESS[name]} and softer in bending"
-            " than C3D8. Mesh with second-order elements (C3D20 or C3D10), or write C3D8 if that is meant.",
-        )
-    if plain not in _TYPES:
-        readable = ", ".join(kind.calculix for kind in KINDS.values())
-        fail(block.where, f"elements of type {shown(name)} cannot be read; {readable} and variants can.")
+    plain = _plain_type(name, block.where)
+    if plain != name:
+        deck.remark(f"{block.where}: elements of type {name} are built as {plain}.")
     kind, width = _TYPES[plain]
     numbers = [(where, whole(where, text)) for where, row in block.data for text in row if text]
     if len(numbers) % (width + 1):
@@ -161,7 +176,7 @@ def _add_members(deck: Deck, block: _Block) -> None:
             continue
         first, last, step = [*(whole(where, value) for value in given), 1, 0, 0][:3]
         if len(given) not in (2, 3) or first < 1 or step < 1:
-            fail(where, f"first, last and step are expected, but {shown(','.join(given))} came.")
+            fail(where, f"first, last and step are expected, but {short_repr(','.join(given))} came.")
         members.extend(deck.counted(where, range(first, last + 1, step)))
 
 
@@ -276,33 +291,82 @@ def _add_element(deck: Deck, card: _Card) -> None:
     deck.members("ELSET", f"nastran:ref={card.whole(1, number)}").append(number)
 
 
+class _Line(NamedTuple):
+    """A line of the bulk data: its head, its fields, and the marker of the line that continues it."""
+
+    where: str
+    head: str
+    fields: list[str]
+    marker: str
+
+    @property
+    def is_continuation(self) -> bool:
+        """Whether it continues another line."""
+        return not self.head or self.head[0] in "+*"
+
+    @property
+    def name(self) -> str:
+        """The marker of the line that it continues; empty where that is the one before."""
+        return self.head[1:].upper()
+
+
 def cards(path: Path) -> list[_Card]:
     """Return the words of the bulk data of a file.
 
-    A continuation with a name goes to the line that ends with this name, also where others stand between.
+    A continuation with a name goes to the line that ends with this name, wherever that stands: also below,
+    if more lines below end with the name than continuations below have it.
     """
-    lines = [*lines_of((path,), _NASTRAN_COMMENT, _NASTRAN_INCLUDE)]
-    start = next((number for number, (_, text) in enumerate(lines, start=1) if _BEGIN.match(text)), 0)
     found: list[_Card] = []
-    marker = ""
     awaiting: dict[str, _Card] = {}
-    for where, text in lines[start:]:
-        head, *fields, end = _fields(where, text.expandtabs(8))
-        if head and head[0] not in "+*":
-            found.append(_Card(head.upper().rstrip("*_"), where, fields))  # meshio writes CTETRA_
-            if found[-1].word.startswith("ENDDATA"):
-                return found[:-1]
-            card = found[-1]
+    early: dict[str, _Line] = {}
+    card: _Card | None = None  # of the line before
+    marker = ""
+    lines = _bulk_lines(path)
+    parents_below = Counter(line.marker for line in lines)
+    continuations_below = Counter(line.name for line in lines if line.is_continuation)
+    for line in lines:
+        parents_below[line.marker] -= 1
+        if not line.is_continuation:
+            card = _Card(line.head.upper().rstrip("*_"), line.where, line.fields)  # meshio writes CTETRA_
+            found.append(card)
         else:
-            name = head[1:].upper()
-            if not found or (name and marker and name != marker and name not in awaiting):
-                fail(where, f"the continuation {shown(head)} stands behind no line that it continues.")
-            card = awaiting.pop(name, found[-1])
-            card.fields.extend(fields)
-        marker = end.lstrip("+*").upper()
+            continuations_below[line.name] -= 1
+            if line.name in awaiting:
+                card = awaiting.pop(line.name)
+            elif line.name and parents_below[line.name] > continuations_below[line.name]:
+                early[line.name] = line
+                card, marker = None, line.marker
+                continue
+            elif card is None or (line.name and marker):
+                _refuse_continuation(line)
+            card.fields.extend(line.fields)
+        marker = line.marker
+        while marker in early:
+            continuation = early.pop(marker)
+            card.fields.extend(continuation.fields)
+            marker = continuation.marker
         if marker:
             awaiting[marker] = card
+    for line in early.values():
+        _refuse_continuation(line)
     return found
+
+
+def _bulk_lines(path: Path) -> list[_Line]:
+    """Return the lines of the bulk data up to ENDDATA."""
+    lines = [*lines_of((path,), _NASTRAN_COMMENT, _NASTRAN_INCLUDE)]
+    start = next((number for number, (_, text) in enumerate(lines, start=1) if _BEGIN.match(text)), 0)
+    bulk: list[_Line] = []
+    for where, text in lines[start:]:
+        head, *fields, end = _fields(where, text.expandtabs(8))
+        if head.upper().startswith("ENDDATA"):
+            break
+        bulk.append(_Line(where, head, fields, end.lstrip("+*").upper()))
+    return bulk
+
+
+def _refuse_continuation(line: _Line) -> NoReturn:
+    fail(line.where, f"the continuation {short_repr(line.head)} stands behind no line that it continues.")
 
 
 def _fields(where: str, text: str) -> list[str]:

@@ -19,7 +19,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
 from fe.sentences import said
-from reporting.toml_file import Fault, checked, read_toml
+from reporting.toml_file import Fault, read_toml, validate
 
 from . import tables
 
@@ -208,6 +208,19 @@ class PointOutput(tables.Named):
     direction: tables.Direction
 
 
+class Port(tables.Given, tables.Named):
+    """Where a force that the model lacks may act: on a set, shared as a load's force is, or at a point.
+
+    It acts along `direction`, on the mean displacement of the set, or on that of the point.
+    """
+
+    direction: tables.Direction
+    set: SetName | None = None
+    point: tables.Vector | None = None
+
+    ways = (("set",), ("point",))
+
+
 class MeshDesign(tables.StructureDesign, Gauged):
     """A structure from a mesh."""
 
@@ -221,6 +234,7 @@ class MeshDesign(tables.StructureDesign, Gauged):
     gauge: tuple[Gauge, ...] = ()
     displacement: tuple[PointOutput, ...] = ()
     acceleration: tuple[PointOutput, ...] = ()
+    port: tuple[Port, ...] = ()
 
     what = "mesh"
     scaled_table = "material"
@@ -295,7 +309,7 @@ class Extension(tables.Given, tables.Named):
 
 
 class NodeOutput(tables.Given, tables.Named):
-    """Displacement, or acceleration: a `vector` of its own, or of a node along a direction."""
+    """Displacement, acceleration or port: a `vector` of its own, or of a node along a direction."""
 
     vector: FileName | None = None
     node: Node | None = None
@@ -323,6 +337,7 @@ class MatrixDesign(tables.StructureDesign):
     gauge: tuple[Extension, ...] = ()
     displacement: tuple[NodeOutput, ...] = ()
     acceleration: tuple[NodeOutput, ...] = ()
+    port: tuple[NodeOutput, ...] = ()
 
     what = "matrix"
     scaled_table = "part"
@@ -336,7 +351,8 @@ class MatrixDesign(tables.StructureDesign):
     @property
     def files(self) -> tuple[str, ...]:
         """Every file that is named, once, in the order of the tables."""
-        tables = (self.part, self.load, self.mass, self.gauge, self.displacement, self.acceleration)
+        outputs = (self.gauge, self.displacement, self.acceleration, self.port)
+        tables = (self.part, self.load, self.mass, *outputs)
         own = (getattr(part, key, None) for table in tables for part in table for key in _FILES)
         named = filter(None, (*self.stiffness_matrix, *self.mass_matrix, self.unknowns, *own))
         return tuple(dict.fromkeys(file_of(name)[0] for name in named))
@@ -365,8 +381,8 @@ def parse_structure(content: dict[str, Any], source: str = "the structure") -> M
         One sentence that names `source`, the place, what came and what was expected.
     """
     if "stiffness_matrix" in content:
-        return checked(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
-    return checked(MeshDesign, content, source, InvalidDesignError, what="a structure")
+        return validate(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
+    return validate(MeshDesign, content, source, InvalidDesignError, what="a structure")
 
 
 def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
@@ -383,15 +399,28 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
     return parse_structure(read_toml(file, DesignFileError, what="structure file"), source=str(file))
 
 
-def structure_hash(design: tables.StructureDesign, folder: Path) -> str:
-    """SHA-256 of the design and of the bytes of its files in a folder, 64 hexadecimal digits.
+def structure_hash(design: tables.StructureDesign, folder: Path, *, with_ports: bool = False) -> str:
+    """Return the SHA-256 of the design and of the bytes of its files, 64 hexadecimal digits.
+
+    Parameters
+    ----------
+    design : StructureDesign
+        The structure.
+    folder : Path
+        Folder of its files.
+    with_ports : bool
+        Whether its ports count. They change no answer of the structure, but an effect is found at one.
 
     Raises
     ------
     MeshError
-        If one cannot be read.
+        If a file cannot be read.
     """
+    if not with_ports:
+        design = design.model_copy(update={"port": ()})
     content = design.model_dump(mode="json")
+    if not design.port:
+        del content["port"]
     content.pop("mesh", None)  # its bytes count, not its name
     del content["reduction"]  # the structure is the same
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())

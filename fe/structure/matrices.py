@@ -1,7 +1,8 @@
 """From matrices and a structure file to affine operators; matrices that are no structure's are refused.
 
-Unknowns stay in the unit of length of the matrices, so that these are used as they are. Rows that
-read a displacement, and masses and accelerations, are converted to SI units.
+Matrices are converted to SI units as they are read: stiffness in N/m, mass in kg, unknowns in metres
+(rotations times the unit of length). A row that reads a displacement is then, transposed, a force of
+1 N there.
 """
 
 import itertools
@@ -51,7 +52,7 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
         If a file cannot be read, does not fit the others, lacks what the design names, or is not of a
         structure: unsymmetric, indefinite, not held, or with mass that nothing holds.
     """
-    files = MatrixFiles(folder, _places(design, folder))
+    files = MatrixFiles(folder, _places(design, folder), design.unit)
     stiffness = sum(files.matrix(name, "stiffness_matrix") for name in design.stiffness_matrix)
     mass = sum(files.matrix(name, "mass_matrix") for name in design.mass_matrix)
     free = _free_rows(design, files, (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0))
@@ -60,8 +61,8 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
     free_places = [files.places[row] for row in free]
     _check_structure(stiffness[free][:, free], mass[free][:, free], free_places)
     fields = _fields(design, files, mass, free)
-    # Rows read in the unit of the matrices; only the nodal displacements are in metres.
-    fields["expansion"] = design.unit * _nodal_displacements(files)[:, free]
+    # The fields select the free rows; fields of displacements are those of all nodes.
+    fields["expansion"] = _nodal_displacements(files)[:, free]
     return AffineStructure(
         design=design,
         **fields,
@@ -105,8 +106,8 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
 def _fields(design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, free: IntArray) -> AffineFields:
     """Return the fields of the affine model, whose expansion selects the free rows."""
     size = len(files.places)
-    point_masses = (_point_mass(part, design.unit, files, label) for label, part in design.numbered("mass"))
-    loads = (_load(load, design.unit, files, label) for label, load in design.numbered("load"))
+    point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
+    loads = (_load(load, files, label) for label, load in design.numbered("load"))
 
     def output_rows(key: str) -> sparse.csr_array:
         rows = [
@@ -125,12 +126,13 @@ def _fields(design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, fr
             gauge=output_rows("gauge"),
             displacement=output_rows("displacement"),
             acceleration=output_rows("acceleration"),
+            port=output_rows("port"),
         ),
     )
 
 
-def _point_mass(part: MatrixMass, unit: float, files: MatrixFiles, where: str) -> sparse.csr_array:
-    """Return the mass matrix (n, n) of 1 kg, in the unit of the matrices."""
+def _point_mass(part: MatrixMass, files: MatrixFiles, where: str) -> sparse.csr_array:
+    """Return the mass matrix (n, n) of 1 kg."""
     if part.matrix is not None:
         return files.matrix(part.matrix, where, partial=True)
     assert part.node is not None
@@ -139,22 +141,25 @@ def _point_mass(part: MatrixMass, unit: float, files: MatrixFiles, where: str) -
         axes = [1]  # refused by name below
     columns = np.array([files.unit_vector_at((part.node, axis), where) for axis in axes]).T
     selection = sparse.csr_array(columns)
-    return sparse.csr_array(unit * (selection @ selection.T))
+    return sparse.csr_array(selection @ selection.T)
 
 
-def _load(load: MatrixLoad, unit: float, files: MatrixFiles, where: str) -> FloatArray:
-    """Return the vector (n,) of a load, or of the field of an acceleration in the unit of the matrices."""
+def _load(load: MatrixLoad, files: MatrixFiles, where: str) -> FloatArray:
+    """Return the vector (n,) of a load [N], or of the field of an acceleration [m/s^2]."""
     if load.acceleration is not None:
-        return files.uniform_field(load.acceleration, where) / unit
+        return files.uniform_field(load.acceleration, where)
     if load.node is not None and load.force is not None:
         return files.direction_at(load.node, load.force, where, FORCE_WEIGHTS)
     return files.vector(str(load.vector), where, FORCE_WEIGHTS)
 
 
 def _output_row(output: Extension | NodeOutput, files: MatrixFiles, where: str, unit: float) -> FloatArray:
-    """Return the row (n,) of an output: a strain, or a displacement or acceleration in metres."""
+    """Return the row (n,) of an output: a strain [1/m], or a displacement, acceleration or port [1].
+
+    Strains are given per unknown in the unit of length of the matrices [m].
+    """
     is_strain = isinstance(output, Extension)
-    scale = 1.0 if is_strain else unit
+    scale = 1.0 / unit if is_strain else 1.0
     if output.vector is not None:
         return scale * files.vector(output.vector, where)
     assert output.direction is not None
@@ -163,9 +168,9 @@ def _output_row(output: Extension | NodeOutput, files: MatrixFiles, where: str, 
         assert output.nodes is not None
         assert output.length is not None
         first, last = (files.direction_at(node, (x, y, z), where) for node in output.nodes)
-        return (last - first) / output.length
+        return scale * (last - first) / output.length
     assert output.node is not None
-    return scale * files.direction_at(output.node, (x, y, z), where)
+    return files.direction_at(output.node, (x, y, z), where)
 
 
 def _nodal_displacements(files: MatrixFiles) -> sparse.csr_array:

@@ -50,10 +50,13 @@ class MatrixFiles:
         The folder of the files.
     places : list of (int, int)
         Node and component of each row.
+    unit : float
+        Metres in the unit of length of the matrices.
     """
 
     folder: Path
     places: list[Place]
+    unit: float
 
     @cached_property
     def rows(self) -> dict[Place, list[int]]:
@@ -153,7 +156,7 @@ class MatrixFiles:
         return read_vector(self.folder, name, unit_vector_at, len(self.places))
 
     def matrix(self, name: str, where: str, *, partial: bool = False) -> sparse.csr_array:
-        """Return the symmetric matrix (n, n) of a file, its rows in the order of the places.
+        """Return the symmetric matrix (n, n) of a file [N/m or kg], its rows in the order of the places.
 
         Parameters
         ----------
@@ -184,7 +187,7 @@ class MatrixFiles:
                 "must be of the same run."
             )
         self._check_finite_and_symmetric(matrix, label)
-        return sparse.csr_array(0.5 * (matrix + matrix.T))
+        return sparse.csr_array(0.5 * (matrix + matrix.T) / self.unit)
 
     def _check_finite_and_symmetric(self, matrix: sparse.csr_array, label: str) -> None:
         """Raise `MeshError` if a matrix (n, n) is not finite or not symmetric."""

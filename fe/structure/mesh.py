@@ -1,6 +1,6 @@
 """The mesh of a structure as its file has it, in metres: nodes, cells of one kind, named sets."""
 
-from collections.abc import Iterable, Sized
+from collections.abc import Sized
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, TypeVar
@@ -10,7 +10,7 @@ import numpy as np
 from fe.elements.cells import CellMesh
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
-from reporting.sentences import MOST_LISTED
+from reporting.words import comma_list
 
 ALL_CELLS = "all"
 """Name of the set of all cells, which no file has to hold."""
@@ -182,7 +182,7 @@ class StructureMesh(CellMesh):
         members = _set_named(sets, name)
         if members is None:
             raise MeshError(
-                f"{where}: {self.source} holds no set of {kind} named {name!r}; there are {_listed(sets)}."
+                f"{where}: {self.source} holds no set of {kind} named {name!r}; there are {comma_list(sets)}."
             )
         if not len(members):
             raise MeshError(f"{where}: the set {name!r} of {self.source} holds no {member}.")
@@ -236,11 +236,3 @@ def _set_named(sets: dict[str, _Content], name: str) -> _Content | None:
         return sets[name]
     matches = [members for key, members in sets.items() if key.casefold() == name.casefold()]
     return matches[0] if len(matches) == 1 else None
-
-
-def _listed(names: Iterable[str]) -> str:
-    """Return names for a sentence, at most `MOST_LISTED` of them."""
-    all_names = list(names)
-    listed = ", ".join(all_names[:MOST_LISTED]) or "none"
-    further = len(all_names) - MOST_LISTED
-    return f"{listed} and {further} more" if further > 0 else listed

@@ -25,11 +25,12 @@ from scipy.sparse import csgraph
 from fe.elements.cells import BATCH, jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.full.fronts import analyse
-from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from fe.sentences import said
-from reporting.memory import memory_left
+from reporting.memory import available_memory
 from reporting.text_file import read_text
+from reporting.words import counted, is_or_are
 
 from .deck import FLAT, Deck, fail
 from .decks import cards, read_abaqus, read_nastran
@@ -41,6 +42,8 @@ _READERS: dict[str, Callable[[Path], Deck]] = {
 }  # fmt: skip
 """Readers of this project; meshio reads what has another ending."""
 _MOST_VALUES = 1000
+_LEFT_OUT = 0
+"""Number that no element has: they are counted from one."""
 LARGEST_EDGE_SHIFT = 0.3
 """A mid-edge node may lie so far from the middle of its edge, in lengths of the edge."""
 
@@ -121,14 +124,22 @@ def read_by_meshio(path: Path) -> Deck:
     points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
     deck.nodes = dict(enumerate(map(tuple, points.tolist()), start=1))
     numbers, first, count = [], dict[Any, int](), 0
-    for block in found.cells:
+    outside = _outside_physical_groups(found)
+    left_out = sum(int(rows.sum()) for rows in outside)
+    if left_out:
+        what = f"{counted(left_out, 'element')} of no physical group {is_or_are(left_out)} left out"
+        deck.remark(f"{path}: {what}; set Mesh.SaveAll = 0 in Gmsh, and it saves none of them.")
+    for block, is_outside in zip(found.cells, outside, strict=True):
         known = block.type in KINDS or block.type in FLAT
         table = block.data if known else np.zeros((len(block.data), 0), dtype=np.int64)
         if suffix == ".med" and block.type in KINDS:
             table = table[:, KINDS[block.type].med_order]
         mine = []
-        for nodes in (table + 1).tolist():
+        for nodes, without_group in zip((table + 1).tolist(), is_outside.tolist(), strict=True):
             count += 1
+            if without_group:
+                mine.append(_LEFT_OUT)
+                continue
             # Gmsh writes an element once for each of its physical groups.
             mine.append(first.setdefault((block.type, *sorted(nodes)) if suffix == ".msh" else count, count))
             if mine[-1] == count:
@@ -151,8 +162,30 @@ def read_by_meshio(path: Path) -> Deck:
                 tagged = _named(found, label, arrays, number)
                 named += [(name, places) for name, places in tagged if name not in sets]
             for name, places in named:
-                deck.members(key, name).extend(own[places].tolist())
+                numbers_of_set = own[places]
+                kept = numbers_of_set[numbers_of_set != _LEFT_OUT]
+                if len(kept) or not len(numbers_of_set):
+                    deck.members(key, name).extend(kept.tolist())
     return deck
+
+
+def _outside_physical_groups(found: Any) -> list[BoolArray]:
+    """Return which elements of each block of a file of Gmsh are in no physical group, where others are.
+
+    Gmsh saves them, with the group 0, where its option Mesh.SaveAll says so. Where no solid element has a
+    group, all of them stay: groups may be of faces alone.
+    """
+    groups = found.cell_data.get("gmsh:physical")
+    if groups is None:
+        return [np.zeros(len(block.data), dtype=bool) for block in found.cells]
+    has_groups = any(np.any(group) for group in groups)
+    blocks = [*zip(found.cells, groups, strict=True)]
+    has_solids = any(np.any(group) for block, group in blocks if block.type not in FLAT)
+    outside = []
+    for block, group in blocks:
+        is_chosen = has_groups if block.type in FLAT else has_solids
+        outside.append((np.asarray(group) == 0) & is_chosen)
+    return outside
 
 
 def _check_element_lines(path: Path) -> None:
@@ -192,6 +225,12 @@ def _found_by_meshio(path: Path) -> Any:
         why = printed.getvalue().removeprefix("Error: ")
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
         why = getattr(error, "strerror", None) or str(error) or "its format is not known"
+        if "gmsh:physical" in why:  # of version 4, where some blocks of elements have it and others do not
+            fail(
+                str(path),
+                "some elements are in a physical group and others in none, as Gmsh saves them with"
+                " Mesh.SaveAll = 1. Set Mesh.SaveAll = 0 and save the mesh anew.",
+            )
     raise MeshError(said("mesh.unread", path=path, why=" ".join(why[:500].split()).rstrip(".")))
 
 
@@ -252,7 +291,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     MeshError
         If it would take more.
     """
-    allowed = memory_left() if limit is None else limit
+    allowed = available_memory() if limit is None else limit
     entries = 9 * mesh.cells.size * mesh.cells.shape[1]  # four times those that are left of them
     bulky = _PROGRAM + _MATRICES * _ENTRY * entries / 4.0 + _BULKY * mesh.unknowns ** (4.0 / 3.0)
     if bulky > allowed and (needed := memory_estimate(mesh)) > allowed:

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fe.elements.cells import CellMesh
+from fe.elements.elasticity import unit_vector
 from fe.runtime.arrays import FloatArray
 
-from .design import Load
+from .design import Load, Port
 from .location import attach
 from .mesh import StructureMesh, Surface
 
@@ -87,18 +88,48 @@ def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
     if load.pressure is not None:
         surface = mesh.faces_of(str(load.set), where)
         return -load.pressure * face_areas(mesh, surface).vectors
-    force = np.asarray(load.force)
-    if load.point is not None:
-        return np.outer(point_weights(mesh, load.point, where), force)
-    # a force on a set: by area if it holds faces, else equally among the nodes
-    nodes = mesh.nodes_of(str(load.set), where)
-    surface = mesh.faces_between(str(load.set), nodes)
+    return np.outer(_force_weights(mesh, load, where), np.asarray(load.force))
+
+
+def port_row(mesh: StructureMesh, port: Port, where: str) -> FloatArray:
+    """Return the row (nodes, 3) that reads the displacement of a port.
+
+    Transposed, the row is a force of 1 N at the port.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    port : Port
+        The port.
+    where : str
+        Its name in sentences.
+
+    Raises
+    ------
+    MeshError
+        If its set is missing or empty.
+    InvalidDesignError
+        If its point lies outside.
+    """
+    return np.outer(_force_weights(mesh, port, where), unit_vector(port.direction))
+
+
+def _force_weights(mesh: StructureMesh, part: Load | Port, where: str) -> FloatArray:
+    """Return the weights (nodes,) of the nodes in a force at a point or on a set; they sum to one.
+
+    A force on a set acts by area if the set holds faces, else equally on its nodes.
+    """
+    if part.point is not None:
+        return point_weights(mesh, part.point, where)
+    nodes = mesh.nodes_of(str(part.set), where)
+    surface = mesh.faces_between(str(part.set), nodes)
     if len(surface):
         weights = face_areas(mesh, surface).areas
     else:
         weights = np.zeros(len(mesh.points))
         weights[nodes] = 1.0
-    return np.outer(weights / weights.sum(), force)
+    return np.asarray(weights / weights.sum())
 
 
 def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where: str) -> FloatArray:

@@ -23,7 +23,7 @@ from .gauges import gauge_rows
 from .matrices import assemble_matrices
 from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
-from .nodal_loads import nodal_load, point_weights
+from .nodal_loads import nodal_load, point_weights, port_row
 from .supports import supports_of_design
 
 
@@ -184,10 +184,12 @@ def load_and_assemble(
     # the body, its loads and outputs
     body = _body(design, mesh, material_of, region_of, mass_as_stiffness=mass_as_stiffness)
     gauges, gauges_moved = gauge_rows(mesh, design.gauge)
+    ports = [port_row(mesh, port, label).ravel() for label, port in design.numbered("port")]
     outputs = OutputRows(
         gauge=gauges,
         displacement=_point_rows(mesh, list(design.numbered("displacement"))),
         acceleration=_point_rows(mesh, list(design.numbered("acceleration"))),
+        port=sparse.csr_array(np.reshape(ports, (-1, mesh.unknowns))),
     )
     loads = (nodal_load(mesh, load, label).ravel() for label, load in design.numbered("load"))
     return Structure(

@@ -186,6 +186,7 @@ class StructureDesign(Part):
     gauge: tuple[Named, ...] = ()
     displacement: tuple[Named, ...] = ()
     acceleration: tuple[Named, ...] = ()
+    port: tuple[Named, ...] = ()
     damping: Damping = Damping()
     reduction: ReductionLimits = ReductionLimits()
 
@@ -213,7 +214,7 @@ class StructureDesign(Part):
         # What a state, a control or an output is called by must be one thing.
         for keys in (
             ("parameter", "damage", "mass", "control"),
-            ("gauge", "displacement", "acceleration"),
+            ("gauge", "displacement", "acceleration", "port"),
             ("load",),
             *((key,) for key in self.own_names),
         ):

@@ -17,7 +17,7 @@ from pydantic import Field
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
 from fe.structure.tables import Part, StructureDesign
-from reporting.toml_file import Fault, checked, read_toml
+from reporting.toml_file import Fault, read_toml, validate
 from reporting.words import brief
 
 from . import parts
@@ -41,7 +41,9 @@ def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
         "damage": [{"name": name} for name in regions],
         "gauge": [{"name": f"gauge_{number}"} for number in range(1, gauges + 1)],
     }
-    return checked(StructureDesign, content, str(_NAMES), InvalidDesignError, what="a wing's names")
+    return validate(
+        StructureDesign, content, str(_NAMES), InvalidDesignError, what="a wing's names"
+    )
 
 
 RESERVED_NAMES = frozenset((*wing_names(()), "skin", "webs", "ribs"))
@@ -317,7 +319,7 @@ def parse_design(content: dict[str, Any], source: str = "the design") -> WingDes
         If the content is not a wing that can be built; the sentence names `source`, the key, what
         was found and what was expected.
     """
-    return checked(
+    return validate(
         WingDesign, content, source, InvalidDesignError, what="a wing design", first_index=0
     )
 

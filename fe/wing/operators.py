@@ -91,10 +91,12 @@ def outputs(gauges: sparse.csr_array, tip: FloatArray) -> OutputRows:
     tip : (full,) array
         Upward displacement at the tip.
     """
+    no_rows = sparse.csr_array((0, len(tip)))
     return OutputRows(
         gauge=gauges,
         displacement=sparse.csr_array(tip[np.newaxis]),
-        acceleration=sparse.csr_array((0, len(tip))),
+        acceleration=no_rows,
+        port=no_rows,
     )
 
 

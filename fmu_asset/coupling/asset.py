@@ -194,7 +194,7 @@ class CoupledFmus(Housing):
             values = self._fed(part, self._now, self._now)
             fed = {key: values[key] for key, port in part.fed.items() if port.end.component in known}
             with naming(name):
-                asset.reset(part.settings | tuned.get(name, {}), load=(self._held[name] | fed) or None)
+                asset.reset({**part.settings, **tuned.get(name, {})}, load=(self._held[name] | fed) or None)
                 self._now[self._spans[name]] = asset.observe().values
             known.add(name)
         self._before = self._now.copy()
@@ -399,7 +399,7 @@ class CoupledAsset(FmiAsset):
                     part.binding,
                     isolated=isolated,
                     step_timeout=step_timeout,
-                    parameters=part.settings | tuned.get(name, {}),
+                    parameters={**part.settings, **tuned.get(name, {})},
                 )
         for name in (name for group in plan.circles if iterations > 1 for name in group):
             if assets[name].state_method != "serialised":

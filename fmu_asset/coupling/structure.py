@@ -13,7 +13,7 @@ from fmu_asset.instances.plan import Interface
 
 CONNECTOR_KINDS = ("input", "output", "parameter")
 """What a connector of a system can be."""
-SettingValue = float | bool | str
+SettingValue = float | bool | str | bytes
 
 
 class Endpoint(NamedTuple):
@@ -28,12 +28,13 @@ class Endpoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """The value of a parameter, or the start value of an input; a text names an item of an enumeration.
+    """The value of a parameter, or the start value of an input.
 
     Attributes
     ----------
-    value : float, bool or str
-        The value.
+    value : float, bool, str or bytes
+        The value. A text is that of a parameter that is one, or names an item of an enumeration; nothing
+        takes bytes, which are refused where a variable would.
     unit : str or None
         Its unit; that of the variable if None.
     scale : Conversion

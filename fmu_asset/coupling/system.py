@@ -150,7 +150,7 @@ class Part:
         Whether its inputs move in straight lines over a step.
     substeps : int
         Its steps in a step of the system, as calls of its asset: of several with lines, the door makes these.
-    settings, constants : dict of str to float
+    settings, constants : dict of str to float or str, dict of str to float
         Parameters, and inputs that have a value from the start.
     binding : Binding
         Its own names and units.
@@ -162,7 +162,7 @@ class Part:
     moving: frozenset[str]
     linear: bool
     substeps: int
-    settings: dict[str, float]
+    settings: dict[str, float | str]
     constants: dict[str, float]
     binding: Binding
 
@@ -219,9 +219,12 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
         and wiring.declared[name].can_interpolate_inputs
         and (bool(moving) or any(variables[key].continuous for key in given))
     )
-    constants, settings = dict[str, float](), dict[str, float]()
-    for key, number in wiring.settings[name].items():
-        (constants if variables[key].causality == "input" else settings)[key] = number
+    constants, settings = dict[str, float](), dict[str, float | str]()
+    for key, value in wiring.settings[name].items():
+        if variables[key].causality == "input" and not isinstance(value, str):
+            constants[key] = value
+        else:
+            settings[key] = value
 
     def units(*groups: Iterable[str]) -> dict[str, str]:
         """Return the units of variables, each once."""

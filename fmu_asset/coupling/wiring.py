@@ -241,8 +241,8 @@ class Wiring:
         For each input and parameter of the system where it goes, for each output where it comes from.
     units : dict of str to (str or None)
         Unit of each connector: its own, or that of what it is connected to.
-    settings : dict of str to (dict of str to float)
-        Parameters and start values of each component, in the FMU's units.
+    settings : dict of str to (dict of str to float or str)
+        Parameters and start values of each component, in the FMU's units; a text of a parameter that is one.
     schedule : Schedule
         Order of the components, and algebraic loops.
 
@@ -377,19 +377,19 @@ class Wiring:
 
     # ------------------------------------------------------------------ parameters
 
-    def _settings(self, component: Component, leave_out_unknown: bool) -> dict[str, float]:
+    def _settings(self, component: Component, leave_out_unknown: bool) -> dict[str, float | str]:
         if component.substeps < 1:
             raise CouplingError(said("coupling.substeps", component=component))
-        settings = {}
+        settings: dict[str, float | str] = {}
         for name, setting in component.settings.items():
             if leave_out_unknown and self.declared[component.name].variable(name) is None:
                 self.left_out.append(f"{component.name}.{name}")
             else:
-                settings[name] = self.number(Endpoint(component.name, name), setting)
+                settings[name] = self.start_value(Endpoint(component.name, name), setting)
         return settings
 
-    def number(self, end: Endpoint, setting: Setting) -> float:
-        """Return a parameter or start value as a number in the FMU's unit.
+    def start_value(self, end: Endpoint, setting: Setting) -> float | str:
+        """Return a parameter or start value: a number in the FMU's unit, or the text of a text parameter.
 
         Raises
         ------
@@ -397,6 +397,16 @@ class Wiring:
             If there is no such parameter or input, or the value is of another type or unit.
         """
         variable = self.variable(end)
+        if not variable.is_text_parameter:
+            return self._start_number(end, variable, setting)
+        if not isinstance(setting.value, str):
+            raise CouplingError(
+                said("coupling.setting", end=end, value=setting.value, found=variable, wanted="a text")
+            )
+        return setting.value
+
+    def _start_number(self, end: Endpoint, variable: VariableInfo, setting: Setting) -> float:
+        """Return a parameter or start value as a number in the FMU's unit."""
         if variable.causality not in ("parameter", "input") and not variable.startable:
             raise CouplingError(f"{end} cannot be set: it is declared as {variable.causality}.")
         if not variable.single:
@@ -404,8 +414,8 @@ class Wiring:
             what = "is an array" if variable.shape else "changes with a clock" if variable.clocked else text
             raise CouplingError(f"{end} cannot be set: it {what}; only single numbers are set in a system.")
         value, own = setting.value, self.declared[end.component].units
-        if isinstance(value, str):
-            if value in variable.items:
+        if isinstance(value, str | bytes):
+            if isinstance(value, str) and value in variable.items:
                 return float(variable.items[value])
             wanted = variable.items or "a number"
             raise CouplingError(said("coupling.setting", end=end, value=value, found=variable, wanted=wanted))

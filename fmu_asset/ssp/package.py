@@ -16,6 +16,7 @@ from urllib.parse import unquote, urlsplit
 from lxml import etree
 
 from fe.runtime.arrays import archive_bytes
+from fmu_asset.archive.declared import VariableInfo
 from fmu_asset.archive.fmu_file import check_archive
 from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
@@ -300,14 +301,21 @@ def _parameters(
             name, kind = names.get(end, str(end)), variable.base_type
             if name in found:
                 raise SspError(said("ssp.parameter", name=name))
-            text = {
-                "Real": repr(value),
-                "Boolean": "true" if value else "false",
-                "Integer": str(int(value)),
-                "Enumeration": next((key for key, item in variable.items.items() if item == value), None),
-            }[kind]
-            if text is None:
-                raise SspError(f"{end} = {value:g} is no item of its enumeration.")
+            text = value if isinstance(value, str) else _written(end, variable, value)
             unit = variable.unit if kind == "Real" and variable.unit in units else None
             found[name] = {"name": name, "end": end, "type": kind, "value": text, "unit": unit}
     return list(found.values())
+
+
+def _written(end: Endpoint, variable: VariableInfo, value: float) -> str:
+    """Return the text of a number in a parameter set; that of an enumeration is the name of its item."""
+    if variable.base_type == "Real":
+        return repr(value)
+    if variable.base_type == "Boolean":
+        return "true" if value else "false"
+    if variable.base_type == "Integer":
+        return str(int(value))
+    for name, item in variable.items.items():
+        if item == value:
+            return name
+    raise SspError(f"{end} = {value:g} is no item of its enumeration.")

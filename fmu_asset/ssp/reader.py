@@ -1,7 +1,8 @@
 """Reading an SSP file: nested systems flattened, parameters and mappings applied, FMUs taken out.
 
 What SSP 1.0 allows and is not read is refused in a sentence: signal dictionaries, components that are systems
-of their own files, mappings of Booleans, integers and enumerations, texts and binary values.
+of their own files, mappings of Booleans, integers and enumerations, texts that are no
+parameters, binary values.
 Of SSP 2.0 the same is read; see `package`.
 """
 
@@ -288,6 +289,8 @@ class _Tree:
                 value = self._finite(value, f"the value of {name!r} of {where}")
             elif kind in ("Integer", "Boolean"):
                 value = int(value) if kind == "Integer" else _flag(item, "value")
+            elif kind == "Binary":
+                value = bytes.fromhex(value)
             found[name] = Setting(value, item.get("unit"), units=units)
         return found
 
@@ -308,7 +311,7 @@ class _Tree:
                 raise self._error(f"{where} maps two parameters to {target!r}; keep one of the two.")
             setting = values[source]
             if scale != IDENTITY:
-                if isinstance(setting.value, bool | str):
+                if isinstance(setting.value, bool | str | bytes):
                     raise self._error(f"{where} scales {source!r}, which is no number.")
                 setting = replace(setting, scale=scale)
             suppressed = _flag(entry, "suppressUnitConversion")

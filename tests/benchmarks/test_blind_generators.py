@@ -23,9 +23,9 @@ from benchmarks.blind.lumped_rig import model_text
 from benchmarks.blind.writing import write_case
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
-from discrepancy.models.interface import Conditions
-from discrepancy.models.sensing import observe
-from discrepancy.models.structures import WingModel
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
+from discrepancy.system.structures import WingModel
 from fe.runtime.patch import ModelPatch
 from tests.discrepancy.rigs import chosen, model_of, setting_of
 from tests.test_architecture import named_imports

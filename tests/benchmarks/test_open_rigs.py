@@ -19,8 +19,8 @@ from benchmarks.open_rigs.campaigns import ALONE, GAPS, SHARES, Bench, drawn, si
 from benchmarks.open_rigs.rigs import RIGS, Truth
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
-from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions
 from fe.runtime.patch import BoucWen, FreePlay, ModelPatch, Overflow, PowerDamping, PowerStiffness, Primitive
 from tests.refusals import Inputs
 

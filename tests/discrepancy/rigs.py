@@ -15,10 +15,11 @@ from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document import Origin
-from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_file import LumpedDescription
+from discrepancy.system.response import Conditions
 from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.provenance import collect_provenance
@@ -26,7 +27,7 @@ from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
 MODEL = "single_mass_rig"
-INPUTS = Inputs(Path(__file__).with_name("models"))
+INPUTS = Inputs(Path(__file__).with_name("system"))
 CAMPAIGNS = Inputs(Path(__file__).with_name("data"))
 
 

@@ -19,12 +19,12 @@ from discrepancy.files.verdict import read_patch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.model_choice import choose_model
-from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.sensing import observe
 from discrepancy.report.figures import ReportInput
-from discrepancy.search.strategy import search
+from discrepancy.search.whole_search import search
 from discrepancy.sources.examples import example_campaign, plan_of
+from discrepancy.system.lumped_file import SHIPPED_MODELS
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate

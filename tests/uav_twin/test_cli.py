@@ -315,9 +315,9 @@ def test_records_show_themselves_in_a_few_words(library_file):
     from calibration.wing.calibrate import WingCalibration
     from discrepancy.document import Origin
     from discrepancy.files.verdict import StoredVerdict
-    from discrepancy.models.fmu import FmuModel
-    from discrepancy.models.interface import Model
-    from discrepancy.models.structures import WingModel
+    from discrepancy.fmu_models.model import FmuModel
+    from discrepancy.system.interface import Model
+    from discrepancy.system.structures import WingModel
     from discrepancy.verdict import Verdict, VerdictKind
     from discrepancy.workflow import Investigation
 

@@ -16,6 +16,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.files.verdict import read_patch, read_verdict_file
 from discrepancy.model_choice import choose_model
+from discrepancy.search.strategy import Search
 from discrepancy.sources.examples import example_campaign, plan_for
 from tests import command_line
 from tests.command_line import Terminal, command, refused, said
@@ -264,6 +265,40 @@ def test_a_table_without_a_time_has_the_interval_that_is_stated():
     assert "b.csv has a column of times, and --interval came for it" in sentence
 
 
+def test_a_table_of_one_column_has_the_interval_that_is_stated():
+    cells = [f"{row % 5}.5" for row in range(9)]
+    Path("a.csv").write_text("\n".join(["acc [g]", *cells]) + "\n", "utf-8")
+    printed = said(*IMPORT, "a.csv", "--kind", "driven", "--column", "acc=acc", "--interval", "0.02")
+    assert "a.csv: driven; lines 2 to 10; decimal points" in printed
+    (trial,) = read_campaign("a").trials
+    assert trial.time.tolist() == [0.02 * k for k in range(9)]
+    np.testing.assert_allclose(trial.values[:, 0], [9.80665 * float(cell) for cell in cells], rtol=1e-14)
+
+
+def test_inputs_and_forces_keep_the_units_of_the_file():
+    """Of inputs in `[[input]]`, and of the force of a forced trial in `force_unit`."""
+    rows = "".join(f"{k / 100},{k},{k % 3}\n" for k in range(9))
+    Path("push.csv").write_text(f"time [s],pull [lbf],x [in]\n{rows}", "utf-8")
+    given = (*IMPORT, "push.csv", "--column", "x=x")
+    said(
+        *given, "--kind", "driven", "--column", "pull=input:pull", "--zero", "pull=0.5lbf", "--out", "driven"
+    )
+    said(*given, "--kind", "forced", "--column", "pull=force", "--out", "forced")
+    pounds = 4.4482216152605
+    for kind, word in (("driven", "pull"), ("forced", "force")):
+        head, _, third, *_ = Path(kind, "01_push.csv").read_text("utf-8").splitlines()
+        assert (head, third) == (f"time,{word},x", "0.01,1.0,1.0")
+        (trial,) = read_campaign(kind).trials
+        np.testing.assert_allclose(trial.force, pounds * np.arange(9.0), rtol=1e-14)
+    (pull,) = read_campaign("driven").trials[0].inputs
+    assert (pull.unit, pull.offset_deviation) == ("lbf", pytest.approx(0.5 * pounds, rel=1e-14))
+    assert 'force_unit = "lbf"' in Path("forced/campaign.toml").read_text("utf-8")
+    toml = Path("forced/campaign.toml").read_text("utf-8").replace('"lbf"', '"mm"')
+    Path("forced/campaign.toml").write_text(toml, "utf-8")
+    sentence = refused("discrepancy", "check", "forced", *RIG)
+    assert "force must have a unit such as N, mN or kN, and 'mm' came" in sentence
+
+
 @pytest.mark.parametrize(
     ("scale", "in_newtons"), [("200 N/V", 100.0), ("0.2 kN/V", 100.0), ("200 N/mV", 1e5), ("-2 kN/V", -1e3)]
 )
@@ -339,6 +374,38 @@ def test_from_an_example_to_a_verdict(campaign, tmp_path):
     assert str(tmp_path) not in page
     # a second time: only on demand (that it comes to the same conclusion is tested in test_workflow.py)
     assert "--replace" in refused("discrepancy", "run", str(campaign), *RIG, "--out", str(out))
+
+
+def test_an_interrupted_search_keeps_what_it_has_found(campaign, tmp_path):
+    """Ctrl-C comes when single effects are compared; another run takes the place of what was kept."""
+    out = tmp_path / "verdict"
+    run = ("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--no-report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Search, "sets", interrupt)
+        words = refused(*run, code=130)
+    kept = out / "verdict_so_far.json"
+    assert f"Interrupted; the hypotheses fitted until then are in {kept}." in words
+    record = json.loads(kept.read_text(encoding="utf-8"))
+    assert record["schema"] == "uav-twin verdict so far 1"
+    assert record["hypotheses"][0]["effects"][0]["identifier"] == "seating_offset"
+    assert sum(item["probability"] for item in record["hypotheses"]) == pytest.approx(1.0, abs=1e-3)
+    said(*run)
+    assert not kept.exists()
+    assert (out / "verdict.json").is_file()
+
+
+def test_a_search_that_is_interrupted_before_it_has_found_anything_leaves_no_folder(campaign, tmp_path):
+    out = tmp_path / "verdict"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("discrepancy.workflow.check_data", interrupt)
+        words = refused("discrepancy", "run", str(campaign), *RIG, "--out", str(out), code=130)
+    assert "Interrupted." in words
+    assert not out.exists()
+
+
+def interrupt(*_: object) -> None:
+    """Do what Ctrl-C does."""
+    raise KeyboardInterrupt
 
 
 def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path):

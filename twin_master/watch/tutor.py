@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from fe.runtime.patch import SensorSaturation
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.network.estimator import Notice
@@ -28,7 +29,8 @@ LEAST_GAIN = 3.0
 GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
-alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
+alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out. A
+group of which some members saturate is not tried: they agree at the loads of the search, and at no other."""
 ABSOLUTE_FIT = "absolute fit"
 """Gate of a verdict that says whether what is named leaves noise alone."""
 SEARCH = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
@@ -180,14 +182,27 @@ def caveats_of(verdict: Mapping[str, Any]) -> list[str]:
     Returns
     -------
     list of str
-        The reasons of the gates that failed, and of an absolute fit that was not tested; empty where none.
+        The reasons of the gates that failed, of an absolute fit that was not tested, and of a group whose
+        members differ at other loads; empty where none.
     """
     gates = verdict["gates"]
     caveats = [str(gate["reason"]) for gate in gates if gate["passed"] is False]
     tested = [gate for gate in gates if gate["name"] == ABSOLUTE_FIT and gate["passed"] is not None]
     if not tested:
         caveats.append("Whether it leaves noise alone was not tested.")
+    if verdict["kind"] == GROUP and has_some_saturating_members(verdict):
+        caveats.append(
+            "A sensor that saturates and the other effects of the group differ at other loads, and these "
+            "turns do not tell them apart; more turns at more than one load may."
+        )
     return caveats
+
+
+def has_some_saturating_members(verdict: Mapping[str, Any]) -> bool:
+    """Return whether some effects of a group are sensors that saturate, and others are not."""
+    kinds_of_effects = [{item["kind"] for item in effect["patch"]} for effect in verdict["effects"]]
+    saturating = [SensorSaturation.kind in kinds for kinds in kinds_of_effects]
+    return any(saturating) and not all(saturating)
 
 
 def command_to_believe(place: str, first: int) -> str:

@@ -21,10 +21,10 @@ from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import mains_lines
 from discrepancy.errors import CatalogueError
-from discrepancy.models.interface import ACROSS, Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.sensing import observe
 from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import ACROSS, Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime import patch as patches
 from fe.runtime.patch import FreePlay, LoadGain, ModelPatch, PointMass, PowerStiffness, SensorGain
 from tests.discrepancy.rigs import INPUTS, asked, campaign, chosen, model_of, seen, setting_of
@@ -172,8 +172,28 @@ def test_sizes_in_closed_form(setting):
          patches.RunOffset("B", pytest.approx(0.02 * 30.0 / scales.tip_stiffness))),
         ("gauge_zero_drift", {"drift_ratio": 0.1}, "g1",
          patches.SensorDrift("g1", pytest.approx(0.1 * largest), scales.campaign_time)),
+        ("sensor_saturation", {"lost_share": 1.0 / 12.0}, "g1",
+         patches.SensorSaturation("g1", pytest.approx(2.0 * largest))),
     ):  # fmt: skip
         assert only(setting, identifier, values, place) == primitive
+
+
+def test_saturation_loses_its_share_and_all_channels_of_a_quantity_have_one_limit(setting):
+    (saturation,) = chosen("sensor_saturation")
+    assert saturation.places(setting) == ("all strain", "tip", "g0", "g1", "g2")
+    every = only(setting, "sensor_saturation", {"lost_share": 0.01}, "all strain")
+    strains = [trial.values[:, 1:] for trial in setting.campaign.trials]
+    largest = max(float(np.abs(values).max()) for values in strains)
+    assert (every.channel, every.quantity) == (patches.EVERY_CHANNEL, "strain")
+    assert every.limit == pytest.approx(largest / np.sqrt(0.03))
+    lost = 1.0 - every.limit * np.tanh(largest / every.limit) / largest
+    assert lost == pytest.approx(0.01, rel=0.02)
+    for trial in setting.campaign.trials:
+        values = shown(setting, trial, ModelPatch((every,)))
+        np.testing.assert_array_equal(values[:, 0], trial.values[:, 0])
+        wanted = every.limit * np.tanh(trial.values[:, 1:] / every.limit)
+        np.testing.assert_allclose(values[:, 1:], wanted, rtol=1e-12, atol=1e-18)
+    assert saturation.patch(setting, {"lost_share": 0.0}, "g0") == ModelPatch()
 
 
 def test_observations_are_responses_through_the_sensors_of_a_patch(setting):
@@ -293,6 +313,21 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory():
     assert chosen("quadratic_damping")[0].unavailable(setting) is None
     still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
     assert model.scales(still).ports["air"].turns
+
+
+@pytest.mark.parametrize(
+    ("other", "places"), [("root", ("tip",)), ("span", ("tip", "span")), ("joint", ("tip", "joint"))]
+)
+def test_a_port_stands_for_the_others_of_a_wing_alone(other, places):
+    """A model with a port of another name is no wing: at all of its ports an effect is tried."""
+    ports = f"""
+        port = [{{ name = "tip", vector = [0.0, 1.0] }}, {{ name = "{other}", vector = [1.0, 0.0] }}]
+        """
+    text = INPUTS.text("two_masses.toml", ("[damping]", f"{ports}\n[damping]"))
+    model = model_of(text)
+    load = asked(TrialKind.STATIC, np.zeros(3), force=np.array([0.0, 0.1, 0.2]), load_place="in")
+    setting = setting_of(campaign(load, x=Channel("x", Quantity.DISPLACEMENT, "x", None)), model)
+    assert chosen("cubic_stiffness")[0].places(setting) == places
 
 
 ALL, BOTH = {"all": ("shaker", "laser", "camera")}, {"rack": ("shaker", "laser"), "film": ("camera",)}

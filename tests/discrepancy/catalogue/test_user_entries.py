@@ -15,8 +15,8 @@ from discrepancy.campaign.writing import write_campaign
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
 from discrepancy.errors import CatalogueError
-from discrepancy.models.interface import Conditions
-from discrepancy.models.sensing import observe
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import PointMass
 from tests.discrepancy.rigs import campaign_folder, one_mass, setting_of
 from tests.refusals import Inputs, refused

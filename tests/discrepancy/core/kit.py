@@ -15,9 +15,11 @@ from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import Conditions, Model, PortScale, Response, Scales
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.sensing import observe
+from discrepancy.system.interface import Model
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions, Response
+from discrepancy.system.scales import PortScale, Scales
+from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch, RunOffset, SensorDrift
 from tests.discrepancy.rigs import chosen, hiding, setting_of
 

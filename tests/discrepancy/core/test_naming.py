@@ -16,7 +16,7 @@ from discrepancy.judgement.naming import Case, name
 from discrepancy.missing_force.shares import OF_READINGS, Share
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
-from fe.runtime.patch import ModelPatch
+from fe.runtime.patch import ModelPatch, SensorSaturation
 from tests.refusals import Inputs
 
 from . import kit
@@ -119,6 +119,24 @@ def test_the_verdict_on_what_is_hidden(case, seed):
         ((_, values, place),) = (item for item in hidden if item[0] == effect.identifier)
         assert effect.place == place
         assert_held(effect, values)
+
+
+@pytest.mark.parametrize("place", ["g1", "all strain"])
+def test_a_sensor_that_saturates_is_named_with_its_limit(place):
+    """A softening spring, a gain and a mass are beside it; one limit for all strain is no sum of gauges."""
+    limit, rivals = 2e-4, RIVALS["soft or saturated"]
+    channel, quantity = ("*", "strain") if place == "all strain" else (place, "")
+    hidden = SensorSaturation(channel, limit, quantity)
+    verdict, _, _ = name(SMALL.problem(11, ModelPatch((hidden,))), rivals)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert all(gate.passed is not False for gate in verdict.gates)
+    (effect,) = verdict.effects
+    assert (effect.identifier, effect.place) == ("sensor_saturation", place)
+    (primitive,) = effect.patch
+    assert (primitive.channel, primitive.quantity) == (channel, quantity)
+    (share,) = effect.parameters
+    # the limit goes with one over the root of the share; the interval is widened to 99.9 %
+    assert abs(np.log(primitive.limit / limit)) <= 0.5 * np.log(share.high / share.low)
 
 
 def assert_held(effect, values):

@@ -11,9 +11,9 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import whiteness_tests
 from discrepancy.judgement import in_part
-from discrepancy.models.interface import Conditions
-from discrepancy.models.sensing import observe
 from discrepancy.search.strategy import Search
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import Clock, ModelPatch, PowerDamping, Window
@@ -168,6 +168,17 @@ def test_a_group_needs_probability_evidence_and_members_that_fit(monkeypatch, pr
     monkeypatch.setattr(in_part, "_unexplained", lambda *given: "unexplained")
     monkeypatch.setattr(in_part, "named_effects", lambda *given: ())
     assert in_part._verdict_of(TwoRivals(probability, gain, fits), None) == kind
+
+
+@pytest.mark.parametrize(
+    ("probability", "gain", "reason"),
+    [(0.5, 20.0, ""), (0.99, 1.5, "explains the readings as well (ln Bayes factor 1.5; a name needs 3)")],
+)
+def test_what_speaks_against_a_name_is_the_probability_or_the_evidence(
+    monkeypatch, probability, gain, reason
+):
+    monkeypatch.setattr(in_part, "_unexplained", lambda court, first, close, why="": why)
+    assert in_part._verdict_of(TwoRivals(probability, gain, True), None).endswith(reason)
 
 
 # ---------------------------------------------------------------- whiteness

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from discrepancy.system.lumped_model import LumpedModel
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
 from discrepancy.files.verdict import read_verdict
@@ -20,7 +21,7 @@ from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
 from fe.runtime.patch import PowerDamping
 from tests.discrepancy.bench import Bench
-from tests.discrepancy.rigs import ORIGIN, chosen, integrated, measured, model_of
+from tests.discrepancy.rigs import ORIGIN, chosen, integrated, measured, model_of, simulated
 from tests.refusals import Inputs
 
 from . import kit
@@ -153,6 +154,7 @@ def test_gains_and_zeros_are_named_too():
 
 
 FRICTION, CUBIC = "coulomb_friction", "cubic_stiffness"
+ROOT, CRACK = "root_compliance", "breathing_crack"
 
 
 def rig(drag=0.0, kind="laboratory", **changes):
@@ -174,6 +176,12 @@ def with_fault():
     return campaign, model
 
 
+def compliant_root(share):
+    """Return static trials of a chain whose root is more compliant, which a crack there resembles."""
+    model = LumpedModel.load("three_mass_chain")
+    return simulated(model, "static", 3, (ROOT, {"compliance_share": share}, "")), model
+
+
 CAMPAIGNS = {
     "named": (lambda: rig(0.01), ("quadratic_damping", FRICTION)),
     "named without a noise record": (lambda: rig(0.01, noise=None), ("quadratic_damping",)),
@@ -186,14 +194,19 @@ CAMPAIGNS = {
     "wide gains": (lambda: rig(0.01, gain_deviation=0.3), ("quadratic_damping", "gauge_gain")),
     "two rivals": (lambda: rig(0.002), ("quadratic_damping", FRICTION, "structural_damping")),
     "data error": (with_fault, (FRICTION,)),
+    "group": (lambda: compliant_root(0.11), (ROOT, CRACK)),
+    "below limit": (lambda: compliant_root(0.05), (ROOT, CRACK)),
 }
+ENDS_IN = {"group": VerdictKind.GROUP, "below limit": VerdictKind.BELOW_LIMIT}
+"""Kinds of verdict of campaigns that are there for these."""
 
 
 @pytest.mark.parametrize("case", CAMPAIGNS)
 def test_the_record_of_proof_is_what_the_residuals_show(case, tmp_path):
-    """In eleven kinds of verdict: share and errors of sentence and file are those of residuals.nc."""
+    """In thirteen campaigns: share and errors of sentence and file are those of residuals.nc."""
     made, effects = CAMPAIGNS[case]
     found = investigate(*made(), chosen(*effects), thorough=False)
+    assert found.verdict.kind is ENDS_IN.get(case, found.verdict.kind), found.verdict.sentence
     write_verdict_folder(tmp_path / "verdict", ReportInput(found, ORIGIN), report=False)
     stored = read_verdict(tmp_path / "verdict")
     if stored.proof is None:

@@ -14,10 +14,10 @@ from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.judgement.separability import as_predicted
-from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.sensing import observe
 from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share, without_port
 from fe.runtime.patch import ModelPatch, PowerDamping, Window

@@ -14,8 +14,8 @@ from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
 from discrepancy.checks.quality import _freedom, check_data, clipped_run
 from discrepancy.errors import ModelError
-from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import ExamplePlan, example_campaign, plan_for, write_example
+from discrepancy.system.lumped import LumpedModel
 from fe.runtime import patch as patches
 from fe.runtime.patch import ModelPatch, SensorGain
 from tests.discrepancy.core import kit

@@ -318,7 +318,7 @@ def test_what_is_no_unit_of_ours_is_of_no_quantity_and_a_ratio_of_volts_a_signal
 
 @pytest.mark.parametrize(
     ("name", "what"),
-    [("a.mat", "MATLAB"), ("a.XLS", "before 2007"), ("a.tdms", "TDMS"), ("a.uff", "universal file")],
+    [("a.XLS", "before 2007"), ("a.tdms", "TDMS"), ("a.uff", "universal file")],
 )
 def test_a_format_that_is_not_read_is_named_with_the_way_round(tmp_path, name, what):
     file = tmp_path / name

@@ -9,15 +9,16 @@ from scipy.linalg import expm
 from benchmarks.force_events import KINDS, counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.conclusion import begins_inside, when_sentence
-from discrepancy.missing_force.events import EventSearch, SwitchedRecord
+from discrepancy.missing_force.events import EventSearch
+from discrepancy.missing_force.explained import seen
 from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
-from discrepancy.missing_force.naming import seen
 from discrepancy.missing_force.shares import _noise
+from discrepancy.missing_force.switched_record import SwitchedRecord
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
 from discrepancy.missing_force.windows import _most_telling, residual_windows
-from discrepancy.models.interface import PortedSystem
 from discrepancy.report.residual_figures import time_line_figure
+from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate
 from tests.discrepancy.bench import Bench
@@ -240,7 +241,7 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
     search = EventSearch(View([trial], np.zeros(0)), 0, EVENT)
     switched = SwitchedRecord(search, 0, (EVENT, REST))
     starts, ends = np.array([0, 7, 20]), np.array([9, 26, 40])
-    values = switched.ways(np.zeros(40, dtype=bool), starts, ends)
+    values = switched.evidence_by_ends(np.zeros(40, dtype=bool), starts, ends)
     always = dense(trial, REST)[0] + np.eye(80) + np.outer(local.ravel(), local.ravel())
     for a, start in enumerate(starts):
         for b, end in enumerate(ends):
@@ -252,7 +253,7 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
             assert values[a, b] == pytest.approx(gaussian(covariance, residual.ravel()), abs=0.05)
             on = np.zeros(40, dtype=bool)
             on[start:end] = True
-            assert search.evidence([switched.whole(on)]) == pytest.approx(values[a, b], abs=1e-7)
+            assert search.evidence([switched.products(on)]) == pytest.approx(values[a, b], abs=1e-7)
 
 
 @pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
@@ -263,7 +264,7 @@ def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(
     search = EventSearch(View([trial], np.zeros(0)), 0, EVENT)
     for on, forces in ((False, [REST]), (True, [EVENT, REST])):
         wanted = evidence(Filtered(trial, [(0, one) for one in forces]))
-        found = search.evidence(search.told((EVENT, REST), [np.full(40, on)]))
+        found = search.evidence(search.products((EVENT, REST), [np.full(40, on)]))
         assert found == pytest.approx(wanted, abs=1e-7)
 
 

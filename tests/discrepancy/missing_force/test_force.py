@@ -16,17 +16,18 @@ from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
+from discrepancy.fmu_models.model import FmuModel
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
 from discrepancy.missing_force.shares import ForceShares, missing_force, order_of
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
-from discrepancy.models.fmu import FmuModel
-from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence
-from discrepancy.search.strategy import Search, search
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import search
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness

@@ -14,8 +14,10 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.model_choice import ModelChoice, ModelKind
-from discrepancy.models.interface import Model, Response, Scales
 from discrepancy.parameters.calibration import calibrate_parameters
+from discrepancy.system.interface import Model
+from discrepancy.system.response import Response
+from discrepancy.system.scales import Scales
 from tests.discrepancy.core import kit
 
 FORCE = np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])

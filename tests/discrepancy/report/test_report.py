@@ -20,7 +20,6 @@ from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import primitive_intervals, read_patch, read_verdict, read_verdict_file
 from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
-from discrepancy.models.structures import WingModel
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import parameter_rows, render_report
 from discrepancy.report.residual_figures import gauge_places, planform_figure
@@ -37,6 +36,7 @@ from discrepancy.report.text import (
     share_text,
     si_sizes,
 )
+from discrepancy.system.structures import WingModel
 from discrepancy.verdict import NotFitted, RemainderEstimate, Verdict, VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
 from fe.runtime import patch as patches
@@ -171,7 +171,9 @@ def test_what_can_be_decided(drag, able):
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
     told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
-    said = list(WORDS.told(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told))
+    said = list(
+        WORDS.rendered_blocks(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told)
+    )
     assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
     confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
     assert len(confused) == sum(bool(neighbours(able, name)) for name in able.identifiers)

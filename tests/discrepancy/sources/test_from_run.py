@@ -14,9 +14,9 @@ from benchmarks.study_hidden_effects import fly_mission
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import choice_of_run
-from discrepancy.models.interface import Conditions
-from discrepancy.models.sensing import observe
 from discrepancy.sources.from_run import held_out_turns, run_campaign, run_model
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PointMass, SensorDrift, SensorGain, SensorRotation

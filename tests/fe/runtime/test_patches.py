@@ -130,6 +130,22 @@ def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, tri
         assert values[:, changed] == pytest.approx(VALUES[:, changed] + 1e-3)
 
 
+def test_a_saturating_sensor_shows_the_formula_and_its_derivative():
+    """Rates are those by finite differences; far below the limit nothing changes; windows leave the rest."""
+    item = patch.SensorSaturation("*", 2e-3, "strain")
+    values, rates = shown(item)
+    assert values[:, 1:] == pytest.approx(2e-3 * np.tanh(VALUES[:, 1:] / 2e-3), rel=1e-14)
+    step = 1e-6
+    ahead, behind = (
+        applied(ModelPatch((item,)), RECORD, VALUES + side * step * RATES, RATES)[0] for side in (1.0, -1.0)
+    )
+    assert rates == pytest.approx((ahead - behind) / (2.0 * step), abs=1e-9 * np.abs(RATES).max())
+    far, _ = shown(replace(item, limit=1e6))
+    assert far == pytest.approx(VALUES, rel=1e-12)
+    late, _ = shown(replace(item, windows=(patch.Window("a", 1.0, None),)))
+    assert np.array_equal(late, np.where(TIME[:, np.newaxis] < 1.0, VALUES, values))
+
+
 def test_drift_by_kind_of_trial_and_exponent():
     drifted = shown(SensorDrift("tip", 1.0, 50.0), record=replace(STATIC, time=100.0 * TIME))[0][:, 0]
     assert drifted == pytest.approx(VALUES[:, 0] + 2.0 * TIME)

@@ -117,6 +117,85 @@ def test_physical_groups_of_gmsh_are_sets(tmp_path):
     refuses(tmp_path / "m.vtu", r"m\.vtu: 2 elements, such as 13, have the nodes of another")
 
 
+def saved_all(path: Path, groups: list[list[int]], cells: np.ndarray, points: np.ndarray) -> None:
+    """Write edges, faces and tetrahedra with their physical groups as Gmsh does with Mesh.SaveAll = 1."""
+    edges = [cell[:2] for cell in cells.tolist()[:4]]
+    faces = [[cell[n] for n in face] for cell in cells.tolist() for face in KINDS["tetra"].face_nodes]
+    faces = [row for row in faces if (points[row, 0] == 0.0).all()]
+    blocks = [("line", edges), ("triangle", faces), ("tetra", cells)]
+    geometrical = [[number] * len(rows) for number, (_, rows) in enumerate(blocks, start=1)]
+    data = {"gmsh:physical": groups, "gmsh:geometrical": geometrical}
+    names = {"body": np.array([1, 3]), "wall": np.array([7, 2])}
+    mesh = meshio.Mesh(points, blocks, cell_data=data, field_data=names)
+    meshio.write(path, mesh, file_format="gmsh22", binary=False)
+
+
+def test_elements_of_gmsh_without_a_physical_group_are_left_out(tmp_path):
+    """Solid ones stay where no solid element has a group: then groups are of faces alone."""
+    points, cells = box("tetra", (2, 1, 1))
+    half = len(cells) // 2
+    path = tmp_path / "m.msh"
+    saved_all(path, [[0] * 4, [7] * 2, [1] * half + [0] * half], cells, points)
+    mesh = read_mesh(path, 1.0, "m")
+    np.testing.assert_array_equal(mesh.nodes, points[cells[:half]])
+    assert {*mesh.cell_sets} | {*mesh.node_sets} == {
+        "body",
+        "wall",
+        "gmsh:geometrical=2",
+        "gmsh:geometrical=3",
+    }
+    (remark,) = mesh.remarks
+    assert f"{half + 4} elements of no physical group are left out; set Mesh.SaveAll = 0" in remark
+    saved_all(path, [[0] * 4, [7] * 2, [0] * len(cells)], cells, points)
+    mesh = read_mesh(path, 1.0, "m")
+    assert len(mesh.cells) == len(cells)
+    saved_all(path, [[0] * 4, [0] * 2, [0] * len(cells)], cells, points)
+    assert (len(read_mesh(path, 1.0, "m").cells), read_mesh(path, 1.0, "m").remarks) == (len(cells), ())
+
+
+ALL_SAVED = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+1
+3 1 "body"
+$EndPhysicalNames
+$Entities
+0 0 1 1
+5 0 0 0 1 1 0 0 0
+1 0 0 0 1 1 1 1 1 0
+$EndEntities
+$Nodes
+1 4 1 4
+3 1 0 4
+1
+2
+3
+4
+0 0 0
+1 0 0
+0 1 0
+0 0 1
+$EndNodes
+$Elements
+2 2 1 2
+2 5 2 1
+1 1 2 3
+3 1 4 1
+2 1 2 3 4
+$EndElements
+"""
+"""Of version 4: a tetrahedron in a physical group, and one of its faces in none."""
+
+
+def test_a_file_of_gmsh_of_version_4_with_all_saved_is_refused_with_the_remedy(tmp_path):
+    path = tmp_path / "m.msh"
+    path.write_text(ALL_SAVED)
+    refuses(path, r"m\.msh: some elements are in a physical group and others in none, .* Mesh.SaveAll = 0")
+    path.write_text(ALL_SAVED.replace("5 0 0 0 1 1 0 0 0", "5 0 0 0 1 1 0 1 7 0"))
+    assert read_mesh(path, 1.0, "m").cells_of("body", "here").tolist() == [0]
+
+
 @pytest.mark.parametrize("file_format", ["gmsh22", "gmsh"])
 def test_a_doubled_line_of_gmsh_loses_no_element(file_format, tmp_path):
     """The count in the file stays what it was, so that its last element would not be read."""
@@ -272,6 +351,28 @@ def test_a_continuation_of_nastran_goes_to_the_line_with_its_marker(marker, tmp_
     assert hexahedron.fields[2:10] == list("12345678")
     assert point.fields[2:5] == ["0."] * 3
     assert not any(point.fields[5:])
+
+
+@pytest.mark.parametrize("end", ["", "+C"])
+def test_a_continuation_of_nastran_may_stand_before_its_line(end, tmp_path):
+    """Also a chain of two, and behind a line that goes on, or not, by itself."""
+    first = "CHEXA          1       1       1       2       3       4       5       6+A"
+    middle = "+A             7       8       9      10      11      12      13      14+B"
+    last = "+B            15      16      17      18      19      20"
+    grid = f"{'GRID           1              0.      0.      0.':72}{end}"
+    lines = [grid, last, middle, first, *(["+C             5"] if end else [])]
+    (tmp_path / "m.bdf").write_text("\n".join(lines))
+    point, hexahedron = cards(tmp_path / "m.bdf")
+    nodes = [field for field in hexahedron.fields[2:] if field]
+    assert nodes == [str(number) for number in range(1, 21)]
+    assert [field for field in point.fields if field] == ["1", "0.", "0.", "0.", *(["5"] if end else [])]
+
+
+def test_a_continuation_of_nastran_that_continues_nothing_is_refused(tmp_path):
+    lines = ["GRID,1,,0.,0.,0.,,,+A", "+B,7,8", "GRID,2,,0.,0.,1."]
+    (tmp_path / "m.bdf").write_text("\n".join(lines))
+    with refused(MeshError, r"line 2: the continuation '\+B' stands behind no line that it continues"):
+        cards(tmp_path / "m.bdf")
 
 
 def test_real_numbers_and_lines_of_nastran(tmp_path):

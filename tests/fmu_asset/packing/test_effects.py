@@ -13,8 +13,8 @@ from fmpy import read_model_description
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
-from discrepancy.models.interface import ACROSS, Conditions
-from discrepancy.models.structures import WingModel
+from discrepancy.system.response import ACROSS, Conditions
+from discrepancy.system.structures import WingModel
 from fe.high_pass import filtered_record
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors
@@ -120,6 +120,16 @@ def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, patched, mo
     scale = np.abs(wanted).max(axis=0) if moving else np.abs(wanted)
     assert (np.abs(shown - wanted) <= (1e-12 if moving else 1e-13) * scale).all()
     assert not np.allclose(shown, plain)
+
+
+def test_gauges_that_saturate_show_the_formula_and_displacements_stay(fmu, sensing) -> None:
+    """One limit for all gauges, of an order with the strains; a displacement has a limit of its own."""
+    rows = [(n, 0.0) for n in (1.0, 3.0, -2.0)]
+    plain, shown = flown(fmu, rows), flown(sensing, rows, **on("saturation"))
+    assert np.abs(plain[:, :24]).max() > 2e-3
+    np.testing.assert_allclose(shown[:, :24], 4e-3 * np.tanh(plain[:, :24] / 4e-3), rtol=1e-13)
+    np.testing.assert_allclose(shown[:, 24], 0.9 * np.tanh(plain[:, 24] / 0.9), rtol=1e-13)
+    np.testing.assert_array_equal(shown[:, 25], plain[:, 25])
 
 
 def test_switches_and_values_change_between_steps(sensing, fmu) -> None:

@@ -122,7 +122,7 @@ def test_the_flight_of_a_watched_fmu_in_python_is_the_same_and_no_file_is_refuse
 )
 def test_a_watched_worker_ends_with_all_that_it_has_started(foreign_fmu, scratch, case) -> None:
     with watch_for_refusals() as report:
-        fly(FmiAsset(foreign_fmu("hostile2", *case), HOSTILE, step_timeout=1.0))
+        fly(FmiAsset(foreign_fmu("hostile2", *case), HOSTILE, step_timeout=5.0))
         await_nothing(scratch)
         assert report.sentence() == "The sandbox refused nothing."
 

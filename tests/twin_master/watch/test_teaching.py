@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fe.runtime.patch import SensorGain
+from fe.runtime.patch import ModelPatch, SensorGain, SensorSaturation
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
 from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
@@ -43,7 +43,7 @@ if kind is None:
 place = out.with_name("." + out.name)
 place.mkdir()
 gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves noise alone."}]
-verdict = {"kind": kind, "sentence": "It is so.", "gates": gates}
+verdict = {"kind": kind, "sentence": "It is so.", "gates": gates, "effects": []}
 (place / "verdict.json").write_text(json.dumps({"verdict": verdict}))
 (place / "patch.json").write_text(json.dumps(patch))
 place.rename(out)
@@ -200,6 +200,26 @@ def test_a_name_without_an_absolute_fit_is_not_tried_and_the_notice_says_why(tmp
     assert "To believe it none the less: uav-twin watch --resume" in sentence
 
 
+@pytest.mark.parametrize(
+    ("members", "tried"),
+    [
+        ([SensorSaturation("g17", 7e-3), SensorGain("g17", -0.12)], False),
+        ([SensorGain("g17", -0.12), SensorGain("g18", -0.1)], True),
+        ([SensorSaturation("g17", 7e-3), SensorSaturation("g18", 7e-3)], True),
+    ],
+)
+def test_a_group_that_differs_at_other_loads_is_not_tried(tmp_path, members, tried):
+    """Gauge 17 showed 12 % too little; saturation was the most probable of its group, and was adopted."""
+    gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves noise alone."}]
+    folder = verdict_folder(tmp_path / "verdict", gates)
+    effects = [{"patch": ModelPatch((member,)).to_list()} for member in members]
+    verdict = {"kind": "group", "sentence": "Either is missing.", "gates": gates, "effects": effects}
+    (folder / "verdict.json").write_text(json.dumps({"verdict": verdict}))
+    found = verdict_of(folder, tmp_path / "log", 3, 13, "turn")
+    assert found["tried"] is tried
+    assert ("more turns at more than one load may" in found["notice"]["sentence"]) is not tried
+
+
 @pytest.fixture(scope="module")
 def saturated(mission, tmp_path_factory) -> Path:
     """The mission as gauges recorded it that all saturate softly, from the first turn on."""
@@ -334,6 +354,17 @@ def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_pat
     observed = taught.sensor_model.mean[0, 0]
     rewards, _ = taught.rewards.expectation(known_control(taught.model.prior, 0, 2), observed)
     assert rewards[2] > -0.2  # readings are compared with readings
+
+
+def test_gauges_taught_to_saturate_make_no_wing_healthier(base, tmp_path):
+    """What is expected of the gauges saturates; health, rewards and policy go by the strain itself."""
+    record = json.dumps(patch_record(SensorSaturation("*", 4e-3, "strain")))
+    file = written(tmp_path, record, name="saturation.json")
+    known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
+    strains, shown = known.sensor_model.value_per_draw, taught.sensor_model.value_per_draw
+    np.testing.assert_allclose(shown, 4e-3 * np.tanh(strains / 4e-3), rtol=1e-9)
+    np.testing.assert_allclose(taught.rewards.health_per_draw, known.rewards.health_per_draw, rtol=1e-9)
+    np.testing.assert_array_equal(taught.plan.policy, known.plan.policy)
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:

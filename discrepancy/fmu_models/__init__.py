@@ -1,0 +1,1 @@
+"""FMUs as models of a campaign."""

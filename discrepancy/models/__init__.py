@@ -1,1 +1,0 @@
-"""Models that a campaign can be compared with, behind one interface."""

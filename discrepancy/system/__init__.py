@@ -1,0 +1,1 @@
+"""Models of a campaign as linear systems with laws at ports, behind one interface, and their sensors."""

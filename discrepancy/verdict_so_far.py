@@ -1,0 +1,85 @@
+"""What an interrupted search has found: `verdict_so_far.json`, in the folder of the verdict to come."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from discrepancy.document import Origin, write_document
+from discrepancy.judgement.conclusion import hypothesis
+from discrepancy.search.strategy import Search
+from discrepancy.verdict import Hypothesis
+
+SO_FAR_SCHEMA = "uav-twin verdict so far 1"
+"""Value of the key `schema`."""
+SO_FAR_NAME = "verdict_so_far.json"
+MOST_HYPOTHESES = 20
+"""Hypotheses that are written, the most probable first."""
+
+
+@dataclass(frozen=True)
+class VerdictSoFar:
+    """Content of verdict_so_far.json.
+
+    Attributes
+    ----------
+    remark : str
+        What these figures are not.
+    hypotheses : tuple of Hypothesis
+        As in verdict.json, the most probable first; one without effects is the model as it is.
+    origin : Origin
+        Campaign, model and command.
+    """
+
+    remark: str
+    hypotheses: tuple[Hypothesis, ...]
+    origin: Origin
+
+
+REMARK = (
+    "The search was interrupted: probabilities are among the hypotheses fitted until then, no gate was "
+    "applied, and nothing was proved on held-out trials."
+)
+
+
+@dataclass
+class SearchInProgress:
+    """Remembers the searches of an investigation while they go on.
+
+    Attributes
+    ----------
+    searches : list of Search
+        In the order in which they began; the last one goes on.
+    """
+
+    searches: list[Search] = field(default_factory=list)
+
+    def begin(self, search: Search) -> None:
+        """Remember a search that begins."""
+        self.searches.append(search)
+
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """Return what the latest search has fitted, the most probable first; nothing before it has begun."""
+        if not self.searches:
+            return ()
+        search = self.searches[-1]
+        probabilities = list(search.set_probabilities().items())[:MOST_HYPOTHESES]
+        return tuple(
+            hypothesis(search.problem, search.best_of(identifiers), probability)
+            for identifiers, probability in probabilities
+        )
+
+
+def write_so_far(folder: Path, hypotheses: Sequence[Hypothesis], origin: Origin) -> Path | None:
+    """Write what was found into the folder of the verdict, which is made; None where nothing was found yet.
+
+    Raises
+    ------
+    VerdictFileError
+        If a record does not fit the schema.
+    FileNotWrittenError
+        If the file cannot be written.
+    """
+    if not hypotheses:
+        return None
+    content = VerdictSoFar(REMARK, tuple(hypotheses), origin)
+    return write_document(folder / SO_FAR_NAME, SO_FAR_SCHEMA, content)

@@ -1,0 +1,305 @@
+"""Lumped models against matrices inverted by hand and general integrators of their equations of motion."""
+
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.linalg import eigh, expm
+from scipy.optimize import brentq
+
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Quantity, Trial, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.system.excitation import Acting, Shown
+from discrepancy.system.linear_system import LinearSystem
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.lumped_file import SHIPPED_MODELS, LumpedDescription
+from discrepancy.system.motion import Motion, motion_of
+from discrepancy.system.system_model import State
+from fe.runtime import patch as patches
+from fe.runtime.motion import laws_of
+from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, laws, model_of, seen
+from tests.fe.runtime.stepping import force_of, second_order, states_of
+
+pytestmark = pytest.mark.xdist_group("compiling")
+
+MASS = np.diag([1.5, 1.2, 0.8])
+STIFFNESS = np.array([[5200.0, -2600.0, 0.0], [-2600.0, 4800.0, -2200.0], [0.0, -2200.0, 2200.0]])
+JOINT = np.array([0.0, -1.0, 1.0])
+END = np.linalg.solve(STIFFNESS, [0, 0, 1])
+SQUARE, SHAPES = eigh(STIFFNESS, MASS)
+VISCOUS = MASS @ SHAPES @ np.diag(np.array([0.016, 0.012, 0.012]) * np.sqrt(SQUARE)) @ (MASS @ SHAPES).T
+MOTION = second_order(*(np.linalg.solve(MASS, part) for part in (STIFFNESS, VISCOUS)))
+DISPLACEMENTS = {f"x{k}": Quantity.DISPLACEMENT for k in (1, 2, 3)}
+X3, VELOCITY, ACCELERATION = (("x3", quantity) for quantity in Quantity.DISPLACEMENT.moving)
+
+
+CHAIN = LumpedModel.load("three_mass_chain")
+
+
+def trial(kind: TrialKind, time: Any = 400, **said: Any) -> Trial:
+    return asked(kind, time, **{"load_place": "end", **said})
+
+
+def ringdown(time: Any = 400, **said: Any) -> Trial:
+    return trial(TrialKind.RINGDOWN, time, **{"release": Release(0.02), **said})
+
+
+def static(force: list[float], **said: Any) -> Trial:
+    return trial(TrialKind.STATIC, len(force), force=np.array(force), **said)
+
+
+def shown(model: LumpedModel, what: Trial, *items: Any, outputs: Any = DISPLACEMENTS, **given: Any) -> Any:
+    return seen(model, what, outputs, *items, **given)
+
+
+# ---------------------------------------------------------------- static
+
+SCALED = 1.1 * (STIFFNESS - 0.2 * 2200.0 * np.outer(JOINT, JOINT))
+ROOT = np.linalg.inv(STIFFNESS) + 3e-4 * np.outer([0.2, 0.4, 0.6], [0.2, 0.4, 0.6])
+TWO_GAINS = patches.LoadGain(0.2, 0.5), patches.LoadGain(0.1, 0.0)  # one upon the other
+WARM, SOFTER = np.array([0.0, 10.0, 0.0, -20.0]), patches.ModulusTemperature(2e-3)
+
+
+@pytest.mark.parametrize(
+    ("items", "force", "wanted", "said"),
+    [
+        ((), [0.0, 1.0, -3.0], np.outer([0, 1, -3], END), {}),
+        ((), [1.0], [np.linalg.solve(SCALED, [0, 0, 1])], {"parameters": np.array([1.1, 0.8, 2.0])}),
+        ((patches.RootCompliance(3e-4),), [2.0], [2.0 * ROOT[:, 2]], {}),  # in series
+        ((patches.LoadGain(0.05, 0.5),), [0.0, 4.0], np.outer([0.0, 4.7], END), {}),
+        (TWO_GAINS, [0.0, 4.0], np.outer([0.0, 5.83], END), {}),
+        ((patches.LoadPlace(-0.05, 0.0),), [3.0], [np.linalg.solve(STIFFNESS, [0, 0.75, 2.25])], {}),
+        ((patches.PointMass(0.3, 0.55),), [1.0], [END], {}),
+        ((SOFTER,), [1.0] * 4, np.outer(1.0 / (1 - 2e-3 * WARM), END), {"temperature": WARM}),
+    ],
+)
+def test_static_rows_are_those_of_the_matrices(items, force, wanted, said) -> None:
+    given = {"parameters": np.ones(3)} | said
+    parameters = given.pop("parameters")
+    found = shown(CHAIN, static(force, **given), *items, parameters=parameters)
+    np.testing.assert_allclose(found, wanted, rtol=1e-10)
+
+
+# ---------------------------------------------------------------- motion
+
+
+def test_a_record_that_begins_under_load_begins_at_rest() -> None:
+    what = trial(TrialKind.FORCED, 100, force=np.full(100, 3.0))
+    for items in ((), (MicroSlip("joint", 0.5, 800.0, -0.3),)):
+        still = shown(CHAIN, static([3.0] * 100), *items)
+        np.testing.assert_allclose(shown(CHAIN, what, *items), still, rtol=1e-3 if items else 1e-11)
+
+
+def test_hysteresis_remembers_its_path_also_while_it_warms() -> None:
+    """A temperature that does nothing does not change the path, though every level is solved by itself."""
+    path, slip = [2.0, 4.0, 10.0, 6.0, 0.0], MicroSlip("joint", 2.5, 800.0, -0.3)
+    values = shown(CHAIN, static(path), slip)
+    assert values[-1, 2] > 1e-5  # unloaded, it does not come back
+    warm = shown(CHAIN, static(path, temperature=np.arange(5.0)), slip, patches.ModulusTemperature(1e-12))
+    assert warm == pytest.approx(values, rel=1e-6, abs=1e-10)
+
+
+def test_initial_states_are_shares_of_the_release() -> None:
+    start = shown(CHAIN, ringdown(), initial=np.array([[0.1, 0.0], [0.05, 0.0]]))[0]
+    wanted = 0.02 * (1.1 * END / END[2] + 0.05 * SHAPES[:, 1] / SHAPES[2, 1])
+    np.testing.assert_allclose(start, wanted, atol=1e-12)
+    later, initial = ringdown(release=Release(0.02, at_rest=False)), np.array([[0.0, 0.0], [0.3, -0.4]])
+    values = shown(CHAIN, later, outputs=(X3, VELOCITY), initial=initial, clock=(0.0, -0.02))
+    begin = 0.02 * np.outer([0.3, -0.4 * np.sqrt(SQUARE[1])], SHAPES[:, 1] / SHAPES[2, 1]).ravel()
+    wanted = [(expm(MOTION * t) @ begin)[[2, 5]] for t in later.time - 0.02]  # it moves before, too
+    np.testing.assert_allclose(values, wanted, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("items", [(), (PowerDamping("joint", 0.2, 2.0, 0.0, 0.1, 1.0),)])
+def test_a_clock_shows_the_motion_at_other_times(items: tuple[Primitive, ...]) -> None:
+    stamps, time = np.arange(40001) * 1e-4, ringdown(200).time
+    fine = shown(CHAIN, ringdown(stamps), *items)
+    for clock in ((0.02, 0.013), (-0.01, -0.0333), (0.0, -0.02)):
+        values, times = shown(CHAIN, ringdown(200), *items, clock=clock), (1 + clock[0]) * time + clock[1]
+        expected = np.stack([np.interp(times, stamps, column) for column in fine.T], axis=1)
+        np.testing.assert_allclose(values, expected, atol=0.02 * 2e-4)
+        assert np.all(values[times < 0.0] == values[0])  # held until the release
+
+
+def test_a_point_mass_sits_between_places() -> None:
+    row = np.array([0.0, 0.25, 0.75])
+    wanted = np.sqrt(eigh(STIFFNESS, MASS + 0.3 * np.outer(row, row), eigvals_only=True))
+    state = State((1.0,) * 3, structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
+    np.testing.assert_allclose(CHAIN.system(state).angular_frequency, wanted, rtol=1e-10)
+
+
+@given(ratios=st.tuples(*[st.floats(0.0, 3.0)] * 3), clock=st.floats(0.0, 0.01))
+@settings(max_examples=30, deadline=None)
+def test_closed_form_and_stepped_ringdown_agree_for_any_damping(ratios: Any, clock: float) -> None:
+    content = tomllib.loads((SHIPPED_MODELS / "three_mass_chain.toml").read_text())
+    closed = LumpedModel(LumpedDescription.parse(content | {"damping": {"ratios": list(ratios)}}))
+    # a drift of nothing that counts makes the kernel step
+    drift = patches.StiffnessDrift(1e-14)
+    values, stepped = (shown(closed, ringdown(200), *items, clock=(0.0, clock)) for items in ((), (drift,)))
+    np.testing.assert_allclose(values, stepped, atol=1e-8 * 0.02)
+
+
+# ---------------------------------------------------------------- at uneven stamps
+
+
+# ---------------------------------------------------------------- what it says of itself
+
+
+@pytest.mark.parametrize(("name", "whole", "parts"), INPUTS.table("parts.toml")["row"])
+def test_a_matrix_may_be_given_by_parts_alone(name: str, whole: str, parts: str) -> None:
+    one, other = (
+        model_of(text).description.terms({})
+        for text in (INPUTS.text(f"{name}.toml"), INPUTS.text(f"{name}.toml", (whole, "")) + parts)
+    )
+    for kind in ("mass", "stiffness", "capacity", "conductance"):
+        np.testing.assert_array_equal(one[kind], other[kind])
+
+
+# ---------------------------------------------------------------- a joint that the modes leave out
+
+
+LIGHT = 1e-5
+"""Mass of the joint's own node [kg], as good as none: the mode that it makes is left out."""
+BETA = 1e-3
+HOLD = 6000.0
+"""Spring of the joint [N/m]: a seventh of the compliance of the tip."""
+TIP = np.array([0.0, 0.0, 0.0, 1.0])
+ROWS = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
+"""Of the tip and of the joint."""
+RELEASE = Release(displacement=0.02, deviation=0.01, at_rest=True, mode_count=1, time_zero_deviation=0.0)
+TIME, EARLY = np.linspace(0.0, 2.796, 700), np.linspace(0.0, 0.01, 101)
+A = 0.02 * 0.135
+"""About the motion of the joint [m]."""
+
+
+def on_joint(modes: int, beta: float) -> LinearSystem:
+    """Three masses of 1 kg in a row on a joint whose node weighs next to nothing."""
+    springs = np.array([HOLD, 2000.0, 4000.0, 5000.0])
+    stretch = np.eye(4) - np.eye(4, k=-1)
+    stiffness = stretch.T @ np.diag(springs) @ stretch
+    mass = np.diag([LIGHT, 1.0, 1.0, 1.0])
+    ports = {"joint": np.array([1.0, 0.0, 0.0, 0.0]), "tip": TIP}
+    return LinearSystem(mass, 0.3 * mass + beta * stiffness, stiffness, ports, modes, beta)
+
+
+def let_go(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **how: int) -> Motion:
+    system = on_joint(how.pop("modes", 3), beta)
+    acts = laws_of(ModelPatch(items), list(system.ports))
+    acting = Acting(time, time, initial=np.zeros((0, 2)), release=(row, RELEASE))
+    return motion_of(system, acting, acts, **how)
+
+
+def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
+    return motion.seen([Shown.of(row) for row in rows]).values
+
+
+LAWS = laws("joint", HOLD, A, 15.0 * A)
+
+
+def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ...]) -> float:
+    """Speed v of a joint without mass: damper v + sum F(x, v) = push."""
+    drags = [
+        (d.coefficient * abs(x / d.reference_displacement) ** d.displacement_exponent, d)
+        for d in items
+        if isinstance(d, PowerDamping)
+    ]
+    rest = max(abs(push) - sum(size for size, d in drags if d.velocity_exponent == 0.0), 0.0)
+    moving = [(size, d) for size, d in drags if d.velocity_exponent > 0.0]
+
+    def left(v: float) -> float:
+        drag = sum(size * (v / d.reference_velocity) ** d.velocity_exponent for size, d in moving)
+        return float(damper * v - rest + drag)
+
+    size = brentq(left, 0.0, rest / damper, xtol=1e-15) if moving and rest > 0.0 else rest / damper
+    return float(np.sign(push) * size)
+
+
+def integrated(items: tuple[Primitive, ...], time: FloatArray, at: int) -> FloatArray:
+    """Displacements (N, 2) of tip and joint, that has no mass, released `at` a node, by an integrator."""
+    system = on_joint(3, BETA)
+    stiffness, damping = system.stiffness, BETA * system.stiffness + 0.3 * system.mass
+    inverse = np.linalg.inv(stiffness)
+    inside, at_tip = ([item for item in items if item.port == port] for port in ("joint", "tip"))
+
+    def force(x: float) -> float:
+        return sum(force_of(item, x, 0.0, np.zeros(0)) for item in inside)  # damping is in its speed
+
+    def held(x: float) -> FloatArray:
+        pull = (0.02 + inverse[at, 0] * force(x)) / inverse[at, at]
+        return inverse[:, at] * pull - inverse[:, 0] * force(x)
+
+    def derivative(t: float, y: FloatArray) -> FloatArray:
+        u, v, x = y[:3], y[3:6], y[6]
+        place = np.concatenate(([x], u))
+        push = -stiffness[0] @ place - damping[0, 1:] @ v - force(x)
+        speed = joint_speed(push, damping[0, 0] - 0.3 * LIGHT, x, items)
+        a = -(stiffness @ place)[1:] - damping[1:] @ np.concatenate(([speed], v))
+        a[2] -= sum(force_of(item, u[2], v[2], np.zeros(0)) for item in at_tip)
+        return np.concatenate((v, a, [speed]))
+
+    x = brentq(lambda x: held(x)[0] - x, 0.0, 3.0 * A if at else 0.03, xtol=1e-14)
+    begin = np.concatenate((held(x)[1:], np.zeros(3), [x]))
+    found = solve_ivp(derivative, (0.0, time[-1]), begin, t_eval=time, rtol=1e-6, atol=1e-9, max_step=2e-3)
+    return np.asarray(found.y[[2, 6]].T)
+
+
+@pytest.mark.parametrize(
+    ("name", "time", "at"),
+    [
+        *((n, TIME[:250], 3) for n in LAWS),
+        ("cubic", EARLY, 3),
+        ("play", EARLY, 3),
+        ("crack", EARLY, 0),
+        ("viscous", EARLY, 0),
+    ],
+)
+def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray, at: int) -> None:
+    """Released at the tip, or at the joint itself; what remembers is beside four modes, which are all."""
+    if any(states_of(item) for item in LAWS[name]):
+        true = values(let_go(BETA, *LAWS[name], time=time, row=np.eye(4)[at], modes=4, refinement=16), ROWS)
+    else:
+        true = integrated(LAWS[name], time, at)
+    effect, usual, fine = (
+        np.abs(values(let_go(BETA, *items, time=time, row=np.eye(4)[at], refinement=n), ROWS) - true).max(
+            axis=0
+        )
+        for items, n in (((), 1), (LAWS[name], 1), (LAWS[name], 8))
+    )
+    assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
+    assert fine[0] < 1e-3 * 0.02
+    assert np.all(usual < np.array([0.03, 0.08]) * effect + 1e-3 * np.array([0.02, A]))
+
+
+WITHOUT_INPUT = """format = 1
+name = "rings down by itself"
+mass = 1.0
+stiffness = 400.0
+damping = { matrix = 1.0 }
+[[output]]
+name = "x"
+vector = 1.0
+[[parameter]]
+name = "loss"
+terms = "damping"
+mean = 1.0
+deviation = 0.5
+low = 0.0
+high = 4.0
+"""
+
+
+def test_a_rig_without_an_input_and_a_damping_down_to_zero_is_a_model():
+    model = model_of(WITHOUT_INPUT)
+    assert TrialKind.DRIVEN in model.kinds
+    assert model.parameters[0].low == 0.0
+
+
+def test_a_low_of_zero_that_would_leave_no_stiffness_is_refused():
+    with pytest.raises(ModelError, match="low = 0, which would leave no stiffness at some unknown"):
+        model_of(WITHOUT_INPUT.replace('terms = "damping"', 'terms = "stiffness"'))

@@ -1,0 +1,423 @@
+"""Rigs of all kinds against closed forms and general integrators; effects in windows; clocks of loggers."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
+from discrepancy.errors import CatalogueError, ModelError
+from discrepancy.system.lumped import LumpedModel
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
+from discrepancy.system.system_model import FORCES
+from fe.runtime import patch
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import PowerDamping, PowerStiffness, Primitive, Window
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, integrated, model_of, one_mass, seen
+from tests.fe.runtime.stepping import exact
+
+HEIGHT, LOWER, CELL = {"height": Quantity.DISPLACEMENT}, {"lower": Quantity.LEVEL}, {"cell": Quantity.FORCE}
+FRICTION = PowerDamping("piston", 3.0, 0.0, 0.0, 1.0, 1.0)
+
+
+def rig(name: str, *changes: tuple[str, str]) -> LumpedModel:
+    return model_of(INPUTS.text(f"{name}.toml", *changes))
+
+
+def trial(time: Any, *inputs: RecordedInput, kind: TrialKind = TrialKind.DRIVEN, **said: Any) -> Any:
+    return asked(kind, time, **{"begins": Start.STILL, "inputs": inputs, **said})
+
+
+def pump(values: FloatArray, hold: Hold | None = Hold.LINEAR) -> RecordedInput:
+    return RecordedInput("pump", Quantity.VOLTAGE, values, hold)
+
+
+def actuator(values: FloatArray) -> RecordedInput:
+    return RecordedInput("actuator", Quantity.DISPLACEMENT, values, Hold.SMOOTH)
+
+
+def uneven(count: int, interval: float) -> FloatArray:
+    steps = interval * np.random.default_rng(0).uniform(0.6, 1.4, count - 1)
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+# ---------------------------------------------------------------- bodies, tanks, motors
+
+
+def test_a_body_falls_as_galilei_says_and_drag_makes_it_a_hyperbolic_tangent() -> None:
+    time, gauge = uneven(200, 0.01), {"accelerometer": Quantity.ACCELERATION}
+    found = seen(rig("falling_body"), trial(time), HEIGHT | gauge)
+    np.testing.assert_allclose(found[:, 0], -0.5 * 9.81 * time**2, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(found[:, 1], 0.0, atol=1e-12)
+    drag = PowerDamping("air", 0.5, 2.0, 0.0, 1.0, 1.0)  # 0.5 v^2
+    found = seen(rig("falling_body"), trial(time), {"height": Quantity.VELOCITY} | gauge, drag, refinement=4)
+    terminal = np.sqrt(2.0 * 9.81 / 0.5)
+    speed = terminal * np.tanh(9.81 * time / terminal)
+    np.testing.assert_allclose(found[:, 0], -speed, atol=1e-5)
+    np.testing.assert_allclose(found[:, 1], 0.5 * speed**2 / 2.0, atol=1e-4)
+    port = rig("falling_body").scales(campaign(trial(time))).ports["air"]  # from what acts and moves
+    assert port.displacement == pytest.approx(0.5 * 9.81 * time[-1] ** 2)
+    assert port.stiffness * port.displacement == pytest.approx(FORCES * 2.0 * 9.81)
+    assert port.angular_frequency * port.displacement == pytest.approx(9.81 * time[-1])
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.4])
+def test_tanks_begin_settled_and_stay_so(offset: float) -> None:
+    what = trial(uneven(20, 4.0), pump(np.full(20, 2.0)), begins=Start.SETTLED)
+    found = seen(rig("tanks"), what, LOWER, offset=(offset,) if offset else ())
+    np.testing.assert_allclose(found[:, 0], (2.0 + offset) * 0.5 / 0.08, rtol=1e-10)
+    # a force at a state, at rest
+    said = {"kind": TrialKind.STATIC, "begins": Start.SETTLED, "load_place": "pump"}
+    still = trial(np.arange(3.0), force=np.array([0.0, 2.0, -1.0]), **said)
+    pressed = seen(rig("tanks", (', quantity = "voltage"', "")), still, LOWER)
+    np.testing.assert_allclose(pressed[:, 0], still.force * 0.5 / 0.08, rtol=1e-10)
+
+
+def test_a_motor_couples_displacements_and_states() -> None:
+    time, generator = uneven(150, 0.02), np.random.default_rng(7)
+    given = np.stack((generator.normal(size=150), 0.1 * generator.normal(size=150)), axis=1)
+    inputs = (("voltage", Quantity.VOLTAGE, given[:, 0]), ("brake", Quantity.TORQUE, given[:, 1]))
+    what = trial(time, *(RecordedInput(*item) for item in inputs))
+    found = seen(rig("motor"), what, {"speed": Quantity.ANGULAR_VELOCITY, "current": Quantity.CURRENT})
+    matrix, into = np.zeros((5, 5)), np.zeros((5, 2))
+    matrix[:2, 2:4] = np.eye(2)
+    matrix[2], matrix[3] = np.array([-3, 3, -0.01, 0, 0.3]) / 0.02, np.array([3, -3, 0, -0.02, 0]) / 0.5
+    matrix[4] = np.array([0, 0, -0.3, 0, -2.0]) / 0.01
+    into[4, 0], into[3, 1] = 100.0, -2.0
+    expected = exact(matrix, into, time, given)
+    np.testing.assert_allclose(found, expected[:, 3:], atol=1e-8 * np.abs(expected).max())
+
+
+def test_an_unknown_begin_takes_any_state() -> None:
+    time, model = uneven(50, 0.01), rig("falling_body")
+    read = {"channels": ("h",), "values": (3.0 - 2.0 * time)[:, None]}
+    what = trial(time, begins=Start.UNKNOWN, **read)
+    for quantity, height in ((Quantity.DISPLACEMENT, 3.0), (Quantity.VELOCITY, 3.0 * time[-1])):
+        given = campaign(what, h=Channel("h", quantity, "height", None))
+        largest = np.sqrt(2.0) * np.array([height, max(height / time[-1], 9.81 * time[-1])])
+        assert model.initial_sizes(given, what) == pytest.approx(largest, rel=1e-9)
+    found = seen(model, what, HEIGHT, initial=np.sqrt(2.0) * np.array([[3.0, -2.0]]))  # mass-normalised
+    np.testing.assert_allclose(found[:, 0], 3.0 - 2.0 * time - 0.5 * 9.81 * time**2, atol=1e-12)
+
+
+def test_what_leaves_one_store_enters_the_next_and_flows_over_when_full() -> None:
+    time = np.arange(0.0, 160.0, 2.0)
+    flow = 0.3 * (1.0 + np.sin(0.05 * time) * np.sign(np.sin(0.02 * time + 1.0)))
+    what = trial(time, RecordedInput("pump", Quantity.FLOW, flow, Hold.ZERO_ORDER), begins=Start.UNKNOWN)
+    laws = (
+        PowerDamping("first", 0.1, 0.5, 0.0, 1.0, 1.0), PowerDamping("second", 0.12, 0.5, 0.0, 1.0, 1.0),
+        patch.Overflow("first", 0.3, 1.5, 2.0, 1.0),
+    )  # fmt: skip
+
+    def rate(t: float, level: FloatArray, k: int) -> list[float]:
+        first = 0.1 * np.sqrt(max(level[0], 0.0)) + 0.3 * max(level[0] - 2.0, 0.0) ** 1.5 + 0.02 * level[0]
+        second = 0.12 * np.sqrt(max(level[1], 0.0)) + 0.03 * level[1]
+        return [(flow[k] - first) / 2.0, (first - second) / 3.0]
+
+    true = integrated(rate, time, [1.0, 0.5], parts=True, rtol=1e-9, atol=1e-11)
+    begin = {"initial": np.array([[np.sqrt(2.0)], [0.5 * np.sqrt(3.0)]])}
+    levels = {"upper": Quantity.LEVEL} | LOWER
+    found = (seen(rig("stores"), what, levels, *laws, **begin, refinement=n) for n in (2, 4))
+    coarse, fine = (np.abs(item - true).max() for item in found)
+    assert fine < 2e-3
+    assert coarse > 3.0 * fine  # of second order
+
+
+# ---------------------------------------------------------------- drives
+
+
+def test_a_driven_damper_shows_its_forces_and_those_of_laws() -> None:
+    time, model = uneven(400, 0.005), rig("damper")
+    motion = 0.02 * np.sin(9.0 * time)
+    spline = CubicSpline(time, motion)
+    what = trial(time, actuator(motion), begins=Start.SETTLED)
+    found = seen(model, what, CELL)[:, 0]
+    linear = 0.4 * spline(time, 2) + 25.0 * spline(time, 1) + 300.0 * motion
+    np.testing.assert_allclose(found, linear, rtol=1e-9, atol=1e-9)
+    analytic = 300.0 * motion + 25.0 * 0.18 * np.cos(9.0 * time) - 0.4 * 1.62 * np.sin(9.0 * time)
+    np.testing.assert_allclose(found[5:-5], analytic[5:-5], atol=2e-3)
+    rest = seen(model, what, CELL, FRICTION, PowerStiffness("piston", 5.0, 3.0, 0, 0.02))[:, 0] - linear
+    moving = np.abs(spline(time, 1)) > 0.02
+    expected = 3.0 * np.sign(spline(time, 1)) + 5.0 * (motion / 0.02) ** 3
+    np.testing.assert_allclose(rest[moving], expected[moving], atol=1e-6)
+    # where a drive begins at rest its spline's slope is not quite zero, but friction, of its sign, is
+    time = 0.025 * np.arange(100.0)
+    for motion, begin in ((-0.02 * np.cos(9.0 * time), 0.0), (0.02 * np.sin(9.0 * time), 3.0)):
+        what = trial(time, actuator(motion - motion[0]))
+        rest = (seen(model, what, CELL, FRICTION) - seen(model, what, CELL))[:, 0]
+        assert rest[0] == pytest.approx(begin, abs=1e-6)
+
+
+def test_a_port_that_a_drive_moves_is_measured_by_its_motion_and_the_force() -> None:
+    """Not by the frequency that it would have if it were let go."""
+    time, readings = 0.01 * np.arange(300.0), np.linspace(-50.0, 40.0, 300)[:, None]
+    read = {"channels": ("cell",), "values": readings}
+    what = trial(time, actuator(0.02 * np.sin(2.0 * time)), **read)
+    given = campaign(what, cell=Channel("cell", Quantity.FORCE, "cell", None))
+    found = rig("damper").scales(given).ports["piston"]
+    assert found.displacement * found.angular_frequency == pytest.approx(0.04, rel=1e-3)
+    assert found.displacement * found.stiffness == pytest.approx(50.0)
+    assert found.static_stiffness == pytest.approx(300.0)
+    assert (found.driven, found.free) == (True, False)
+
+
+def test_a_shaken_base_and_a_hand_on_the_mass() -> None:
+    time = uneven(300, 0.01)
+    shake, hand = 3.0 * np.sin(12.0 * time) + np.cos(5.0 * time), np.random.default_rng(9).normal(size=300)
+    spline = CubicSpline(time, shake)
+    w1, w0 = spline.antiderivative(1), spline.antiderivative(2)
+    base = RecordedInput("base", Quantity.ACCELERATION, shake, Hold.SMOOTH)
+    what = trial(time, base, RecordedInput("hand", Quantity.FORCE, hand))
+
+    def slope(t: float, y: FloatArray) -> list[float]:
+        x, v = y[0] - w0(t), y[1] - w1(t)
+        return [y[1], (np.interp(t, time, hand) - 400.0 * x - 1.5 * v - 4.0 * abs(v) * v) / 2.0]
+
+    solution = integrated(slope, time, [0.0, float(w1(0.0))], max_step=0.004).T
+    outputs = {"mass": Quantity.DISPLACEMENT, "drive": Quantity.FORCE}
+    law = PowerDamping("guide", 4.0, 2.0, 0.0, 1.0, 1.0)
+    found = seen(rig("base"), what, outputs, law, refinement=4)
+    np.testing.assert_allclose(found[:, 0], solution[0], atol=2e-5)
+    x, v = solution[0] - w0(time), solution[1] - w1(time)
+    drive = shake - 400.0 * x - 1.5 * v - 4.0 * np.abs(v) * v - 0.5 * hand
+    np.testing.assert_allclose(found[:, 1], drive, atol=5e-3)
+
+
+def test_plain_models_take_driven_trials_and_other_begins() -> None:
+    model, time = LumpedModel.load("three_mass_chain"), 0.01 * np.arange(300)
+    force, outputs = np.cos(7.0 * time), {"x1": Quantity.DISPLACEMENT, "x3": Quantity.ACCELERATION}
+    said = {"kind": TrialKind.FORCED, "load_place": "end", "begins": Start.SETTLED}
+    forced = trial(time, force=force, **said)
+    friction = PowerDamping("joint", 0.3, 0.0, 0.0, 1.0, 1.0)
+    for hold, laws in itertools.product((None, *Hold), ((), (friction,))):
+        driven = trial(time, RecordedInput("end", Quantity.FORCE, force, hold), begins=Start.SETTLED)
+        one, other = (seen(model, what, outputs, *laws) for what in (replace(forced, hold=hold), driven))
+        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(one).max())
+    still = seen(model, replace(forced, begins=Start.STILL), outputs)
+    assert still[0, 0] == 0.0
+    blank = trial(np.r_[0.0, time + 1e-9], force=np.r_[0.0, force], **said)
+    np.testing.assert_allclose(still, seen(model, blank, outputs)[1:], atol=1e-6 * np.abs(still).max())
+
+
+# ---------------------------------------------------------------- controllers and own laws
+
+
+@pytest.mark.parametrize(("hold", "measured"), [("linear", False), ("zero_order", True)])
+def test_a_pendulum_follows_its_target_as_integrated(hold: str, measured: bool) -> None:
+    model = model_of(INPUTS.text("pendulum.toml") + 'derivative_of = "measurement"\n' * measured)
+    time = np.linspace(0.0, 1.5, 90) ** 1.1  # uneven
+    target, weight, servo, gain = 1.5 * np.sin(2.0 * time) + 0.3, 1.1, 0.9, 1.3
+    what = trial(time, RecordedInput("target", Quantity.ANGLE, target, Hold(hold)))
+    outputs = {"angle": Quantity.ANGLE, "torque": Quantity.TORQUE}
+    found = seen(model, what, outputs, parameters=np.array([weight, servo, gain]), refinement=4)
+
+    def terms(t: float, state: FloatArray, k: int) -> tuple[float, float]:
+        """What is wanted, and the torque that the controller gives."""
+        slope = 0.0 if measured else (target[k + 1] - target[k]) / (time[k + 1] - time[k])
+        wanted = target[k] + slope * (t - time[k])
+        given = servo * (40.0 * (wanted - state[0]) + 30.0 * state[2]) + 2.0 * (slope - state[1])
+        return wanted, gain * given
+
+    def rate(t: float, state: FloatArray, k: int) -> list[float]:
+        wanted, torque = terms(t, state, k)
+        push = torque - 0.1 * state[1] - weight * 2.7 * np.sin(state[0])
+        return [state[1], push / 0.14, wanted - state[0]]
+
+    true = integrated(rate, time, np.zeros(3), parts=True, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(found[:, 0], true[:, 0], atol=1e-4)
+    given = [terms(time[k + 1], true[k + 1], k)[1] for k in range(len(time) - 1)]
+    np.testing.assert_allclose(found[1:, 1], given, atol=6e-3)
+
+
+def test_a_speed_is_held_with_a_proportional_and_an_integral_gain() -> None:
+    loop = 'name = "position", quantity = "angular_velocity", reference = "target", vector = 1.0, acts = 1.0'
+    text = f"{INPUTS.text('servo.toml')}controller = [{{ {loop}, proportional = 0.5, integral = 2.0 }}]"
+    time, outputs = np.linspace(0.0, 2.0, 60), {"angle": Quantity.ANGULAR_VELOCITY, "torque": Quantity.TORQUE}
+    what = trial(time, RecordedInput("target", Quantity.ANGULAR_VELOCITY, np.full(60, 2.6), Hold.ZERO_ORDER))
+    found = seen(model_of(text), what, outputs, offset=(0.4,))
+    true = integrated(
+        lambda t, y: [(0.5 * (3.0 - y[0]) + 2.0 * y[1] - 0.1 * y[0]) / 0.14, 3.0 - y[0]], time, np.zeros(2)
+    )
+    given = 0.5 * (3.0 - true[:, 0]) + 2.0 * true[:, 1]
+    np.testing.assert_allclose(found, np.stack((true[:, 0], given), axis=1), atol=1e-8)
+
+
+def test_a_rig_at_rest_has_the_temperature_of_each_level_and_what_holds_it() -> None:
+    warm = {"force": np.full(3, 3.0), "temperature": np.array([0.0, 40.0, 0.0])}
+    what = trial(np.arange(3.0), kind=TrialKind.STATIC, begins=Start.SETTLED, **warm)
+    held = INPUTS.text("wheel.toml").removesuffix("]\n") + INPUTS.text("held.toml")
+    outputs = {"turn": Quantity.ANGLE, "given": Quantity.TORQUE}
+    found = seen(model_of(held), what, outputs, patch.ModulusTemperature(0.01))
+    turn = 3.0 / (np.array([100.0, 60.0, 100.0]) + 50.0)
+    np.testing.assert_allclose(found, np.stack((turn, -50.0 * turn), axis=1), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "rate", "largest"),
+    [
+        ("capacity = 1.0\nconductance = 3e-4\n", Quantity.TEMPERATURE, 0.0, (75.0 / 3e-4, 75.0)),
+        ("mass = 2.0\nstiffness = 8.0\ndamping.ratios = 0.01\n", Quantity.DISPLACEMENT, 2.0, (75.0, 150.0)),
+    ],
+)
+def test_scales_of_what_nothing_drives_come_from_its_readings(text, unit, rate: float, largest) -> None:
+    """A mug that cools and a mass that rings down: from rest, neither model would move at all."""
+    model = model_of(INPUTS.text("left_alone.toml", ("UNIT", unit.value)) + text)
+    time = np.linspace(0.0, 3e4 if rate == 0.0 else 30.0, 400)
+    values = 20.0 + 75.0 * np.exp(-time * 3e-4) * np.cos(rate * time)
+    read = {"values": values[:, None], "channels": ("shown",)}
+    given = campaign(trial(time, begins=Start.UNKNOWN, **read), shown=Channel("shown", unit, "shown", None))
+    port = model.scales(given).ports["it"]
+    assert (port.displacement, port.angular_frequency * port.displacement) == pytest.approx(largest, rel=0.5)
+
+
+# ---------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(("name", "begins", "item", "sentence"), INPUTS.refused("records"))
+def test_wrong_records_are_named(name: str, begins: str, item: list[str], sentence: str) -> None:
+    time, model = uneven(20, 0.01), rig(name)
+    inputs = [RecordedInput(own, Quantity(kind), time, Hold.ZERO_ORDER) for own, kind in item]
+    output = model.description.output[0]
+    with pytest.raises(ModelError, match=sentence):
+        seen(model, trial(time, *inputs, begins=Start(begins)), {output.name: output.quantity})
+
+
+# ---------------------------------------------------------------- effects in windows of a record
+
+
+MASS, STIFFNESS = 2.0, 200.0
+MODEL = one_mass(stiffness=STIFFNESS, damping={"alpha": 0.0, "beta": 0.0})
+TIME = np.linspace(0.0, 6.0, 301)
+FORCE = 4.0 * np.sin(3.0 * TIME) + 2.0 * np.sin(7.7 * TIME)
+OUTPUTS = (("x", Quantity.DISPLACEMENT), ("x", Quantity.ACCELERATION))
+
+
+def of_mass(kind: TrialKind, time: FloatArray = TIME) -> Trial:
+    said: dict[str, Any] = {"release": Release(0.05, mode_count=1)}
+    if kind is not TrialKind.RINGDOWN:
+        said = {"force": np.interp(time, TIME, FORCE), "begins": Start.STILL}
+    return asked(kind, time, channels=("x",), load_place="push", **said)
+
+
+def response(given: Trial, *items: Primitive, refinement: int = 8) -> FloatArray:
+    return seen(MODEL, given, OUTPUTS, *items, refinement=refinement)
+
+
+DRAG = PowerDamping("slide", 40.0, 2.0, 0.0, 1.0, 1.0)
+
+
+def moved(law: Callable[[float, float, float], float], edges: Any, kind: TrialKind) -> FloatArray:
+    """Return the motion under the force, or let go, with `law(t, x, v)` between two edges, piece by piece."""
+    time, pushed = np.union1d(TIME, edges), float(kind is TrialKind.FORCED)
+
+    def slope(t: float, y: FloatArray, k: int) -> list[float]:
+        own = law(t, *y) if edges[0] <= time[k] < edges[1] else 0.0
+        return [y[1], (pushed * np.interp(t, TIME, FORCE) - STIFFNESS * y[0] - own) / MASS]
+
+    start = np.array([0.0 if pushed else 0.05, 0.0])
+    return integrated(slope, time, start, parts=True, rtol=1e-9)[np.isin(time, TIME), 0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "item", "law"),
+    [
+        (TrialKind.RINGDOWN, DRAG, lambda t, x, v: 40.0 * v * abs(v)),
+        (TrialKind.FORCED, DRAG, lambda t, x, v: 40.0 * v * abs(v)),
+        (TrialKind.FORCED, patch.PowerStiffness("slide", 30.0, 3.0, 0, 0.05), lambda t, x, v: 2.4e5 * x**3),
+        (
+            TrialKind.FORCED,
+            patch.PortLoad("slide", "3 * max(0, time - 2.5)"),
+            lambda t, *_: -3.0 * max(0.0, t - 2.5),
+        ),
+    ],
+)
+def test_a_law_between_two_moments_against_a_general_integrator(kind: TrialKind, item: Any, law: Any) -> None:
+    """At uneven stamps where it is let go."""
+    edges, kept = (1.507, 4.003), (np.arange(len(TIME)) % 9 != 7) | (kind is TrialKind.FORCED)
+    windowed = replace(item, windows=(Window("a trial", *edges),))
+    found = response(of_mass(kind, TIME[kept]), windowed)[:, 0]
+    expected = moved(law, edges, kind)[kept]
+    np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", [TrialKind.FORCED, TrialKind.RINGDOWN])
+def test_without_edges_within_the_record_nothing_changes(kind: TrialKind) -> None:
+    given, law = replace(of_mass(kind), begins=Start.SETTLED), patch.BoucWen("slide", 60.0, 0.01, 1.5)
+    own, other, open_ = Window("a trial"), Window("another", 1.0, 2.0), Window("another", 1.0)
+    for windows, same in (((own,), (law,)), ((other,), ()), ((open_, own), (law,))):
+        np.testing.assert_array_equal(response(given, replace(law, windows=windows)), response(given, *same))
+
+
+def test_sensors_are_wrong_within_their_windows_only() -> None:
+    given = of_mass(TrialKind.FORCED)
+    measured = campaign(given, x=Channel("x", Quantity.DISPLACEMENT, "x", None))
+
+    def read(*items: Primitive) -> FloatArray:
+        return observe(MODEL, measured, given, patch.ModelPatch(items), Conditions(np.zeros(0))).values[:, 0]
+
+    right, inside = read(), (TIME >= 2.0) & (TIME < 3.5)
+    for wrong in (
+        patch.SensorGain("x", 0.1),
+        patch.Line("x", 3.0, 0.01, 0.02),
+        patch.ChannelOffset("x", "0.01 * time"),
+    ):
+        found = read(replace(wrong, windows=(Window("a trial", 2.0, 3.5), Window("other"))))
+        np.testing.assert_array_equal(found, np.where(inside, read(wrong), right))
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: patch.PointMass(0.1, 0.2, windows=(Window("run", 1.0),)), "'point_mass' cannot act in"),
+        (lambda: replace(DRAG, windows=(Window("a trial", 2.0, 1.0),)), "must begin before it ends"),
+        (lambda: patch.PortLoad("slide", "3 * tme"), "unknown name 'tme'"),
+        (lambda: response(of_mass(TrialKind.FORCED), patch.PortLoad("door", "time")), "port 'door', which"),
+        (lambda: response(of_mass(TrialKind.RINGDOWN), patch.PortLoad("slide", "time")),
+         "ring-down, which no force with a course in time"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_in_a_window_says_so(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises((InvalidPatchError, ModelError), match=sentence):
+        make()
+
+
+# ---------------------------------------------------------------- clocks of loggers
+
+SHAKEN = model_of(INPUTS.text("shaken_mass.toml"))
+STAMPS = np.arange(0.0, 4.0, 0.01)
+SWEEP = RecordedInput("shaker", Quantity.FORCE, np.sin(9 * STAMPS**1.3))
+SEEN = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
+SWEPT = asked(TrialKind.DRIVEN, STAMPS, channels=tuple(SEEN), inputs=(SWEEP,), begins=Start.STILL)
+LOGGED = replace(campaign(SWEPT, **SEEN), loggers={"rack": ("shaker", "laser"), "film": ("camera",)})
+RATE = 4e-3
+
+
+def shown(*changes: Primitive, given: Any = LOGGED, at: Any = (1.0, 1.0), what: Trial = SWEPT) -> FloatArray:
+    return observe(SHAKEN, given, what, patch.ModelPatch(changes), Conditions(np.array(at))).values
+
+
+def test_each_logger_has_its_own_clock_and_one_alone_is_a_stiffer_rig_under_a_larger_load() -> None:
+    one, square = shown(patch.LoggerClock("*", RATE), given=replace(LOGGED, loggers={})), (1.0 + RATE) ** 2
+    alias = shown(patch.LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
+    np.testing.assert_allclose(one, alias, atol=1e-9 * np.abs(alias).max())
+    clocks = patch.LoggerClock("film", RATE), patch.LoggerClock("rack", RATE), patch.Clock(RATE, 0.0)
+    film, rack, motion = map(shown, clocks)
+    later = replace(SWEPT, time=1e5 + STAMPS)  # of the day
+    for change in (*clocks, patch.StiffnessDrift(0.05)):
+        np.testing.assert_allclose(shown(change, what=later), shown(change), atol=1e-5 * np.abs(alias).max())
+    assert np.abs(one - motion).max() > 0.05 * np.abs(alias).max()
+    np.testing.assert_array_equal(film[:, 0], shown()[:, 0])
+    np.testing.assert_array_equal(film[:, 1], motion[:, 1])
+    np.testing.assert_allclose(rack[:, 0], one[:, 0], atol=1e-12)
+    # the camera sees the stretched motion at its own, right times
+    stretched = replace(SWEPT, time=(1.0 + RATE) * STAMPS)
+    true = shown(patch.Clock(1.0 / (1.0 + RATE) - 1.0, 0.0), what=stretched)
+    np.testing.assert_allclose(rack[:, 1], true[:, 1], atol=1e-12)
+    with pytest.raises(CatalogueError, match="no logger 'tape'; it has 'rack', 'film'"):
+        shown(patch.LoggerClock("tape", RATE))
