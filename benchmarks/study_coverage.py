@@ -20,7 +20,8 @@ from rich.table import Table
 
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError
-from calibration.joint.posterior import joint_posterior, measured_modes
+from calibration.joint.measured_modes import measured_modes
+from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, wing_priors
 from calibration.paper.procedure import fit_masses
 from calibration.result.record import STATE, Reading, prior_samples

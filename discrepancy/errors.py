@@ -1,22 +1,11 @@
 """Errors of the discrepancy workflow, named by cause, and the sentences that it says."""
 
-from collections.abc import Iterable
-
 from reporting.errors import StandsForOthersError
-from reporting.sentences import MOST_LISTED, Sentences
+from reporting.sentences import Sentences
 
 SENTENCES = Sentences(__file__)
 said = SENTENCES.said
 """A sentence by "table.name" with its values."""
-
-
-def name_list(names: Iterable[str]) -> str:
-    """Return names as "a, b, c", at most `MOST_LISTED` of them, or "none"."""
-    names = list(names)
-    listed = ", ".join(names[:MOST_LISTED]) or "none"
-    if len(names) > MOST_LISTED:
-        return f"{listed} and {len(names) - MOST_LISTED} more"
-    return listed
 
 
 class DiscrepancyError(StandsForOthersError):

@@ -54,7 +54,7 @@ from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
-from reporting.words import be, brief, listing
+from reporting.words import brief, is_or_are, listing
 
 DRAWS = 400
 IMPLAUSIBLE = 4.0
@@ -292,7 +292,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             found = wrong_ends(residual, data.weight > 0.0, noise) & ~_taken_as_right(campaign, trial)
             for number in np.flatnonzero(found.any(axis=0)):
                 count = int(found[:, number].sum())
-                told = {"channel": trial.channels[number], "trial": trial.name, "are": be(count)}
+                told = {"channel": trial.channels[number], "trial": trial.name, "are": is_or_are(count)}
                 remarks.append(said("remarks.wrong_ends", count=count, total=len(found), **told))
             trials[trial.name] = replace(trial, used=trial.used & ~found)
     if len(remarks) == len(problem.campaign.remarks):

@@ -19,7 +19,7 @@ import numpy as np
 from fe.reduction.built_once import cache_folder
 from fe.runtime import laws, motion_arrays, motion_kernel, static_path
 from fe.runtime.motion import Kernel
-from reporting.progress import tell
+from reporting.progress import note
 
 try:
     import numba
@@ -79,7 +79,7 @@ def _plain(function: Callable[Parameters, Result]) -> Callable[Parameters, Resul
     return plain
 
 
-_tell_once = functools.cache(tell)
+_tell_once = functools.cache(note)
 
 if numba is not None:
 

@@ -1,27 +1,27 @@
-"""Exceptions of the reporting room, one for each cause, and how one stands for those of floors below."""
+"""Exceptions of `reporting`, one for each cause, and their translation between layers."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 
 class ReportingError(RuntimeError):
-    """Something that this package was asked to write, read or draw could not be done."""
+    """Something could not be written, read or drawn."""
 
 
 class FileNotWrittenError(ReportingError):
-    """A file could not be written; what stood there before is untouched."""
+    """A file could not be written; the previous file is untouched."""
 
 
 class DiskFullError(FileNotWrittenError):
-    """No space, or no quota, is left where a file should have been written."""
+    """No space, or no quota, is left for a file."""
 
 
 class DamagedFileError(ReportingError):
-    """A file is there but cannot be read as what it should be."""
+    """A file exists but does not hold what it should hold."""
 
 
 class InvalidChoiceError(ValueError):
-    """An argument is none of the few values that are allowed."""
+    """An argument is not one of the few allowed values."""
 
 
 class InvalidFigureError(ValueError):
@@ -29,12 +29,22 @@ class InvalidFigureError(ValueError):
 
 
 class StandsForOthersError(Exception):
-    """An error of one floor that is raised in the place of those of the floors below."""
+    """An error of one layer that is raised in the place of errors of the layers below."""
 
     @classmethod
     @contextmanager
-    def instead_of(cls, *causes: type[Exception], before: str = "", after: str = "") -> Iterator[None]:
-        """Return a context whose errors of these classes are raised as this one, with words around theirs."""
+    def instead_of(
+        cls, *causes: type[Exception], before: str = "", after: str = ""
+    ) -> Iterator[None]:
+        """Return a context that re-raises errors of the given classes as this class.
+
+        Parameters
+        ----------
+        *causes : type of Exception
+            The classes that are replaced.
+        before, after : str
+            Words around the message of the original error.
+        """
         try:
             yield
         except causes as cause:

@@ -1,24 +1,27 @@
-"""One publication style for every figure of the project, and reproducible bytes from a figure.
+"""The style of all figures of the project, and their files as reproducible bytes.
 
-Text is drawn as it is written, whatever signs a user's title holds; a text with mathematics between dollar
-signs is given ``parse_math=True``.
+Text is drawn as it is written, whatever characters a user's title holds; a text with mathematics
+between dollar signs needs ``parse_math=True``.
 
-Figures are made with `new_figure` or `panels` inside ``with publication_style():``, or in a function under
-``@publication_style()``, and never through pyplot, so that nothing global is left behind. Equal data give
-equal bytes: ids are salted, dates and program names left out.
+Figures are made with `new_figure` or `panels` inside ``with publication_style():``, or in a
+function under ``@publication_style()``. They never use pyplot, which would change global state.
+Equal data give equal bytes: ids in SVG files follow from a fixed salt, dates and program names are
+left out.
 """
 
 import html
 import io
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, Tick
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -29,7 +32,7 @@ from reporting.errors import InvalidFigureError
 from reporting.files import atomic_write_bytes
 from reporting.hover import annotated
 
-# Okabe and Ito's palette for colour-blind readers; each colour has one meaning everywhere.
+# Okabe and Ito's palette for colour-blind readers; each colour has one meaning in all figures.
 OBSERVED: Final = "#595959"
 """Measurements (small grey dots)."""
 PAST: Final = "#0072B2"
@@ -39,20 +42,24 @@ PRESENT: Final = "#009E73"
 PREDICTION: Final = "#D55E00"
 """Predicted steps (vermilion, dashed or open marks)."""
 TRUTH: Final = "#000000"
-"""What is really so (black, thin dash-dot line); the twin does not know it."""
+"""The true state (black, thin dash-dot line), which the twin does not know."""
 DECISION: Final = "#CC79A7"
 """Controls and policies (purple)."""
 REFERENCE: Final = "#999999"
-"""Limits, reference lines and other things to read against (light grey)."""
+"""Limits and reference lines (light grey)."""
 LEVELS: Final = "cividis"
 """Colour map of magnitudes: perceptually even and safe for colour-blind readers."""
 
 RESIDUALS: Final[dict[str, Any]] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
-"""How residuals are drawn, in standard deviations."""
+"""Colours of a map of residuals, in standard deviations."""
 
 BAND_OPACITY: Final = 0.22
-TRUTH_LINE: Final[dict[str, Any]] = {"color": TRUTH, "linewidth": 1.0, "linestyle": (0, (4, 1.5, 1, 1.5))}
-"""How a truth is drawn."""
+TRUTH_LINE: Final[dict[str, Any]] = {
+    "color": TRUTH,
+    "linewidth": 1.0,
+    "linestyle": (0, (4, 1.5, 1, 1.5)),
+}
+"""The line of the true state."""
 FULL_WIDTH: Final = 7.2
 """Width of a figure over two columns of a journal, in inches."""
 PNG_RESOLUTION: Final = 200.0
@@ -70,7 +77,7 @@ _STYLE: Final[dict[Any, Any]] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,  # a number beside an axis is what is there
+    "axes.formatter.useoffset": False,  # a number beside an axis is the value itself
     "axes.grid": False,
     "axes.unicode_minus": True,
     "grid.color": "#e3e3e3",
@@ -98,13 +105,16 @@ _STYLE: Final[dict[Any, Any]] = {
     "svg.image_inline": True,
     "path.simplify": True,
     "text.usetex": False,
-    "text.parse_math": False,  # a title may hold any sign; a text that is mathematics says so itself
+    "text.parse_math": False,  # a title may hold a dollar sign
 }
 
 
 @contextmanager
 def publication_style() -> Iterator[None]:
-    """Draw in the style of the project whatever the user's own settings are, and restore these after."""
+    """Return a context of matplotlib's settings for figures of the project.
+
+    The user's own settings have no effect in it, and are restored at its end.
+    """
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(_STYLE)
@@ -112,15 +122,22 @@ def publication_style() -> Iterator[None]:
 
 
 def new_figure(height: float, width: float = FULL_WIDTH) -> Figure:
-    """Return an empty figure of the given size in inches, drawn by Agg and unknown to pyplot.
+    """Return an empty figure, drawn by Agg and unknown to pyplot.
+
+    Parameters
+    ----------
+    height, width : float
+        The size [in].
 
     Raises
     ------
     InvalidFigureError
-        A size is not positive.
+        If the size is not positive.
     """
     if not (height > 0.0 and width > 0.0):
-        raise InvalidFigureError(f"A figure needs a positive size in inches, not {width} by {height}.")
+        raise InvalidFigureError(
+            f"A figure needs a positive size in inches, not {width} by {height}."
+        )
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
@@ -129,66 +146,129 @@ def new_figure(height: float, width: float = FULL_WIDTH) -> Figure:
 def panels(
     rows: int, columns: int, height: float, top: float, bottom: float, **grid: Any
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Return a figure of a height [in] and its panels, row by row.
+    """Return a figure and its panels, row by row.
 
     Parameters
     ----------
-    rows, columns, height
-        How many panels, and the height of the figure [in].
-    top, bottom
-        Room above and below the panels [in].
-    **grid
-        What `Figure.add_gridspec` takes, in shares of the figure.
+    rows, columns : int
+        The number of rows and columns of panels.
+    height : float
+        The height of the figure [in].
+    top, bottom : float
+        The margins above and below the panels [in].
+    **grid : float
+        Arguments of `Figure.add_gridspec`, as fractions of the figure.
     """
     figure = new_figure(height)
-    room = {"top": 1.0 - top / height, "bottom": bottom / height, "left": 0.085, "right": 0.985}
-    cells = figure.add_gridspec(rows, columns, **{**room, **grid})
-    return figure, [[figure.add_subplot(cells[row, n]) for n in range(columns)] for row in range(rows)]
+    margins = {"top": 1.0 - top / height, "bottom": bottom / height, "left": 0.085, "right": 0.985}
+    cells = figure.add_gridspec(rows, columns, **{**margins, **grid})
+    grid_of_axes = []
+    for row in range(rows):
+        grid_of_axes.append([figure.add_subplot(cells[row, column]) for column in range(columns)])
+    return figure, grid_of_axes
 
 
-def first_of(grid: list[list[Axes]], count: int) -> list[Axes]:
-    """Return the first panels, row by row; the others are taken away."""
-    every = [axes for row in grid for axes in row]
-    for spare in every[count:]:
-        spare.remove()
-    return every[:count]
+def keep_first_panels(grid_of_axes: list[list[Axes]], count: int) -> list[Axes]:
+    """Return the first panels, row by row, and remove the others from the figure."""
+    panels_in_order = list(chain.from_iterable(grid_of_axes))
+    for axes in panels_in_order[count:]:
+        axes.remove()
+    return panels_in_order[:count]
 
 
-def plain_powers(axis: Axis, parts: tuple[float, ...]) -> None:
-    """Label a logarithmic axis with plain numbers at parts of its decades."""
-    axis.set_major_locator(LogLocator(10.0, parts))
+def plain_powers(axis: Axis, multiples: tuple[float, ...]) -> None:
+    """Label a logarithmic axis with plain numbers.
+
+    Parameters
+    ----------
+    axis : Axis
+        The axis.
+    multiples : tuple of float
+        The multiples of powers of ten that are labelled, such as (1, 2, 5).
+    """
+    axis.set_major_locator(LogLocator(10.0, multiples))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) -> None:
-    """Draw the band between two lines (n,)."""
+    """Draw the band between two lines, each an (N,) array, at x, an (N,) array."""
     axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
 
 
-def interval(axes: Axes, place: float, mean: float, low: float, high: float, **look: Any) -> None:
-    """Draw a mean with its interval, which holds it but for rounding."""
-    ends = [[max(mean - low, 0.0)], [max(high - mean, 0.0)]]
-    axes.errorbar([place], [mean], yerr=ends, linestyle="none", **look)
+def interval(axes: Axes, x: float, mean: float, low: float, high: float, **style: Any) -> None:
+    """Draw a mean with its interval.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    x : float
+        The horizontal coordinate.
+    mean, low, high : float
+        The mean and the ends of its interval. By rounding the mean may lie just outside.
+    **style : object
+        Arguments of `Axes.errorbar`.
+    """
+    lengths = [[max(mean - low, 0.0)], [max(high - mean, 0.0)]]
+    axes.errorbar([x], [mean], yerr=lengths, linestyle="none", **style)
 
 
-def swatches(names: Sequence[str], colors: Sequence[str], **look: Any) -> list[Rectangle]:
-    """Return what a legend shows of named colours."""
-    named = zip(names, colors, strict=True)
-    return [Rectangle((0, 0), 1, 1, facecolor=color, label=name, **look) for name, color in named]
+def swatches(names: Sequence[str], colors: Sequence[str], **style: Any) -> list[Rectangle]:
+    """Return the patches that a legend shows for named colours.
+
+    Parameters
+    ----------
+    names, colors : sequence of str
+        The names and their colours.
+    **style : object
+        Arguments of `Rectangle`.
+    """
+    return [
+        Rectangle((0, 0), 1, 1, facecolor=color, label=name, **style)
+        for name, color in zip(names, colors, strict=True)
+    ]
 
 
-def shared_legend(figure: Figure, rows: int = 1, **place: Any) -> None:
-    """Name above the panels, in some rows, what is drawn with a label in any of them."""
-    pairs = (pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True))
-    named = {label: handle for handle, label in pairs}
-    place = {"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), **place}
-    figure.legend(named.values(), named.keys(), ncols=-(-len(named) // rows), **place)
+def shared_legend(figure: Figure, rows: int = 1, **position: Any) -> None:
+    """Draw one legend for all panels above them; equal labels appear once.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    rows : int
+        The number of rows of the legend.
+    **position : object
+        Arguments of `Figure.legend`, instead of the usual position.
+    """
+    handle_of_label = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handle_of_label[label] = handle
+    figure.legend(
+        handle_of_label.values(),
+        handle_of_label.keys(),
+        ncols=math.ceil(len(handle_of_label) / rows),
+        **{"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), **position},
+    )
 
 
-def color_bar(figure: Figure, drawn: Any, label: str, **place: Any) -> Axes:
-    """Draw the scale of colours of what was drawn; `place` is `ax`, beside a panel, or `cax`, in one."""
-    bar = figure.colorbar(drawn, **place)
+def color_bar(figure: Figure, artist: Any, label: str, **position: Any) -> Axes:
+    """Draw the scale of the colours of an artist, and return its panel.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    artist : ScalarMappable
+        The map or the points whose colours stand for values.
+    label : str
+        The quantity and its unit.
+    **position : object
+        Either `ax`, the panel beside which the scale is drawn, or `cax`, the panel in which.
+    """
+    bar = figure.colorbar(artist, **position)
     bar.set_label(label)
     bar.outline.set_linewidth(0.5)
     return bar.ax
@@ -199,27 +279,30 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
 
     Parameters
     ----------
-    axes
+    axes : Axes
         The panel.
-    label
+    label : str
         Its letter, such as ``a``.
-    title
+    title : str
         A few words beside the letter.
     """
-    axes.set_title("  ".join(part for part in (label, title) if part), loc="left")
+    axes.set_title("  ".join(text for text in (label, title) if text), loc="left")
 
 
 def to_svg(figure: Figure) -> bytes:
-    """Return the figure as SVG: text as outlines, values for the reader's pointer, no date, no DTD."""
+    """Return a figure as SVG, with text as outlines and with values for the reader's pointer.
+
+    The file has neither a date nor a document type.
+    """
     buffer = io.BytesIO()
     with publication_style():
-        _read_powers(figure)
+        _parse_tick_labels_of_powers(figure)
         with annotated(figure) as annotate:
-            # All four must be left out for the block of metadata, with its addresses, to vanish.
+            # Matplotlib leaves out the block of metadata only if all four are None.
             figure.savefig(
                 buffer,
                 format="svg",
-                dpi=PNG_RESOLUTION,  # of what is rasterised in it
+                dpi=PNG_RESOLUTION,  # of the parts that are rasterised
                 metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
             )
         text = annotate(buffer.getvalue().decode("utf-8"))
@@ -228,16 +311,33 @@ def to_svg(figure: Figure) -> bytes:
 
 
 def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
-    """Return the figure as PNG at `resolution` dots per inch, without program name."""
+    """Return a figure as PNG without the name of the program.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    resolution : float
+        The resolution in dots per inch.
+    """
     buffer = io.BytesIO()
     with publication_style():
-        _read_powers(figure)
+        _parse_tick_labels_of_powers(figure)
         figure.savefig(buffer, format="png", dpi=resolution, metadata={"Software": None})
     return buffer.getvalue()
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> bytes:
-    """Write `name` as SVG and as PNG to a folder; return the SVG.
+    """Write a figure as SVG and as PNG, and return the SVG.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    folder : Path
+        The folder of the files.
+    name : str
+        The name of the files, without ending.
 
     Raises
     ------
@@ -250,17 +350,18 @@ def save_figure(figure: Figure, folder: Path, name: str) -> bytes:
     return drawing
 
 
-def _read_powers(figure: Figure) -> None:
-    """Let logarithmic axes show the powers of ten that matplotlib writes as mathematics."""
-    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
-        for formatter, ticks, places in (
-            (axis.get_major_formatter(), axis.get_major_ticks, axis.get_majorticklocs()),
-            (axis.get_minor_formatter(), axis.get_minor_ticks, axis.get_minorticklocs()),
-        ):
-            if isinstance(formatter, LogFormatter):
-                for tick in ticks(len(places)):
-                    tick.label1.set_parse_math(True)
-                    tick.label2.set_parse_math(True)
+def _parse_tick_labels_of_powers(figure: Figure) -> None:
+    """Let logarithmic axes show powers of ten, which matplotlib writes as mathematics."""
+    ticks: list[Tick] = []
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if isinstance(axis.get_major_formatter(), LogFormatter):
+                ticks += axis.get_major_ticks(len(axis.get_majorticklocs()))
+            if isinstance(axis.get_minor_formatter(), LogFormatter):
+                ticks += axis.get_minor_ticks(len(axis.get_minorticklocs()))
+    for tick in ticks:
+        tick.label1.set_parse_math(True)
+        tick.label2.set_parse_math(True)
 
 
 _IDENTIFIER = re.compile(r'\bid="([^"]+)"')
@@ -268,27 +369,41 @@ _REFERENCE = re.compile(r'(href="#|url\(#)([^")]+)')
 
 
 def inline_svg(svg: bytes, prefix: str, description: str) -> str:
-    """Return an SVG ready to stand inside an HTML page.
+    """Return an SVG as an element of an HTML page.
 
-    The XML heading goes, every id and every reference to one get `prefix` (ids must be unique in a page), the
-    size follows the page, and a description is there for those who cannot see it.
+    The XML heading is removed, and the size of the drawing follows the page.
+
+    Parameters
+    ----------
+    svg : bytes
+        The SVG.
+    prefix : str
+        The beginning of all ids and references to them; ids must be unique in a page.
+    description : str
+        The description for readers who cannot see the drawing.
 
     Raises
     ------
     InvalidFigureError
-        The bytes are not an SVG.
+        If the bytes are not an SVG that can be scaled.
     """
     text = svg.decode("utf-8", errors="replace")
     start = text.find("<svg")
     end = text.find(">", start)
     if start < 0 or end < 0:
-        raise InvalidFigureError("A figure for a page must be an SVG; the bytes given have no <svg> element.")
-    opening, body = text[start:end], text[end:].rstrip()
+        raise InvalidFigureError(
+            "A figure for a page must be an SVG; the bytes given have no <svg> element."
+        )
+    opening = text[start:end]
+    body = text[end:].rstrip()
     view_box = re.search(r'viewBox="([^"]+)"', opening)
     if view_box is None:
-        raise InvalidFigureError("A figure for a page must have a viewBox, or it could not be scaled.")
+        raise InvalidFigureError(
+            "A figure for a page must have a viewBox, or it could not be scaled."
+        )
     body = _IDENTIFIER.sub(rf'id="{prefix}-\1"', body)
     body = _REFERENCE.sub(rf"\1{prefix}-\2", body)
-    # Inside HTML the parser knows the namespaces; `href` without the xlink prefix is the current standard.
+    # Inside HTML the parser knows the namespaces, and `href` needs no prefix.
     body = body.replace("xlink:href=", "href=")
-    return f'<svg viewBox="{view_box.group(1)}" role="img" aria-label="{html.escape(description)}"{body}'
+    label = html.escape(description)
+    return f'<svg viewBox="{view_box.group(1)}" role="img" aria-label="{label}"{body}'

@@ -1,7 +1,8 @@
-"""Files that are either whole or not there: atomic writes; and hashes of contents.
+"""Atomic writes of files, and hashes of their contents.
 
-Everything is written under a temporary name in the folder of its destination, flushed to the disk and moved
-into place in one step. A kill, a full disk or a refused permission leaves the previous file as it was.
+A file is written under a temporary name in the folder of its destination, flushed to the disk and
+moved into place in one step. After a kill, a full disk or a refused permission the previous file is
+as it was.
 """
 
 import errno
@@ -12,28 +13,36 @@ import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from reporting.errors import DiskFullError, FileNotWrittenError
 
 TEMPORARY_SUFFIX = ".partial"
-"""Ending of the temporary names, so that a leftover of a killed process is recognisable."""
+"""Ending of the temporary names, by which the leftovers of a killed process are recognised."""
 
 _NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-_REFUSED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
-_temporary_count = itertools.count()
+_NO_PERMISSION = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+_temporary_file_numbers = itertools.count()
 
 
 def write_error(error: OSError, path: Path) -> FileNotWrittenError:
-    """Return the exception with one clear sentence for an operating-system error met while writing `path`."""
+    """Return the exception that says why the operating system could not write a file.
+
+    Parameters
+    ----------
+    error : OSError
+        The error of the operating system.
+    path : Path
+        The file that was being written.
+    """
     if error.errno in _NO_SPACE:
         return DiskFullError(
             f"No space is left on the disk to write {path}: free some space and repeat; "
             "what was there before is unchanged."
         )
-    if error.errno in _REFUSED:
+    if error.errno in _NO_PERMISSION:
         return FileNotWrittenError(
-            f"Writing {path} is not permitted: choose another place or change the permissions of its folder."
+            f"Writing {path} is not permitted: "
+            "choose another place or change the permissions of its folder."
         )
     if error.errno in (errno.ENOENT, errno.ENOTDIR) and not path.parent.is_dir():
         return FileNotWrittenError(
@@ -43,8 +52,14 @@ def write_error(error: OSError, path: Path) -> FileNotWrittenError:
 
 
 @contextmanager
-def written(path: Path) -> Iterator[None]:
-    """Turn what the operating system refuses while writing `path` into one clear sentence."""
+def explained_write_errors(path: Path) -> Iterator[None]:
+    """Return a context that raises errors of the operating system as `write_error` of a path.
+
+    Raises
+    ------
+    DiskFullError, FileNotWrittenError
+        If the operating system refuses to write.
+    """
     try:
         yield
     except OSError as error:
@@ -52,11 +67,13 @@ def written(path: Path) -> Iterator[None]:
 
 
 def _destination(path: Path) -> Path:
-    """Return the file behind `path` (links followed); refuse a folder and a device."""
+    """Return the file that a path leads to, through links; refuse a folder and a device."""
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "not an ordinary file"
-        raise FileNotWrittenError(f"{path} cannot be written because it is {kind}: choose another name.")
+        raise FileNotWrittenError(
+            f"{path} cannot be written because it is {kind}: choose another name."
+        )
     return target
 
 
@@ -66,7 +83,7 @@ def synchronise(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        # Some file systems cannot flush a folder; the move itself is atomic there all the same.
+        # Some file systems cannot flush a folder; moving a file is still atomic there.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
             raise
     finally:
@@ -74,55 +91,82 @@ def synchronise(path: Path) -> None:
 
 
 def refuse_existing(path: Path | None, *, replace: bool, option: str = "--out") -> None:
-    """Refuse a file that is there and may not be replaced, before anything is computed for it.
+    """Refuse to replace an existing file, before its content is computed.
+
+    Parameters
+    ----------
+    path : Path, optional
+        The file to write.
+    replace : bool
+        Whether an existing file may be replaced.
+    option : str
+        The option that gives the path, for the message.
 
     Raises
     ------
     FileNotWrittenError
-        `path` exists, and `replace` is not set.
+        If the file exists and may not be replaced.
     """
     if path is not None and path.exists() and not replace:
         raise FileNotWrittenError(f"{path} exists: choose another {option} or give --replace.")
 
 
 def refuse_filled(folder: Path | None, option: str = "--out") -> None:
-    """Refuse a folder to write that holds something, or that is a file.
+    """Refuse to write into a folder that is not empty, or that is a file.
+
+    Parameters
+    ----------
+    folder : Path, optional
+        The folder to write.
+    option : str
+        The option that gives the folder, for the message.
 
     Raises
     ------
     FileNotWrittenError
-        `folder` exists and is not an empty folder.
+        If the path exists and is not an empty folder.
     """
-    if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileNotWrittenError(f"{folder} exists and is not an empty folder: choose another {option}.")
+    if folder is None or not folder.exists():
+        return
+    is_empty_folder = folder.is_dir() and not any(folder.iterdir())
+    if not is_empty_folder:
+        raise FileNotWrittenError(
+            f"{folder} exists and is not an empty folder: choose another {option}."
+        )
 
 
 @contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path to write to, and move it to `path` when the block ends without an exception.
+    """Return a context with a temporary file, which replaces `path` at the end of the block.
 
-    For writers that want a file name (NetCDF, zip, VTU). The temporary file lies in the same folder and has
-    the same ending as `path`. If the block raises, the temporary file is removed and `path` is unchanged.
+    For writers that need a file name (NetCDF, zip, VTU). The temporary file lies in the same folder
+    and has the same ending as `path`. If the block raises, the temporary file is removed and `path`
+    is unchanged.
 
     Parameters
     ----------
-    path
-        Destination; replaced if it exists, and its folder made if it is missing. A symbolic link is followed.
+    path : str or path-like
+        The file to write. A symbolic link is followed, and a missing folder is made.
+
+    Yields
+    ------
+    Path
+        The temporary file.
 
     Raises
     ------
     DiskFullError
-        No space is left.
+        If no space is left.
     FileNotWrittenError
-        The folder cannot be made or is read-only, or `path` is a folder or a device.
+        If the folder cannot be made or is read-only, or `path` is a folder or a device.
     """
     requested = Path(path)
     target = _destination(requested)
-    label = f"{os.getpid()}-{next(_temporary_count)}"
+    label = f"{os.getpid()}-{next(_temporary_file_numbers)}"
     temporary = target.with_name(f".{target.stem}.{label}{TEMPORARY_SUFFIX}{target.suffix}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        # Created here, with the permissions of the user's umask and not those of a private temporary file.
+        # The user's umask gives the permissions; `tempfile` would make a private file.
         os.close(os.open(temporary, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666))
         yield temporary
         synchronise(temporary)
@@ -136,48 +180,55 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
-    """Write bytes to `path` in one step; return the path.
-
-    Raises
-    ------
-    DiskFullError, FileNotWrittenError
-        As `atomic_file`.
-    """
+    """Write bytes to a file in one step, and return its path; raises as `atomic_file`."""
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
     return Path(path)
 
 
 def atomic_write_text(path: str | os.PathLike[str], text: str) -> Path:
-    """Write text to `path` in UTF-8 with the line ends as given, in one step; return the path.
+    """Write text to a file in one step, and return its path; raises as `atomic_file`.
 
-    Raises
-    ------
-    DiskFullError, FileNotWrittenError
-        As `atomic_file`.
+    The text is encoded in UTF-8; its line ends stay as they are.
     """
     return atomic_write_bytes(path, text.encode("utf-8"))
 
 
-def members_of(folder: Path, suffixes: Collection[str] = ()) -> dict[str, bytes]:
-    """Return the files below a folder, or those with one of the suffixes, by their places in it, in order."""
-    found = (
-        path for path in folder.rglob("*") if path.is_file() and (not suffixes or path.suffix in suffixes)
-    )
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(found)}
+def read_members(folder: Path, suffixes: Collection[str] = ()) -> dict[str, bytes]:
+    """Return the contents of the files below a folder by their relative paths, in order.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    suffixes : collection of str
+        The suffixes of the files to read, such as ".py"; all files by default.
+    """
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    if suffixes:
+        files = [path for path in files if path.suffix in suffixes]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(files)}
 
 
 def write_members(folder: Path, members: Mapping[str, bytes]) -> None:
-    """Write files to their places in a folder, those that are not there yet; raises as `atomic_file`."""
+    """Write files below a folder unless they exist; raises as `atomic_file`.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    members : mapping of str to bytes
+        The contents by relative path.
+    """
     for name, content in members.items():
         if not (folder / name).exists():
             atomic_write_bytes(folder / name, content)
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> int:
-    """Remove the temporary files that killed processes left in `folder`; return how many there were.
+    """Remove the temporary files that killed processes left in a folder, and return their number.
 
-    Only for a folder that no other process writes to at this moment.
+    No other process may be writing to the folder at this moment.
     """
     leftovers = [path for path in Path(folder).glob(f".*{TEMPORARY_SUFFIX}*") if path.is_file()]
     for path in leftovers:
@@ -186,13 +237,17 @@ def remove_leftovers(folder: str | os.PathLike[str]) -> int:
 
 
 def hash_tree(root: Path, *, suffixes: Iterable[str]) -> str:
-    """Return the SHA-256 of the files below `root` with one of the suffixes; line ends do not count."""
-    members = members_of(root, frozenset(suffixes))
-    return hash_members({name: content.replace(b"\r\n", b"\n") for name, content in members.items()})
+    """Return the SHA-256 of the files below a folder that have one of the suffixes.
+
+    Line ends of Windows and of Unix give the same hash.
+    """
+    members = read_members(root, frozenset(suffixes))
+    with_unix_ends = {name: content.replace(b"\r\n", b"\n") for name, content in members.items()}
+    return hash_members(with_unix_ends)
 
 
 def hash_members(members: Mapping[str, bytes]) -> str:
-    """Return the SHA-256 over the names and contents of files, in the order of their names."""
+    """Return the SHA-256 over the names and contents of files, which are sorted by name."""
     digest = hashlib.sha256()
     for name, content in sorted(members.items()):
         digest.update(f"{name}\0{len(content)}\0".encode())
@@ -201,25 +256,27 @@ def hash_members(members: Mapping[str, bytes]) -> str:
 
 
 def hash_bytes(data: bytes) -> str:
-    """Return the SHA-256 of the bytes as 64 hexadecimal digits."""
+    """Return the SHA-256 of bytes, as 64 hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
 
 def hash_file(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file's content; its name and date do not count."""
+    """Return the SHA-256 of the content of a file."""
     with Path(path).open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def hash_record(record: Any) -> str:
-    """Return the SHA-256 of a JSON-like record; the order of keys does not count.
+def hash_record(record: object) -> str:
+    """Return the SHA-256 of plain data of JSON; the order of keys does not matter.
 
     Raises
     ------
     TypeError
-        The record holds something that JSON cannot.
+        If the record holds something that JSON cannot express.
     ValueError
-        The record holds NaN or an infinity.
+        If the record holds NaN or an infinity.
     """
-    text = json.dumps(record, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    text = json.dumps(
+        record, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
     return hash_bytes(text.encode("utf-8"))

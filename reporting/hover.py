@@ -1,14 +1,15 @@
-"""What a reader of a page sees under the pointer: values of lines, points and maps, their names and units.
+"""Values under the pointer in the figures of a page: of lines, points and maps, with units.
 
-An SVG of matplotlib has every point of a line already. What it lacks are the scales of the panels and the
-names of the lines; `annotated` adds these as attributes, and the script of a page (`hover.js`) reads both.
+An SVG of matplotlib holds every point of a line already. It lacks the scales of the panels and the
+names of the lines; `annotated` adds these as attributes, and the script of a page (`hover.js`)
+reads both.
 """
 
 import html
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -21,165 +22,252 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
+from reporting.arrays import Float
 from reporting.table_file import is_number
 
 _POINTS_PER_INCH = 72.0
 _MOST_CELLS = 5000
-"""Cells of a map whose values a page holds."""
+"""Largest map whose values a page holds, in cells."""
 _FEW_COLOURS = 20
-"""So few colours stand for names, such as those of controls, and not for values."""
-_Look = tuple[str, str, str]
+"""Colour maps with fewer colours stand for names, such as those of controls, and not for values."""
+_SAME_POSITION = 1e-6  # of two panels, as a fraction of the figure
+
+JsonObject = dict[str, Any]
+
+
+class _LineLook(NamedTuple):
+    """Colour, line style and marker, by which lines of several panels are recognised as equal."""
+
+    colour: str
+    style: str
+    marker: str
+
+
+class _Annotation(NamedTuple):
+    """An attribute that an artist gets in the SVG; that of a panel is made after drawing."""
+
+    artist: Artist
+    attribute: str
+    value: str = ""
 
 
 @contextmanager
 def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
-    """Let a figure be drawn as SVG inside, and yield what adds the attributes to it.
+    """Return a context that yields a function, which adds attributes to the SVG drawn inside.
 
-    Panels get ``data-axes`` (box in units of the SVG; limits, scale, name and texts of either axis),
-    lines and scatters ``data-series`` (name, colour), bands and error bars ``data-spread`` (colour).
+    Panels get ``data-axes`` (box in units of the SVG; limits, scale, name and texts of either
+    axis), lines and scatters ``data-series`` (name, colour), bands and error bars ``data-spread``
+    (colour).
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure to draw as SVG in the block.
     """
-    names = _names(figure)
-    marked: list[tuple[Artist, str, str]] = []
-    for axes in figure.axes:
-        if {axes.get_xscale(), axes.get_yscale()} <= {"linear", "log"}:
-            found = list(_marked(axes, names))
-            if any(attribute == "data-series" for _, attribute, _ in found) or _maps(axes):
-                marked += [*found, (axes, "data-axes", "")]
-    marked = [entry for entry in marked if entry[0].get_gid() is None]
-    for number, (artist, _, _) in enumerate(marked):
-        artist.set_gid(f"hover-{number}-")
+    annotations = _annotations(figure)
+    # Matplotlib writes the group id of an artist into the SVG, where `annotate` replaces it.
+    for number, annotation in enumerate(annotations):
+        annotation.artist.set_gid(f"hover-{number}-")
 
     def annotate(svg: str) -> str:
-        for number, (artist, attribute, value) in enumerate(marked):
-            text = json.dumps(_frame(artist), ensure_ascii=False) if isinstance(artist, Axes) else value
-            svg = svg.replace(f'id="hover-{number}-"', f'{attribute}="{html.escape(text)}"', 1)
+        for number, (artist, attribute, value) in enumerate(annotations):
+            if isinstance(artist, Axes):
+                value = json.dumps(_panel_record(artist), ensure_ascii=False)
+            replacement = f'{attribute}="{html.escape(value)}"'
+            svg = svg.replace(f'id="hover-{number}-"', replacement, 1)
         return svg
 
     try:
         yield annotate
     finally:
-        for artist, _, _ in marked:
-            artist.set_gid(None)
+        for annotation in annotations:
+            annotation.artist.set_gid(None)
 
 
-def _marked(axes: Axes, names: dict[_Look, str]) -> Iterator[tuple[Artist, str, str]]:
-    """Yield what is read from a panel: the artist, its attribute and the value of this."""
-    caps: list[Artist] = []
-    titles: dict[Artist, str] = {}
+def _annotations(figure: Figure) -> list[_Annotation]:
+    """Return the annotations of all panels with lines, points or maps.
+
+    Artists that have a group id already get none.
+    """
+    line_names = _line_names(figure)
+    annotations: list[_Annotation] = []
+    for axes in figure.axes:
+        if not {axes.get_xscale(), axes.get_yscale()} <= {"linear", "log"}:
+            continue
+        of_panel = [*_error_bar_annotations(axes), *_data_annotations(axes, line_names)]
+        has_series = any(annotation.attribute == "data-series" for annotation in of_panel)
+        if has_series or _map_records(axes):
+            annotations += [*of_panel, _Annotation(axes, "data-axes")]
+    return [annotation for annotation in annotations if annotation.artist.get_gid() is None]
+
+
+def _error_bar_annotations(axes: Axes) -> Iterator[_Annotation]:
     for container in axes.containers:
         if isinstance(container, ErrorbarContainer):
-            line, ends, spans = container.lines
-            caps += ends
-            if line is not None:
-                titles[line] = str(container.get_label())
-            for span in spans:
-                yield span, "data-spread", to_hex(np.asarray(span.get_colors())[0])
+            _, _, bars = container.lines
+            for bar in bars:
+                yield _Annotation(bar, "data-spread", to_hex(np.asarray(bar.get_colors())[0]))
+
+
+def _data_annotations(axes: Axes, line_names: dict[_LineLook, str]) -> Iterator[_Annotation]:
+    """Yield the annotations of bands, lines and scatters in the coordinates of the data."""
+    caps: list[Artist] = []  # of error bars
+    error_bar_names: dict[Artist, str] = {}
+    for container in axes.containers:
+        if isinstance(container, ErrorbarContainer):
+            data_line, cap_lines, _ = container.lines
+            caps += cap_lines
+            if data_line is not None:
+                error_bar_names[data_line] = str(container.get_label())
     for artist in (*axes.lines, *axes.collections):
         if isinstance(artist, FillBetweenPolyCollection):
-            yield artist, "data-spread", to_hex(np.asarray(artist.get_facecolor())[0])
+            colour = to_hex(np.asarray(artist.get_facecolor())[0])
+            yield _Annotation(artist, "data-spread", colour)
         elif isinstance(artist, Line2D | PathCollection) and artist not in caps:
-            own = artist.get_transform() if isinstance(artist, Line2D) else artist.get_offset_transform()
-            if own == axes.transData:  # else a line that marks one coordinate only, such as a limit
-                look = _look(artist)
-                name = _public(titles.get(artist, str(artist.get_label()))) or names.get(look, "")
-                yield artist, "data-series", json.dumps([name, look[0]], ensure_ascii=False)
+            if not _is_in_data_coordinates(artist, axes):
+                continue
+            look = _look_of(artist)
+            label = error_bar_names.get(artist, str(artist.get_label()))
+            name = _public_label(label) or line_names.get(look, "")
+            value = json.dumps([name, look.colour], ensure_ascii=False)
+            yield _Annotation(artist, "data-series", value)
 
 
-def _names(figure: Figure) -> dict[_Look, str]:
-    """Return what lines are called by legends, and else by other panels where they look the same."""
-    found: dict[_Look, str] = {}
+def _is_in_data_coordinates(artist: Line2D | PathCollection, axes: Axes) -> bool:
+    """Return whether both coordinates are data; a line that marks a limit has only one such."""
+    if isinstance(artist, Line2D):
+        return artist.get_transform() == axes.transData
+    return artist.get_offset_transform() == axes.transData
+
+
+def _line_names(figure: Figure) -> dict[_LineLook, str]:
+    """Return the names of lines in legends, and else in other panels where lines look the same."""
+    names: dict[_LineLook, str] = {}
     for legend in (*figure.legends, *(axes.get_legend() for axes in figure.axes)):
-        if legend is not None:
-            for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
-                if isinstance(handle, Line2D):
-                    found.setdefault(_look(handle), text.get_text())
-    for line in (line for axes in figure.axes for line in axes.lines):
-        if _public(str(line.get_label())):
-            found.setdefault(_look(line), str(line.get_label()))
-    return found
+        if legend is None:
+            continue
+        for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
+            if isinstance(handle, Line2D):
+                names.setdefault(_look_of(handle), text.get_text())
+    for axes in figure.axes:
+        for line in axes.lines:
+            label = str(line.get_label())
+            if _public_label(label):
+                names.setdefault(_look_of(line), label)
+    return names
 
 
-def _public(label: str) -> str:
+def _public_label(label: str) -> str:
+    """Return a label, or "" for the labels with underscore that matplotlib gives itself."""
     return "" if label.startswith("_") else label
 
 
-def _look(artist: Line2D | PathCollection) -> _Look:
-    """Return colour, style and marker."""
+def _look_of(artist: Line2D | PathCollection) -> _LineLook:
     if isinstance(artist, PathCollection):
-        return "", "", ""
-    style, marker = artist.get_linestyle(), str(artist.get_marker())
+        return _LineLook("", "", "")
+    style = artist.get_linestyle()
     colour = artist.get_markeredgecolor() if style == "None" else artist.get_color()
-    return to_hex(colour), str(style), marker
+    return _LineLook(to_hex(colour), str(style), str(artist.get_marker()))
 
 
-def _frame(axes: Axes) -> dict[str, Any]:
-    """Return where a drawn panel is and what its axes mean."""
+def _panel_record(axes: Axes) -> JsonObject:
+    """Return the box of a drawn panel in the SVG, and the meaning of its axes."""
     figure = axes.get_figure(root=True)
     assert figure is not None
-    width, height = (_POINTS_PER_INCH * size for size in figure.get_size_inches())
+    width, height = (_POINTS_PER_INCH * inches for inches in figure.get_size_inches())
     box = axes.get_position()
-    place = [box.x0 * width, box.x1 * width, (1.0 - box.y0) * height, (1.0 - box.y1) * height]
-    # One panel of a column names the horizontal axis of all, and one of a row the vertical axis.
-    panels = [(other, other.get_position()) for other in (axes, *figure.axes)]
-    column = [
-        other.get_xlabel() for other, at in panels
-        if other.get_xlim() == axes.get_xlim() and abs(at.x0 - box.x0) < 1e-6
-    ]  # fmt: skip
-    row = [
-        other.get_ylabel() for other, at in panels
-        if other.get_ylim() == axes.get_ylim() and abs(at.y0 - box.y0) < 1e-6
-    ]  # fmt: skip
+    corners = [box.x0 * width, box.x1 * width, (1.0 - box.y0) * height, (1.0 - box.y1) * height]
+    x_name = _shared_x_label(axes, figure.axes)
+    y_name = _shared_y_label(axes, figure.axes)
     return {
         "title": axes.get_title(loc="left") or axes.get_title(),
-        "maps": _maps(axes),
-        "box": [round(value, 3) for value in place],
-        "x": _scale(axes.xaxis, axes.get_xlim(), axes.get_xscale(), next(filter(None, column), "")),
-        "y": _scale(axes.yaxis, axes.get_ylim(), axes.get_yscale(), next(filter(None, row), "")),
+        "maps": _map_records(axes),
+        "box": [round(value, 3) for value in corners],
+        "x": _axis_record(axes.xaxis, axes.get_xlim(), axes.get_xscale(), x_name),
+        "y": _axis_record(axes.yaxis, axes.get_ylim(), axes.get_yscale(), y_name),
     }
 
 
-def _maps(axes: Axes) -> list[dict[str, Any]]:
-    """Return the maps of a panel: edges of columns x and rows y, values with null where there is none."""
-    figure, found = axes.get_figure(root=True), []
-    if figure is None or _is_bar(axes) or {axes.get_xscale(), axes.get_yscale()} != {"linear"}:
+def _shared_x_label(axes: Axes, panels: Iterable[Axes]) -> str:
+    """Return the label of the horizontal axis, which one panel of a column may carry for all."""
+    for panel in (axes, *panels):
+        has_same_limits = panel.get_xlim() == axes.get_xlim()
+        offset = abs(panel.get_position().x0 - axes.get_position().x0)
+        if has_same_limits and offset < _SAME_POSITION and panel.get_xlabel():
+            return panel.get_xlabel()
+    return ""
+
+
+def _shared_y_label(axes: Axes, panels: Iterable[Axes]) -> str:
+    """Return the label of the vertical axis, which one panel of a row may carry for all."""
+    for panel in (axes, *panels):
+        has_same_limits = panel.get_ylim() == axes.get_ylim()
+        offset = abs(panel.get_position().y0 - axes.get_position().y0)
+        if has_same_limits and offset < _SAME_POSITION and panel.get_ylabel():
+            return panel.get_ylabel()
+    return ""
+
+
+def _map_records(axes: Axes) -> list[JsonObject]:
+    """Return the maps of a panel: edges of columns x and of rows y, and values, null for none."""
+    figure = axes.get_figure(root=True)
+    if figure is None or _is_color_bar(axes):
         return []
-    label = next((other.get_ylabel() for other in figure.axes if _is_bar(other)), "") or "value"
+    if {axes.get_xscale(), axes.get_yscale()} != {"linear"}:
+        return []
+    color_bar_labels = [panel.get_ylabel() for panel in figure.axes if _is_color_bar(panel)]
+    name = color_bar_labels[0] if color_bar_labels else ""
+    records: list[JsonObject] = []
     for artist in (*axes.collections, *axes.images):
         if not isinstance(artist, QuadMesh | AxesImage) or artist.get_cmap().N < _FEW_COLOURS:
             continue
         values: Any = np.ma.masked_invalid(np.ma.asarray(artist.get_array()))
         if values.ndim != 2 or values.size > _MOST_CELLS:
             continue
-        if isinstance(artist, QuadMesh):
-            corners = np.asarray(artist.get_coordinates())
-            x, y = corners[0, :, 0], corners[:, 0, 1]
-        else:
-            left, right, bottom, top = artist.get_extent()
-            ends = (bottom, top) if artist.origin == "lower" else (top, bottom)
-            x, y = np.linspace(left, right, values.shape[1] + 1), np.linspace(*ends, values.shape[0] + 1)
-        rows = [[None if cell is None else float(f"{cell:.3g}") for cell in row] for row in values.tolist()]
-        found.append({"x": x.tolist(), "y": y.tolist(), "values": rows, "name": label})
-    return found
+        x, y = _cell_edges(artist, values.shape)
+        rows = [_rounded_cells(row) for row in values.tolist()]
+        records.append({"x": x.tolist(), "y": y.tolist(), "values": rows, "name": name or "value"})
+    return records
 
 
-def _is_bar(axes: Axes) -> bool:
-    """Whether a panel is the scale of colours beside a map."""
+def _cell_edges(artist: QuadMesh | AxesImage, shape: tuple[int, int]) -> tuple[Float, Float]:
+    """Return the edges of the columns and of the rows of a map."""
+    if isinstance(artist, QuadMesh):
+        corners = np.asarray(artist.get_coordinates())
+        return corners[0, :, 0], corners[:, 0, 1]
+    rows, columns = shape
+    left, right, bottom, top = artist.get_extent()
+    first, last = (bottom, top) if artist.origin == "lower" else (top, bottom)
+    return np.linspace(left, right, columns + 1), np.linspace(first, last, rows + 1)
+
+
+def _rounded_cells(row: Sequence[float | None]) -> list[float | None]:
+    return [None if value is None else float(f"{value:.3g}") for value in row]
+
+
+def _is_color_bar(axes: Axes) -> bool:
+    """Return whether a panel is the scale of colours beside a map."""
     return hasattr(axes, "_colorbar")
 
 
-def _scale(axis: Axis, limits: tuple[float, float], kind: str, name: str) -> dict[str, Any]:
-    """Return limits and name of an axis, and the texts that stand for places where they are no numbers."""
-    found: dict[str, Any] = {
+def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str) -> JsonObject:
+    """Return limits and name of an axis, and the texts of its ticks where they are no numbers."""
+    record: JsonObject = {
         "name": " ".join(name.split()),
         "limits": [float(f"{end:.9g}") for end in limits],
     }
-    if kind == "log":
-        found["log"] = True
-        return found
-    places = [float(place) for place in axis.get_majorticklocs()]
-    texts = axis.get_major_formatter().format_ticks(places)
+    if scale == "log":
+        record["log"] = True
+        return record
+    ticks = [float(tick) for tick in axis.get_majorticklocs()]
+    texts = axis.get_major_formatter().format_ticks(ticks)
     if not name and not any(texts):
-        found["unsaid"] = True
-    if any(text and not is_number(text.replace("\N{MINUS SIGN}", "-")) for text in texts):
-        found["texts"] = [[place, " ".join(text.split())] for place, text in zip(places, texts, strict=True)]
-    return found
+        record["unsaid"] = True
+    if any(_is_word(text) for text in texts):
+        pairs = zip(ticks, texts, strict=True)
+        record["texts"] = [[tick, " ".join(text.split())] for tick, text in pairs]
+    return record
+
+
+def _is_word(tick_text: str) -> bool:
+    return bool(tick_text) and not is_number(tick_text.replace("\N{MINUS SIGN}", "-"))

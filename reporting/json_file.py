@@ -1,4 +1,4 @@
-"""The one reader of JSON: whatever is wrong with a file becomes one sentence of the caller's exception.
+"""The one reader of JSON: a fault of a file is one sentence of the caller's exception.
 
 Also records (dataclasses of numbers, words, arrays and other records) as plain data of JSON.
 """
@@ -16,87 +16,131 @@ import numpy as np
 
 from reporting.text_file import check_nesting, decoded, read_text, too_deep
 
-_LONGEST_INTEGER = len(str(-(2**63)))
+_SMALLEST_INTEGER = -(2**63)
+_LARGEST_INTEGER = 2**63 - 1
+_LONGEST_INTEGER = len(str(_SMALLEST_INTEGER))
 
 
 def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -> Any:
-    """Return the content of a JSON file; parameters as `reporting.toml_file.read_toml`.
+    """Return the content of a JSON file.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file; UTF-8, with or without a byte order mark.
+    error : type of Exception
+        The exception to raise.
+    what : str
+        What the file should be, for the message: "patch".
 
     Raises
     ------
     error
-        The file is not there, cannot be read, is not UTF-8 or not JSON (which has no NaN), is nested too
-        deeply, names a key twice, or holds a number that 64 bits cannot.
+        If the file does not exist, cannot be read, is not UTF-8 or not JSON (which has no NaN), is
+        nested too deeply, repeats a key, or holds a number that does not fit in 64 bits.
     """
     return parse_json(read_text(path, error, what=what), f"The {what} {path}", error)
 
 
-def parse_json(content: bytes | str, source: str, error: type[Exception], *, any_number: bool = False) -> Any:
-    """Return the content of JSON that was read elsewhere; `source` names it in the sentence of `error`.
+def parse_json(
+    content: bytes | str, source: str, error: type[Exception], *, any_number: bool = False
+) -> Any:
+    """Return the content of a JSON text.
 
-    With `any_number` it may have NaN, infinities and numbers that 64 bits cannot hold, which are floats.
+    Parameters
+    ----------
+    content : bytes or str
+        The text.
+    source : str
+        Where the text is from; begins the message.
+    error : type of Exception
+        The exception to raise, for the reasons of `read_json`.
+    any_number : bool
+        Whether the text may hold NaN, infinities, and integers beyond 64 bits, which become floats.
     """
     text = decoded(content, source, error) if isinstance(content, bytes) else content
     try:
-        found = json.loads(
+        document = json.loads(
             text,
-            parse_int=_any_integer if any_number else _integer,
-            parse_float=float if any_number else _decimal,
-            parse_constant=float if any_number else _refuse,
-            object_pairs_hook=_table,
+            parse_int=_parse_long_integer if any_number else _parse_integer,
+            parse_float=float if any_number else _parse_finite_float,
+            parse_constant=float if any_number else _refuse_number,
+            object_pairs_hook=_object_without_repeated_keys,
         )
     except ValueError as cause:
         raise error(f"{source} is not valid JSON: {cause}.") from cause
     except RecursionError:
         raise error(too_deep(source)) from None
-    check_nesting(found, source, error)
-    return found
+    check_nesting(document, source, error)
+    return document
 
 
-def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of JSON; of a key that comes twice Python would take the last."""
+def _object_without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON; Python itself would keep the last of repeated keys."""
     table = dict(pairs)
     if len(table) < len(pairs):
-        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
-        raise ValueError(f"the key {twice!r} comes twice")
+        counts = Counter(name for name, _ in pairs)
+        repeated_key, _ = counts.most_common(1)[0]
+        raise ValueError(f"the key {repeated_key!r} comes twice")
     return table
 
 
-def _refuse(number: str) -> NoReturn:
-    raise ValueError(f"{number[:40]} is no number in JSON")
+def _refuse_number(text: str) -> NoReturn:
+    raise ValueError(f"{text[:40]} is no number in JSON")
 
 
-def _decimal(text: str) -> float:
+def _parse_finite_float(text: str) -> float:
     number = float(text)
-    return number if isfinite(number) else _refuse(text)
-
-
-def _any_integer(digits: str) -> float:
-    return int(digits) if len(digits) < _LONGEST_INTEGER else float(digits)
-
-
-def _integer(digits: str) -> int:
-    """Return an integer that NumPy, HDF5 and `float` hold; Python's own is as long as the text."""
-    if len(digits) > _LONGEST_INTEGER or not -(2**63) <= (number := int(digits)) < 2**63:
-        raise ValueError(f"an integer of {len(digits)} digits, and 64 bits are what a file may hold")
+    if not isfinite(number):
+        _refuse_number(text)
     return number
 
 
-def plain(value: Any, odd: Callable[[float], Any] = lambda _: None) -> Any:
-    """Return a value as JSON has it: records by their fields, arrays as lists.
+def _parse_long_integer(digits: str) -> float:
+    """Return an integer, or a float where it has more digits than 64 bits hold."""
+    if len(digits) < _LONGEST_INTEGER:
+        return int(digits)
+    return float(digits)
 
-    `odd` says what stands for a number that is not finite: null.
+
+def _parse_integer(digits: str) -> int:
+    """Return an integer that NumPy, HDF5 and `float` can hold; integers of Python have no limit."""
+    # The length comes first: Python refuses to convert thousands of digits.
+    if len(digits) <= _LONGEST_INTEGER:
+        number = int(digits)
+        if _SMALLEST_INTEGER <= number <= _LARGEST_INTEGER:
+            return number
+    raise ValueError(f"an integer of {len(digits)} digits, and 64 bits are what a file may hold")
+
+
+def _null(_: float) -> None:
+    return None
+
+
+def plain(value: Any, not_finite: Callable[[float], Any] = _null) -> Any:
+    """Return a value as plain data of JSON: records by their fields, arrays as lists.
+
+    Parameters
+    ----------
+    value : object
+        Numbers, words, arrays, records, and collections of these. An object with a method
+        `to_list` is written as that returns it.
+    not_finite : callable
+        Returns what replaces a NaN or an infinity; null by default.
     """
-    if hasattr(value, "to_list"):  # what says itself how it is written, as a patch does
+    if hasattr(value, "to_list"):
         return value.to_list()
     if isinstance(value, Enum):
         return value.value
     if is_dataclass(value):
-        return {item.name: plain(getattr(value, item.name), odd) for item in fields(value) if item.init}
+        arguments = [field.name for field in fields(value) if field.init]
+        return {name: plain(getattr(value, name), not_finite) for name in arguments}
     if isinstance(value, Mapping):
-        return {str(name): plain(item, odd) for name, item in value.items()}
+        return {str(name): plain(entry, not_finite) for name, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, tuple | list):
-        return [plain(item, odd) for item in value]
-    return odd(value) if isinstance(value, float) and not isfinite(value) else value
+        return [plain(entry, not_finite) for entry in value]
+    if isinstance(value, float) and not isfinite(value):
+        return not_finite(value)
+    return value

@@ -1,7 +1,7 @@
-"""Names that a module hands on: imported from their own modules when they are first used.
+"""Names that a module re-exports and imports only when they are first used.
 
-A `.pyi` file beside the module lists them, for this and for type checkers. So a command needs nothing of what
-others use, and `--help` needs none.
+A `.pyi` file beside the module lists them, for this module and for type checkers. So a command
+imports only what it needs, and `--help` imports none of it.
 """
 
 import re
@@ -10,21 +10,37 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-
-def homes_of(file: str) -> dict[str, str]:
-    """Return the module of each name in the `.pyi` beside a file: `from MODULE import NAME as NAME`."""
-    text = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
-    return {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as \2$", text, re.MULTILINE)}
+_REEXPORT = re.compile(r"^from (\S+) import (\w+) as \2$", re.MULTILINE)
 
 
-def handed_on(module: str, file: str) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a module with its file."""
-    homes = homes_of(file)
+def reexported_names(file: str) -> dict[str, str]:
+    """Return the defining module of each name that the `.pyi` file beside a module re-exports.
 
-    def found(name: str) -> Any:
-        if name not in homes:
-            known = ", ".join(sorted(homes))
-            raise AttributeError(f"module {module!r} has no attribute {name!r}; it has {known}")
-        return getattr(import_module(homes[name]), name)
+    Parameters
+    ----------
+    file : str
+        The path of the module; lines ``from MODULE import NAME as NAME`` of the `.pyi` file count.
+    """
+    stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
+    return {name: module for module, name in _REEXPORT.findall(stub)}
 
-    return found
+
+def lazy_getattr(module: str, file: str) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a module that imports its re-exported names on first use.
+
+    Parameters
+    ----------
+    module : str
+        The name of the module, for error messages.
+    file : str
+        The path of the module.
+    """
+    modules = reexported_names(file)
+
+    def getattr_of_module(name: str) -> Any:
+        if name not in modules:
+            available = ", ".join(sorted(modules))
+            raise AttributeError(f"module {module!r} has no attribute {name!r}; it has {available}")
+        return getattr(import_module(modules[name]), name)
+
+    return getattr_of_module

@@ -1,4 +1,4 @@
-"""Results that are kept in memory, and how much memory this process may still take."""
+"""A cache of results, and how much memory this process may still use."""
 
 import contextlib
 import math
@@ -8,62 +8,98 @@ from typing import Any, TypeVar
 
 _Value = TypeVar("_Value")
 
+_KIBIBYTE = 1024.0
+_CONTROL_GROUP = Path("/sys/fs/cgroup")
 
-def memory_left() -> float:
-    """Bytes that the machine, or the container, has left; infinite where it does not say."""
-    left = math.inf
+
+def available_memory() -> float:
+    """Return the memory that the machine or the container has left [bytes].
+
+    It is infinite where the system does not state it.
+    """
+    available = math.inf
     with contextlib.suppress(OSError, ValueError, IndexError):
-        text = Path("/proc/meminfo").read_text(encoding="ascii")
-        left = 1024.0 * float(text.split("MemAvailable:")[1].split()[0])
-    with contextlib.suppress(OSError, ValueError, IndexError):  # no such files, or the limit is "max"
-        group = Path("/sys/fs/cgroup")
-        limit, used, parts = (
-            (group / f"memory.{key}").read_text(encoding="ascii") for key in ("max", "current", "stat")
-        )
-        files = float(parts.split("\ninactive_file ")[1].split()[0])  # kept of files until memory is wanted
-        left = min(left, float(limit) - float(used) + files)
-    return left
+        available = _available_memory_of_machine()
+    # The files are missing outside a container, and the limit may be the word "max".
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        available = min(available, _available_memory_of_container())
+    return available
 
 
-def _alike(_: object) -> int:
+def _available_memory_of_machine() -> float:
+    text = Path("/proc/meminfo").read_text(encoding="ascii")
+    kibibytes = text.split("MemAvailable:")[1].split()[0]
+    return _KIBIBYTE * float(kibibytes)
+
+
+def _available_memory_of_container() -> float:
+    limit = (_CONTROL_GROUP / "memory.max").read_text(encoding="ascii")
+    used = (_CONTROL_GROUP / "memory.current").read_text(encoding="ascii")
+    statistics = (_CONTROL_GROUP / "memory.stat").read_text(encoding="ascii")
+    # The kernel gives up cached file pages as soon as a process asks for memory.
+    file_cache = float(statistics.split("\ninactive_file ")[1].split()[0])
+    return float(limit) - float(used) + file_cache
+
+
+def _unit_weight(_: object) -> int:
     return 1
 
 
-class Memory:
-    """Results by key, the least recently used forgotten where there are more than `size`.
+def _do_nothing(_: object) -> None:
+    pass
 
-    `weight` says how much of the size a result takes; one each if it is left out. `end` is called with each
-    that is forgotten. Another process is handed none of them.
+
+class ResultCache:
+    """Results by key; the least recently used result goes when the cache is full.
+
+    A copy that is sent to another process starts empty.
+
+    Parameters
+    ----------
+    size : int
+        The total weight of results that the cache holds.
+    weight : callable
+        Returns the weight of a result; 1 by default.
+    end : callable
+        Is called with each result that the cache drops.
     """
 
     def __init__(
-        self, size: int = 256, weight: Callable[[Any], int] = _alike, end: Callable[[Any], object] = _alike
+        self,
+        size: int = 256,
+        weight: Callable[[Any], int] = _unit_weight,
+        end: Callable[[Any], object] = _do_nothing,
     ) -> None:
-        self._size, self._weight, self._end = size, weight, end
+        self._size = size
+        self._weight = weight
+        self._end = end
         self._values: dict[Hashable, Any] = {}
-        self._taken = 0
+        self._total_weight = 0
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_values": {}, "_taken": 0}
+        return vars(self) | {"_values": {}, "_total_weight": 0}
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
-        """Return what `make` returned for `key`, calling it if need be."""
+        """Return the result of a key; `make` computes it if the cache does not hold it."""
         if key in self._values:
-            found: _Value = self._values.pop(key)
-            self._values[key] = found
-            return found
-        value = self._values[key] = make()
-        self._taken += self._weight(value)
-        while self._taken > self._size and len(self._values) > 1:
-            self._forget()
+            # Dictionaries keep the order of insertion: the last is the most recently used.
+            cached: _Value = self._values.pop(key)
+            self._values[key] = cached
+            return cached
+        value = make()
+        self._values[key] = value
+        self._total_weight += self._weight(value)
+        while self._total_weight > self._size and len(self._values) > 1:
+            self._drop_least_recently_used()
         return value
 
     def clear(self) -> None:
-        """Forget all results."""
+        """Drop all results."""
         while self._values:
-            self._forget()
+            self._drop_least_recently_used()
 
-    def _forget(self) -> None:
-        value = self._values.pop(next(iter(self._values)))
-        self._taken -= self._weight(value)
+    def _drop_least_recently_used(self) -> None:
+        key = next(iter(self._values))
+        value = self._values.pop(key)
+        self._total_weight -= self._weight(value)
         self._end(value)

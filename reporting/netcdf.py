@@ -1,10 +1,11 @@
-"""NetCDF-4 files of several groups: written, and read as a whole or refused in one sentence.
+"""Writing and reading of NetCDF-4 files of several groups.
 
-Labelled arrays are written without xarray, which reads them: it brings pandas, and asks for Dask where that
-is installed, seconds before the first byte is written.
+Labelled arrays are written without xarray, which takes seconds to import (pandas, and Dask where it
+is installed); xarray reads them.
 
-HDF5 believes what a file says of its own structure: a damaged one can keep it busy for ever, or crash it. So
-a fork of this process reads, within limits, and hands over what it read; the process itself opens no file.
+HDF5 trusts what a file says about its own structure, so a damaged file can keep it busy for ever or
+crash it. Therefore a fork of this process reads the file, within limits of time and memory, and
+sends the content back through a pipe.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from reporting.errors import DamagedFileError
 
 if TYPE_CHECKING:
+    import h5py
     import xarray as xr
 
 
@@ -34,11 +36,11 @@ class Variable(NamedTuple):
     Attributes
     ----------
     dims : tuple of str
-        Name of each axis.
+        The name of each axis.
     values : array
-        Numbers or texts.
+        The numbers or texts.
     attrs : mapping of str to str
-        Such as `units` and `long_name`.
+        The attributes, such as `units` and `long_name`.
     """
 
     dims: tuple[str, ...]
@@ -48,16 +50,17 @@ class Variable(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """Variables, and the coordinates that say what stands along their axes.
+    """Variables with the coordinates of their axes.
 
     Attributes
     ----------
     variables : mapping of str to Variable
-        What is told.
+        The data.
     coords : mapping of str to Variable
-        One of the name of an axis labels it; others stand beside.
+        The coordinates. A coordinate with the name of an axis labels this axis; the others are
+        further labels along axes.
     attrs : mapping of str to str
-        Of the whole group.
+        The attributes of the group.
     """
 
     variables: Mapping[str, Variable]
@@ -66,20 +69,22 @@ class Group:
 
     def __getitem__(self, name: str) -> Variable:
         """Return a variable or coordinate."""
-        return self.variables[name] if name in self.variables else self.coords[name]
+        if name in self.variables:
+            return self.variables[name]
+        return self.coords[name]
 
 
 def write_groups(path: Path, groups: Mapping[str, Group], attrs: Mapping[str, Any]) -> None:
-    """Write a NetCDF-4 file; the bytes depend on nothing but what is given.
+    """Write a NetCDF-4 file; equal arguments give equal bytes.
 
     Parameters
     ----------
     path : Path
         The file.
     groups : mapping of str to Group
-        By name.
-    attrs : mapping
-        Attributes of the root.
+        The groups by name.
+    attrs : mapping of str to object
+        The attributes of the root.
     """
     import h5py
 
@@ -89,132 +94,182 @@ def write_groups(path: Path, groups: Mapping[str, Group], attrs: Mapping[str, An
             _write_group(file.create_group(name, track_order=True), group)
 
 
-def _write_group(target: Any, group: Group) -> None:
-    """Write axes with their labels, then all that stands along them, as HDF5 has them."""
+def _write_group(target: h5py.Group, group: Group) -> None:
+    """Write a group as NetCDF-4 prescribes for HDF5: axes are scales, to which variables refer."""
     target.attrs.update(group.attrs)
-    everything = {**group.variables, **group.coords}
-    sizes = {
-        axis: size
-        for variable in everything.values()
-        for axis, size in zip(variable.dims, variable.values.shape, strict=True)
-    }
-    for axis, size in sizes.items():
-        if axis in everything:
-            _written(target, axis, everything[axis]).make_scale(axis)
-        else:
-            bare = target.create_dataset(axis, (size,), ">f4", track_order=True)
-            bare.make_scale(f"This is a netCDF dimension but not a netCDF variable.{size:10}".encode("ascii"))
-    beside = {name: own for name, own in group.coords.items() if name not in sizes}
-    for name, variable in everything.items():
-        if name in sizes:
+    axis_sizes = _axis_sizes(group)
+    for axis, size in axis_sizes.items():
+        _write_axis(target, group, axis, size)
+    for name, variable in {**group.variables, **group.coords}.items():
+        if name in axis_sizes:
             continue
-        stored = _written(target, name, variable)
-        for place, axis in enumerate(variable.dims):
-            stored.dims[place].attach_scale(target[axis])
-        own = [other for other, label in beside.items() if {*label.dims} <= {*variable.dims}]
-        if own and name in group.variables:
-            stored.attrs["coordinates"] = " ".join(own)
+        dataset = _write_variable(target, name, variable)
+        for number, axis in enumerate(variable.dims):
+            dataset.dims[number].attach_scale(target[axis])
+        if name in group.variables:
+            coordinates = _further_coordinates(group, variable)
+            if coordinates:
+                dataset.attrs["coordinates"] = " ".join(coordinates)
 
 
-def _written(target: Any, name: str, variable: Variable) -> Any:
+def _axis_sizes(group: Group) -> dict[str, int]:
+    """Return the size of each axis of a group, in the order of their first use."""
+    sizes = {}
+    for variable in {**group.variables, **group.coords}.values():
+        for axis, size in zip(variable.dims, variable.values.shape, strict=True):
+            sizes[axis] = size
+    return sizes
+
+
+def _write_axis(target: h5py.Group, group: Group, axis: str, size: int) -> None:
+    """Write an axis with its labels, or by its size alone if it has none."""
+    labels = {**group.variables, **group.coords}.get(axis)
+    if labels is not None:
+        _write_variable(target, axis, labels).make_scale(axis)
+        return
+    unlabelled = target.create_dataset(axis, (size,), ">f4", track_order=True)
+    # The NetCDF library recognises an axis without labels by this text.
+    scale_name = f"This is a netCDF dimension but not a netCDF variable.{size:10}"
+    unlabelled.make_scale(scale_name.encode("ascii"))
+
+
+def _further_coordinates(group: Group, variable: Variable) -> list[str]:
+    """Return the coordinates along axes of a variable that do not have the name of an axis."""
+    axis_sizes = _axis_sizes(group)
+    return [
+        name
+        for name, coordinate in group.coords.items()
+        if name not in axis_sizes and set(coordinate.dims) <= set(variable.dims)
+    ]
+
+
+def _write_variable(target: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
     import h5py
 
-    values, text = variable.values, variable.values.dtype.kind == "U"
-    stored = target.create_dataset(
+    values = variable.values
+    is_text = values.dtype.kind == "U"
+    # HDF5 stores an axis of no entries only where it may grow.
+    is_empty = 0 in values.shape
+    dataset = target.create_dataset(
         name,
-        data=values.astype(object) if text else values,
-        dtype=h5py.string_dtype() if text else None,
-        maxshape=tuple(size or None for size in values.shape) if 0 in values.shape else None,
+        data=values.astype(object) if is_text else values,
+        dtype=h5py.string_dtype() if is_text else None,
+        maxshape=tuple(size or None for size in values.shape) if is_empty else None,
         track_order=True,
     )
-    stored.attrs.update(variable.attrs)
-    return stored
+    dataset.attrs.update(variable.attrs)
+    return dataset
 
 
-SECONDS, BYTES_IN_A_SECOND = 10, 5_000_000
-"""Processor time for a file: so much for any, and a second more for so many bytes (1e8 are read in truth)."""
+SECONDS = 10
+"""Processor time that the reading of any file may take [s]."""
+BYTES_IN_A_SECOND = 5_000_000
+"""Bytes of a file for which one more second is allowed; HDF5 reads about 1e8 in a second."""
 WAITING = 6
-"""Seconds on the clock for one of processor time."""
-MEMORY, MEMORY_OF_A_BYTE = 512 * 1024**2, 64
-"""Bytes for any file, and for each byte of it, which may be compressed."""
+"""Seconds on the clock that are allowed for one second of processor time."""
+MEMORY = 512 * 1024**2
+"""Memory that the reading of any file may take [bytes]."""
+MEMORY_OF_A_BYTE = 64
+"""Further memory for each byte of the file, which may be compressed [bytes]."""
 
 
 def read_groups(path: Path) -> xr.DataTree:
-    """Return all groups of a NetCDF-4 file, loaded into memory; times stay the numbers that are stored.
+    """Return all groups of a NetCDF-4 file, loaded into memory.
+
+    Times are not decoded: they stay the stored numbers.
 
     Raises
     ------
     DamagedFileError
-        The file is missing, damaged, cut off or of another kind.
+        If the file is missing, damaged, truncated or of another kind.
     """
     if not path.is_file():
         raise DamagedFileError(f"there is no file {path}")
-    # Here, and not again in each fork.
+    # Imported here, so that the forks need not import them again.
     import h5netcdf  # noqa: F401
     import xarray as xr
 
-    reading, writing = os.pipe()
+    groups = _groups_read_by_fork(path)
+    if isinstance(groups, str):
+        raise DamagedFileError(f"{path} is damaged or no NetCDF file ({groups})")
+    return xr.DataTree.from_dict(groups)
+
+
+def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
+    """Return the groups of a file, or the reason why there are none, as a fork reads them."""
+    reading_end, writing_end = os.pipe()
     with warnings.catch_warnings():
-        # Python 3.12 warns of threads (those of BLAS); the fork calls nothing that they could have locked.
+        # Python 3.12 warns of threads. They are those of BLAS, and the fork does not call BLAS.
         warnings.simplefilter("ignore", DeprecationWarning)
         child = os.fork()
     if not child:
-        _answer(path, writing)
-    os.close(writing)
-    groups: dict[str, xr.Dataset] | str = ""
+        _send_groups_and_exit(path, writing_end)
+    os.close(writing_end)
+    groups: dict[str, xr.Dataset] | str
     try:
-        with os.fdopen(reading, "rb") as pipe:
+        with os.fdopen(reading_end, "rb") as pipe:
             groups = pickle.load(pipe)
     except (EOFError, pickle.UnpicklingError):
         groups = "HDF5 breaks down over it"
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-    if isinstance(groups, str):
-        raise DamagedFileError(f"{path} is damaged or no NetCDF file ({groups})")
-    return xr.DataTree.from_dict(groups)
+    return groups
 
 
-def _answer(path: Path, writing: int) -> NoReturn:
-    """Send the groups of a file, or why there are none, and end this process."""
+def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
+    """Send the groups of a file, or the reason why there are none, and end this process."""
     try:
-        # A fork inherits the lock of a run folder, which must end with the process if that is killed.
-        os.closerange(3, writing)
-        os.closerange(writing + 1, os.sysconf("SC_OPEN_MAX"))
-        gc.disable()  # what is garbage here is in use there: finalizers end workers and remove folders
+        # Among the inherited descriptors may be the lock of a run folder, which must end with the
+        # parent process even if this fork outlives it.
+        os.closerange(3, writing_end)
+        os.closerange(writing_end + 1, os.sysconf("SC_OPEN_MAX"))
+        # No finalizers: they would end workers and remove folders that the parent still uses.
+        gc.disable()
         faulthandler.disable()
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # the C library's last words
-        _limit(path.stat().st_size)
-        with os.fdopen(writing, "wb") as pipe:
-            pickle.dump(_groups(path), pipe, pickle.HIGHEST_PROTOCOL)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # silence the C library
+        _limit_resources(path.stat().st_size)
+        with os.fdopen(writing_end, "wb") as pipe:
+            pickle.dump(_read_groups(path), pipe, pickle.HIGHEST_PROTOCOL)
     finally:
         os._exit(0)
 
 
-def _groups(path: Path) -> dict[str, xr.Dataset] | str:
+def _read_groups(path: Path) -> dict[str, xr.Dataset] | str:
+    """Return the groups of a file by path, or the first line of why it cannot be read."""
     import xarray as xr
 
     try:
         with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
             return {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
-    except Exception as error:  # noqa: BLE001 - HDF5 answers damage with nearly every exception that there is
-        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        return reason[0].rstrip(".")
+    except Exception as error:  # noqa: BLE001 - damage of a file raises nearly any exception
+        lines = str(error).strip().splitlines()
+        reason = lines[0] if lines else type(error).__name__
+        return reason.rstrip(".")
 
 
-def _limit(size: int) -> None:
-    """Let the kernel end this process when it takes more time or memory than a file of `size` bytes may."""
+def _limit_resources(file_size: int) -> None:
+    """Let the kernel end this process when it takes more time or memory than a file may need.
+
+    Parameters
+    ----------
+    file_size : int
+        The size of the file [bytes].
+    """
     import resource
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
-        signal.signal(number, signal.SIG_DFL)
-    seconds = SECONDS + size // BYTES_IN_A_SECOND
+    for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
+        signal.signal(signal_number, signal.SIG_DFL)
+    seconds = SECONDS + file_size // BYTES_IN_A_SECOND
     signal.alarm(WAITING * seconds)
-    taken = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    for what, limit in (
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_CPU, seconds),
-        (resource.RLIMIT_AS, taken + MEMORY + MEMORY_OF_A_BYTE * size),
-    ):
-        hard = resource.getrlimit(what)[1]
-        resource.setrlimit(what, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+    pages = int(Path("/proc/self/statm").read_text("ascii").split()[0])
+    memory_in_use = pages * os.sysconf("SC_PAGE_SIZE")
+    limits = {
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_CPU: seconds,
+        resource.RLIMIT_AS: memory_in_use + MEMORY + MEMORY_OF_A_BYTE * file_size,
+    }
+    for kind, limit in limits.items():
+        _, hard_limit = resource.getrlimit(kind)
+        soft_limit = limit if hard_limit == resource.RLIM_INFINITY else min(limit, hard_limit)
+        resource.setrlimit(kind, (soft_limit, hard_limit))

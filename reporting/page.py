@@ -1,31 +1,32 @@
-"""A self-contained HTML page: sections, numbered figures and tables, one style sheet, nothing from outside.
+"""A self-contained HTML page: sections, numbered figures and tables, one style sheet.
 
-No request to any server; light, and fit to be printed. One short script shows the values under the
-pointer in figures; the page is whole without it. All text is escaped. `page.html` is its form; the words of a
-page stand in a TOML file of its own, see `Words`.
+A page makes no request to any server, is light, and prints well. One short script shows the values
+under the pointer in figures; the page is complete without it. All text is escaped. `page.html` is
+the template of a page; the words of a page stand in a TOML file of its own, see `Words`.
 """
 
-import re
 import tomllib
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jinja2 import Environment, StrictUndefined, Template
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
-from reporting import words
 from reporting.errors import InvalidFigureError
-from reporting.sentences import said
+from reporting.templates import (
+    evaluated,
+    fill_template,
+    html_environment,
+    in_one_line,
+    rendered,
+)
 
-if TYPE_CHECKING:  # words are said where nothing is drawn, too
+if TYPE_CHECKING:  # text is made without figures, too, and matplotlib takes long to import
     from matplotlib.figure import Figure
-
-_UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|µs|Hz|mm|m|kg|N)(?!\w))")
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,12 @@ class Column:
 
     Attributes
     ----------
-    name
-        Heading.
-    unit
-        Unit, shown below the heading; empty for text and for plain counts.
-    numeric
-        Align to the right, in figures of equal width.
+    name : str
+        The heading.
+    unit : str
+        The unit, shown below the heading; empty for text and for plain counts.
+    numeric : bool
+        Whether cells are aligned to the right, in figures of equal width.
     """
 
     name: str
@@ -47,48 +48,51 @@ class Column:
     numeric: bool = False
 
 
-def numbers(name: str, unit: str = "") -> Column:
+def number_column(name: str, unit: str = "") -> Column:
     """Return a column of numbers."""
     return Column(name, unit, numeric=True)
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of ready text; numbers are formatted by whoever knows what their digits mean.
+    """A table of formatted text.
 
     Attributes
     ----------
-    columns
-        Headings and units.
-    rows
-        One sequence of cells a row, as many as there are columns.
+    columns : sequence of Column
+        The headings and units.
+    rows : sequence of sequence of str
+        The cells of each row, one for each column.
 
     Raises
     ------
     InvalidFigureError
-        A row does not have one cell for each column.
+        If a row does not have one cell for each column.
     """
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[str]]
 
     def __post_init__(self) -> None:
+        needed = len(self.columns)
         for number, row in enumerate(self.rows):
-            if (came := len(row)) != (needed := len(self.columns)):
-                raise InvalidFigureError(said("page.row", number=number, came=came, needed=needed))
+            if len(row) != needed:
+                raise InvalidFigureError(
+                    f"Row {number} of a table has {len(row)} cells; {needed} are needed."
+                )
 
 
 class ReportFigure(NamedTuple):
-    """A figure with its words.
+    """A figure with its title and caption.
 
     Attributes
     ----------
-    name
-        Name of its file, without ending.
-    figure
+    name : str
+        The name of its file, without ending.
+    figure : Figure
         The drawing.
-    title, caption
-        Below it.
+    title, caption : str
+        The text below it.
     """
 
     name: str
@@ -97,119 +101,234 @@ class ReportFigure(NamedTuple):
     caption: str
 
 
+class RenderedBlock(NamedTuple):
+    """A block of a page or of printed output, filled with values.
+
+    Attributes
+    ----------
+    kind : {"say", "notice", "table", "figure", "highlights"}
+        What the block is.
+    content : object
+        A text (say, notice), the name of a table and the `Table`, the name of a figure, or pairs of
+        a value and its meaning (highlights).
+    """
+
+    kind: str
+    content: Any
+
+
 class Words:
     """The words of a page, from a TOML file; each is a Jinja2 template that is filled with values.
 
+    ``[said]`` holds sentences by name, ``[figures]`` titles and captions, ``[tables]`` titles,
+    captions and columns. A column is a heading, or a table with the keys
+
+    - `text` or `number`: the heading of a column of text or of numbers; `unit`: its unit;
+    - `cell`: the template of its cells, with the values `row` and `row_number`, for tables whose
+      rows are records and not cells;
+    - `when`: the name of a value; the column is left out where that is false.
+
+    `rows` of a table are templates of further rows, before the others; such a row is left out where
+    all its cells but the first are empty. ``[[page]]`` holds the sections of a page, each with a
+    `title`, `blocks` (see `rendered_blocks`) and perhaps an expression `when`.
+
     Parameters
     ----------
-    package
-        Where the file is, such as ``twin_master.report``.
-    name
-        Of the file: ``[said]`` holds sentences by name, ``[figures]`` titles and captions, and ``[tables]``
-        titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``. `cell` says
-        what a column shows of each `row` and its `row_number`, where rows are records and no ready cells; a
-        column with `when` is left out where the value of that name is false. `rows` are rows of templates
-        before those that are given, each left out where it has nothing behind its first cell. `[[page]]`
-        are sections, each a `title` and the `blocks` of `told`; `when` as there.
-    **shared
-        What every template may name beside its own values, such as functions that print numbers.
+    package : str
+        The package of the file, such as ``twin_master.report``.
+    name : str
+        The name of the file.
+    **shared : object
+        Values that every template may use, such as functions that format numbers.
     """
 
-    def __init__(self, package: str, name: str = "words.toml", **shared: Any) -> None:
-        self._shared = shared
-        self.content = tomllib.loads(resources.files(package).joinpath(name).read_text(encoding="utf-8"))
+    def __init__(self, package: str, name: str = "words.toml", **shared: object) -> None:
+        self._shared: dict[str, Any] = shared
+        file = resources.files(package).joinpath(name)
+        self.content = tomllib.loads(file.read_text(encoding="utf-8"))
 
-    def say(self, name: str, /, **values: Any) -> str:
+    def say(self, name: str, /, **values: object) -> str:
         """Return a sentence of the table ``[said]``."""
-        return filled(self.content["said"][name], **self._shared | values)
+        return fill_template(self.content["said"][name], **self._shared | values)
 
-    def table(self, name: str, rows: Sequence[Any], /, **values: Any) -> tuple[list[Column], list[Any]]:
-        """Return the columns of a table, and the cells of its rows; `more` are further columns."""
-        heads = self.content["tables"][name]["columns"]
-        heads = [{"text": head} if isinstance(head, str) else head for head in heads]
-        heads = [head for head in heads if values.get(head.get("when", ""), True)]
-        columns = [
-            Column(
-                filled(head.get("text") or head["number"], **values), head.get("unit", ""), "number" in head
-            )
-            for head in heads
-        ]
-        columns += [head if isinstance(head, Column) else numbers(head) for head in values.get("more", ())]
-        values |= self._shared
-        if heads and "cell" in heads[0]:  # a table may have no columns but `more`
-            rows = [
-                [filled(head["cell"], **values, row=row, row_number=number) for head in heads]
-                for number, row in enumerate(rows, start=1)
-            ]
-        fixed = [
-            [filled(cell, **values) for cell in row] for row in self.content["tables"][name].get("rows", ())
-        ]
-        rows = [*(row for row in fixed if any(row[1:])), *rows]
-        return columns[: len(rows[0])] if rows else columns, rows
+    def table(
+        self, name: str, rows: Sequence[Any], /, **values: Any
+    ) -> tuple[list[Column], list[Any]]:
+        """Return the columns of a table and the cells of its rows.
 
-    def words(self, kind: str, name: str, /, **values: Any) -> dict[str, str]:
-        """Return title and caption of one of the `figures` or `tables`."""
-        told = self.content[kind][name]
-        return {part: filled(told[part], **self._shared | values) for part in ("title", "caption")}
+        Parameters
+        ----------
+        name : str
+            The name of the table.
+        rows : sequence
+            The cells of each row, or records from which the file makes cells.
+        **values : object
+            The values of the templates; `more` are further columns.
+        """
+        description = self.content["tables"][name]
+        headings = _shown_headings(description["columns"], values)
+        columns = [_column_of_heading(heading, values) for heading in headings]
+        for extra in values.get("more", ()):
+            columns.append(extra if isinstance(extra, Column) else number_column(extra))
+        all_values = values | self._shared
+        cells: list[Any] = []
+        for template_row in description.get("rows", ()):
+            filled_row = [fill_template(cell, **all_values) for cell in template_row]
+            if any(filled_row[1:]):
+                cells.append(filled_row)
+        if headings and "cell" in headings[0]:  # a table may have no columns but `more`
+            cells += _cells_of_records(headings, rows, all_values)
+        else:
+            cells += rows
+        if cells:
+            columns = columns[: len(cells[0])]
+        return columns, cells
 
-    def figure(self, name: str, figure: Any, /, **values: Any) -> ReportFigure:
-        """Return a figure with its words."""
+    def words(self, kind: str, name: str, /, **values: object) -> dict[str, str]:
+        """Return the "title" and "caption" of one of the `figures` or `tables`."""
+        description = self.content[kind][name]
+        all_values = self._shared | values
+        return {key: fill_template(description[key], **all_values) for key in ("title", "caption")}
+
+    def figure(self, name: str, figure: Any, /, **values: object) -> ReportFigure:
+        """Return a figure with its title and caption."""
         return ReportFigure(name, figure, **self.words("figures", name, **values))
 
-    def told(self, blocks: Iterable[Mapping[str, Any]], /, **values: Any) -> Iterator[tuple[str, Any]]:
-        """Return what blocks say, each with its kind.
+    def rendered_blocks(
+        self, blocks: Iterable[Mapping[str, Any]], /, **values: Any
+    ) -> Iterator[RenderedBlock]:
+        """Yield blocks filled with values; blocks without content are left out.
 
-        A `say` or `notice` is a text, left out where it is empty; `of` is an expression of the values, for
-        each of whose items, the `row`, it is said. A `table` is a table of this file with the rows `of`, left
-        out where it has none, and `more` columns. A `figure` is one of the value `figures`, if it is there.
-        `highlights` are pairs of a value and what it is, those with a value. Without its `when` nothing is
-        said.
+        A block is a table with one of the keys
+
+        - `say`, `notice`: a text. With `of`, an expression, it is repeated for each of its entries,
+          the `row`;
+        - `table`: the name of a table of this file, with the rows `of` and the columns `more`;
+        - `figure`: the name of one of the value `figures`;
+        - `highlights`: pairs of a value and its meaning;
+
+        and perhaps `when`, an expression: the block is left out where that is false.
         """
         values = self._shared | values
         for block in blocks:
             if not evaluated(block.get("when", "true"), **values):
                 continue
-            rows = evaluated(block["of"], **values) if "of" in block else None
             if "table" in block:
-                own = values | {"more": evaluated(block.get("more", "[]"), **values)}
-                columns, cells = self.table(block["table"], rows or (), **own)
-                if cells:
-                    yield "table", (block["table"], Table(columns, cells))
+                yield from self._table_block(block, values)
             elif "figure" in block:
                 if block["figure"] in values["figures"]:
-                    yield "figure", block["figure"]
+                    yield RenderedBlock("figure", block["figure"])
             elif "highlights" in block:
-                pairs = ((filled(value, **values), what) for value, what in block["highlights"])
-                yield "highlights", [(value, filled(what, **values)) for value, what in pairs if value]
+                yield RenderedBlock("highlights", _highlights(block["highlights"], values))
             else:
-                kind = "notice" if "notice" in block else "say"
-                for row in (None,) if rows is None else rows:
-                    if (text := rendered(block[kind], **values, row=row)).strip():
-                        yield kind, text
+                yield from _text_blocks(block, values)
+
+    def _table_block(
+        self, block: Mapping[str, Any], values: Mapping[str, Any]
+    ) -> Iterator[RenderedBlock]:
+        name = block["table"]
+        rows = evaluated(block["of"], **values) if "of" in block else None
+        more = evaluated(block.get("more", "[]"), **values)
+        columns, cells = self.table(name, rows or (), **{**values, "more": more})
+        if cells:
+            yield RenderedBlock("table", (name, Table(columns, cells)))
 
     def fill(self, page: "Page", drawings: Mapping[str, bytes], /, **values: Any) -> None:
-        """Add the sections of the file to a page; `drawings` are the `figures` as SVG."""
-        adding: dict[str, Callable[[Any], None]] = {
-            "say": page.add_paragraph, "notice": page.add_notice, "highlights": page.add_highlights,
-        }  # fmt: skip
+        """Add the sections of the file to a page.
+
+        Parameters
+        ----------
+        page : Page
+            The page.
+        drawings : mapping of str to bytes
+            The SVG of each of the value `figures`.
+        **values : object
+            The values of the templates.
+        """
         for section in self.content["page"]:
             if not evaluated(section.get("when", "true"), **values):
                 continue
-            page.add_section(filled(section["title"], **values))
-            for kind, what in self.told(section["blocks"], **values):
+            page.add_section(fill_template(section["title"], **values))
+            for kind, content in self.rendered_blocks(section["blocks"], **values):
                 if kind == "figure":
-                    item = values["figures"][what]
-                    page.add_figure(drawings[what], item.caption, title=item.title)
+                    figure = values["figures"][content]
+                    page.add_figure(drawings[content], figure.caption, title=figure.title)
                 elif kind == "table":
-                    page.add_table(what[1], **self.words("tables", what[0], **values))
+                    name, table = content
+                    page.add_table(table, **self.words("tables", name, **values))
+                elif kind == "highlights":
+                    page.add_highlights(content)
+                elif kind == "notice":
+                    page.add_notice(in_one_line(content))
                 else:
-                    adding[kind](" ".join(what.split()) if isinstance(what, str) else what)
+                    page.add_paragraph(in_one_line(content))
 
-    def add_table(self, page: "Page", name: str, rows: Sequence[Any] = (), /, **values: Any) -> None:
-        """Add a table with its words to a page, if it has rows; `more` are further columns."""
+    def add_table(
+        self, page: "Page", name: str, rows: Sequence[Any] = (), /, **values: Any
+    ) -> None:
+        """Add a table with its title and caption to a page, if it has rows; see `table`."""
         columns, cells = self.table(name, rows, **values)
         if cells:
             page.add_table(Table(columns, cells), **self.words("tables", name, **values))
+
+
+def _shown_headings(
+    headings: Iterable[str | dict[str, Any]], values: Mapping[str, object]
+) -> list[dict[str, Any]]:
+    """Return the headings of a table as tables of TOML, without those whose `when` is false."""
+    shown = []
+    for heading in headings:
+        if isinstance(heading, str):
+            heading = {"text": heading}
+        if "when" not in heading or values.get(heading["when"], True):
+            shown.append(heading)
+    return shown
+
+
+def _column_of_heading(heading: dict[str, Any], values: Mapping[str, object]) -> Column:
+    name = fill_template(heading.get("text") or heading["number"], **values)
+    return Column(name, heading.get("unit", ""), numeric="number" in heading)
+
+
+def _cells_of_records(
+    headings: Sequence[dict[str, Any]], records: Sequence[Any], values: Mapping[str, object]
+) -> list[list[str]]:
+    rows = []
+    for number, record in enumerate(records, start=1):
+        row_values = {**values, "row": record, "row_number": number}
+        rows.append([fill_template(heading["cell"], **row_values) for heading in headings])
+    return rows
+
+
+def _highlights(
+    pairs: Iterable[tuple[str, str]], values: Mapping[str, object]
+) -> list[tuple[str, str]]:
+    """Return pairs of a value and its meaning, without those that have no value."""
+    highlights = []
+    for value_template, meaning_template in pairs:
+        value = fill_template(value_template, **values)
+        if value:
+            highlights.append((value, fill_template(meaning_template, **values)))
+    return highlights
+
+
+def _text_blocks(block: Mapping[str, Any], values: Mapping[str, object]) -> Iterator[RenderedBlock]:
+    """Yield the text of a block once, or for each of its rows."""
+    kind = "notice" if "notice" in block else "say"
+    rows = evaluated(block["of"], **values) if "of" in block else [None]
+    if rows is None:
+        rows = [None]
+    for row in rows:
+        text = rendered(block[kind], **{**values, "row": row})
+        if text.strip():
+            yield RenderedBlock(kind, text)
+
+
+class _PageBlock(NamedTuple):
+    """A block of a page, as `page.html` takes it."""
+
+    kind: str
+    content: dict[str, Any]
 
 
 class Page:
@@ -217,28 +336,28 @@ class Page:
 
     Parameters
     ----------
-    title
-        Title of the page and of the browser's window.
-    subtitle
+    title : str
+        The title of the page and of the browser's window.
+    subtitle : str
         One line below it.
-    footer
-        Lines at the end, such as the sources cited.
+    footer : sequence of str
+        The lines at the end, such as the sources cited.
     """
 
     def __init__(self, title: str, subtitle: str = "", footer: Sequence[str] = ()) -> None:
         self._head = {"title": title, "subtitle": subtitle, "footer": footer}
-        self._blocks: list[tuple[str, dict[str, Any]]] = []
+        self._blocks: list[_PageBlock] = []
 
-    def _add(self, kind: str, **content: Any) -> int:
-        self._blocks.append((kind, content))
-        return self._count(kind)
+    def _add(self, kind: str, **content: Any) -> None:
+        self._blocks.append(_PageBlock(kind, content))
 
-    def _count(self, kind: str) -> int:
-        return sum(other == kind for other, _ in self._blocks)
+    def _next_number(self, kind: str) -> int:
+        """Return the number of the next block of a kind; the first is 1."""
+        return 1 + sum(block.kind == kind for block in self._blocks)
 
     def add_section(self, title: str) -> None:
         """Begin a section; it appears in the contents."""
-        self._add("section", title=title, number=self._count("section") + 1)
+        self._add("section", title=title, number=self._next_number("section"))
 
     def add_paragraph(self, text: str) -> None:
         """Add a paragraph of plain text."""
@@ -249,89 +368,69 @@ class Page:
         self._add("notice", text=text)
 
     def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
-        """Add a row of few figures in large print: (value with unit, what it is)."""
+        """Add a row of a few figures in large print: pairs of a value and its meaning."""
         self._add("highlights", items=items)
 
     def add_figure(self, svg: bytes, caption: str, *, title: str) -> int:
-        """Add a numbered figure; return its number.
+        """Add a numbered figure, and return its number.
 
         Parameters
         ----------
-        svg
+        svg : bytes
             The drawing, from `reporting.figures.to_svg`.
-        caption
+        caption : str
             What is seen, with units and source.
-        title
-            A few words in bold before the caption, also the description for those who cannot see the drawing.
+        title : str
+            A few words in bold before the caption, which also describe the drawing to readers who
+            cannot see it.
 
         Raises
         ------
         InvalidFigureError
-            `svg` is not an SVG that can be scaled.
+            If `svg` is not an SVG that can be scaled.
         """
         from reporting.figures import inline_svg
 
-        number = self._count("figure") + 1
+        number = self._next_number("figure")
         drawing = Markup(inline_svg(svg, prefix=f"f{number}", description=title))
-        return self._add("figure", number=number, drawing=drawing, title=title, caption=caption)
+        self._add("figure", number=number, drawing=drawing, title=title, caption=caption)
+        return number
 
     def add_report_figure(self, figure: ReportFigure) -> int:
-        """Add a figure that has its words; return its number."""
+        """Add a figure with its title and caption, and return its number."""
         from reporting.figures import to_svg
 
         return self.add_figure(to_svg(figure.figure), figure.caption, title=figure.title)
 
     def add_table(self, table: Table, caption: str, *, title: str) -> int:
-        """Add a numbered table; return its number."""
-        return self._add("table", number=self._count("table") + 1, table=table, title=title, caption=caption)
+        """Add a numbered table, and return its number."""
+        number = self._next_number("table")
+        self._add("table", number=number, table=table, title=title, caption=caption)
+        return number
 
     def render(self) -> str:
         """Return the page as one string of HTML."""
-        drawn = any(" data-axes=" in content["drawing"] for kind, content in self._blocks if kind == "figure")
-        return _environment().from_string(_own("page.html")).render(
-            **self._head, blocks=self._blocks, style=Markup(_own("page.css")),
-            script=Markup(_own("hover.js")) if drawn else "",
-        )  # fmt: skip
-
-
-def filled(template: str, /, **values: Any) -> str:
-    """Return a text whose Jinja2 expressions are filled with values, in one line."""
-    return " ".join(rendered(template, **values).split())
-
-
-def rendered(template: str, /, **values: Any) -> str:
-    """Return a text whose Jinja2 expressions are filled with values, as it is written."""
-    return _plain(template).render(**values)
-
-
-def evaluated(expression: str, /, **values: Any) -> Any:
-    """Return what a Jinja2 expression gives; what is not there is None."""
-    return _environment(plain=True).compile_expression(expression)(**values)
-
-
-@cache
-def _plain(template: str) -> Template:
-    return _environment(plain=True).from_string(template)
-
-
-@cache
-def _environment(plain: bool = False) -> Environment:
-    made = Environment(
-        autoescape=not plain, undefined=StrictUndefined, trim_blocks=not plain, lstrip_blocks=not plain
-    )
-    made.filters["spaced"] = lambda text: Markup(_UNIT_SPACE.sub("\u00a0", str(escape(text))))
-    shared: tuple[Callable[..., str], ...] = (words.listing, words.counted, words.number, words.capital)
-    made.filters |= {function.__name__: function for function in shared}
-    made.globals |= {"plus_minus": words.plus_minus, "between": words.between}
-    return made
+        has_values_in_figures = any(
+            " data-axes=" in block.content["drawing"]
+            for block in self._blocks
+            if block.kind == "figure"
+        )
+        template = html_environment().from_string(_read_resource("page.html"))
+        return template.render(
+            **self._head,
+            blocks=self._blocks,
+            style=Markup(_read_resource("page.css")),
+            script=Markup(_read_resource("hover.js")) if has_values_in_figures else "",
+        )
 
 
 @cache
 def script_source() -> str:
     """Return the source by which a Content-Security-Policy allows the script of pages."""
-    return f"'sha256-{b64encode(sha256(_own('hover.js').encode()).digest()).decode()}'"
+    digest = sha256(_read_resource("hover.js").encode()).digest()
+    return f"'sha256-{b64encode(digest).decode()}'"
 
 
 @cache
-def _own(name: str) -> str:
+def _read_resource(name: str) -> str:
     return resources.files("reporting").joinpath(name).read_text(encoding="utf-8")

@@ -1,6 +1,6 @@
-"""Progress of long work: one protocol, shown on a terminal or kept silent.
+"""Progress of long work, shown on a terminal or not at all.
 
-Library code takes a `Progress` and never asks what it is::
+Library code takes a `Progress` and need not know which one it is::
 
     with progress.stage("Flying", total=50, unit="turns") as stage:
         for turn in range(50):
@@ -8,60 +8,83 @@ Library code takes a `Progress` and never asks what it is::
             stage.advance()
 """
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # rich takes a while to import, and most code only names what it reports to
+if TYPE_CHECKING:  # rich takes long to import, and most code needs only the names of types
     from rich.console import Console
     from rich.progress import Progress as RichBars
     from rich.progress import TaskID
 
 SECONDS_BETWEEN_LINES = 10.0
-"""On a pipe, how long a stage is silent at most while its parts advance."""
+"""Longest time between two lines of a stage on a pipe, while the stage advances [s]."""
+LONGEST_SILENCE = 20.0
+"""Longest time between two lines of a stage on a pipe, also where the stage reports nothing [s]."""
 
 
 class Stage:
-    """One stretch of work under way; this one shows nothing."""
+    """One part of the work that is in progress; this one shows nothing."""
 
     def advance(self, amount: int = 1, detail: str | None = None) -> None:
-        """Report `amount` more parts done; `detail` (a few words) replaces the text beside the bar."""
+        """Report that more of the stage is done.
+
+        Parameters
+        ----------
+        amount : int
+            The units of work that were done since the last report.
+        detail : str, optional
+            A few words, which replace the text beside the bar.
+        """
 
 
 class Progress:
-    """Where work reports how far it is; this one shows nothing: the default of every library function."""
+    """Receives reports of progress; this one shows nothing, the default of library functions."""
 
     @contextmanager
     def stage(self, description: str, total: int | None = None, unit: str = "") -> Iterator[Stage]:
-        """Open a stretch of work of `total` parts (None: unknown); it ends with the ``with`` block."""
+        """Return a context for a part of the work.
+
+        Parameters
+        ----------
+        description : str
+            What is done.
+        total : int, optional
+            The number of units of work; None if it is not known.
+        unit : str
+            The name of a unit of work, in the plural.
+        """
         yield Stage()
 
     def note(self, message: str) -> None:
-        """Tell one line, such as where a file was written."""
+        """Show one line, such as where a file was written."""
 
 
 SilentProgress = Progress
-"""By the name that says that nothing is shown."""
+"""The same class, under the name that says that it shows nothing."""
 
 
-narrator: Callable[[], Progress] = SilentProgress
-"""Where work reports that was handed no `Progress`: nowhere but while a command runs."""
+default_progress: Callable[[], Progress] = SilentProgress
+"""Makes the progress of work that was given none; while a command runs, it is the command's."""
 
 
 def reporter(progress: Progress | None = None) -> Progress:
-    """Return the progress that was handed on, else that of the command that runs, else a silent one."""
-    return progress or narrator()
+    """Return the given progress, or that of the running command, or a silent one."""
+    return progress or default_progress()
 
 
-def stage(description: str, total: int | None = None, unit: str = "") -> AbstractContextManager[Stage]:
-    """Open a stretch of work of the command that runs, see `Progress.stage`."""
-    return narrator().stage(description, total, unit)
+def stage(
+    description: str, total: int | None = None, unit: str = ""
+) -> AbstractContextManager[Stage]:
+    """Return a context for a part of the work of the running command, see `Progress.stage`."""
+    return default_progress().stage(description, total, unit)
 
 
-def tell(message: str) -> None:
-    """Tell one line of what a library does unasked, such as to compile, where no `Progress` was handed on."""
-    narrator().note(message)
+def note(message: str) -> None:
+    """Show one line of the running command, such as that a function is compiled."""
+    default_progress().note(message)
 
 
 class _BarStage(Stage):
@@ -71,44 +94,85 @@ class _BarStage(Stage):
 
     def advance(self, amount: int = 1, detail: str | None = None) -> None:
         """Move the bar."""
-        told: dict[str, Any] = {} if detail is None else {"detail": detail}
-        self._bars.update(self._task, advance=amount, **told)
+        if detail is None:
+            self._bars.update(self._task, advance=amount)
+        else:
+            self._bars.update(self._task, advance=amount, detail=detail)
 
 
 class _LineStage(Stage):
-    """A stage on a pipe: a line now and then, so that nobody takes long work for a standstill."""
+    """A stage on a pipe: a line now and then shows that the work goes on.
 
-    def __init__(self, note: Callable[[str], None], description: str, total: int | None, unit: str) -> None:
-        self._note, self._description, self._total, self._unit = note, description, total, unit
-        self._begin = self._last = time.perf_counter()
+    A thread shows the last detail again where the work reports nothing for `LONGEST_SILENCE`.
+    """
+
+    def __init__(
+        self, note: Callable[[str], None], description: str, total: int | None, unit: str
+    ) -> None:
+        self._note = note
+        self._description = description
+        self._total = total
+        self._unit = unit
+        self._start_time = time.perf_counter()
+        self._time_of_last_line = self._start_time
         self._done = 0
+        self._detail: str | None = None
+        self._lines_shown = 0
+        self._has_ended = threading.Event()
         amount = f", {total} {unit}".rstrip() if total is not None else ""
         note(f"{description}{amount} ...")
+        threading.Thread(target=self._break_silence, daemon=True).start()
 
     def advance(self, amount: int = 1, detail: str | None = None) -> None:
-        """Tell how far the work is, if the last line is old."""
+        """Show how much is done, unless the last line is recent."""
         self._done += amount
+        self._detail = detail
         now = time.perf_counter()
-        if now - self._last >= SECONDS_BETWEEN_LINES:
-            self._last = now
-            total = "" if self._total is None else f" of {self._total} {self._unit}".rstrip()
-            told = f"{self._done}{total}" if detail is None else f"{self._done}{total}, {detail}"
-            self._note(f"{self._description}: {told}, {now - self._begin:.0f} s ...")
+        if now - self._time_of_last_line >= SECONDS_BETWEEN_LINES:
+            self._show(now)
+
+    def _show(self, now: float) -> None:
+        """Show how much is done at a time of the clock [s]."""
+        self._time_of_last_line = now
+        self._lines_shown += 1
+        parts = []
+        if self._total is not None:
+            parts.append(f"{self._done} of {self._total} {self._unit}".rstrip())
+        elif self._done:
+            parts.append(str(self._done))
+        if self._detail is not None:
+            parts.append(self._detail)
+        parts.append(f"{now - self._start_time:.0f} s ...")
+        self._note(f"{self._description}: {', '.join(parts)}")
+
+    def _break_silence(self) -> None:
+        """Show a line after each half of the longest silence in which none was shown."""
+        shown_before = self._lines_shown
+        while not self._has_ended.wait(0.5 * LONGEST_SILENCE):
+            if self._lines_shown == shown_before:
+                self._show(time.perf_counter())
+            shown_before = self._lines_shown
+
+    def stop(self) -> None:
+        """Show no further line."""
+        self._has_ended.set()
 
     def end(self) -> None:
-        """Tell that the stage is done, and how long it took."""
-        self._note(f"{self._description}: done, {time.perf_counter() - self._begin:.1f} s")
+        """Show that the stage is done, and how long it took."""
+        self.stop()
+        duration = time.perf_counter() - self._start_time
+        self._note(f"{self._description}: done, {duration:.1f} s")
 
 
 class RichProgress(Progress):
-    """Progress on a terminal: a bar for each stage; on a pipe or in a log, lines as a stage begins and ends.
+    """Progress as a bar for each stage on a terminal, and as lines on a pipe or in a log.
 
     Parameters
     ----------
-    console
+    console : Console, optional
         Where to show it; the standard error stream by default, so that results can be piped.
-    lines
-        Show lines on a terminal too.
+    lines : bool
+        Whether to show lines on a terminal, too.
     """
 
     def __init__(self, console: "Console | None" = None, *, lines: bool = False) -> None:
@@ -123,32 +187,37 @@ class RichProgress(Progress):
         """Show a stage; stages may be nested."""
         if self._lines:
             stage = _LineStage(self.note, description, total, unit)
-            yield stage
+            try:
+                yield stage
+            finally:  # a stage that is interrupted must not look finished
+                stage.stop()
             stage.end()
             return
-        first = self._bars is None
-        bars = self._bars = self._bars or self._started()
+        is_outermost = self._bars is None
+        if self._bars is None:
+            self._bars = self._start_bars()
+        bars = self._bars
         task = bars.add_task(description, total=total, unit=unit, detail="")
         try:
             yield _BarStage(bars, task)
         except BaseException:
-            # An interrupted stage must not look finished: its bar stays where it stood.
+            # The bar of an interrupted stage stays where it is: the stage must not look finished.
             bars.stop_task(task)
             raise
         else:
-            done = total if total is not None else 1
-            bars.update(task, total=done, completed=done, detail="")
+            completed = total if total is not None else 1
+            bars.update(task, total=completed, completed=completed, detail="")
         finally:
-            if first:
+            if is_outermost:
                 bars.stop()
                 self._bars = None
 
     def note(self, message: str) -> None:
-        """Print one line, above the bars if there are any."""
+        """Show one line, above the bars if there are any."""
         console = self._bars.console if self._bars is not None else self.console
         console.print(message, markup=False, highlight=False, soft_wrap=True)
 
-    def _started(self) -> "RichBars":
+    def _start_bars(self) -> "RichBars":
         from rich import progress as rich
 
         bars = rich.Progress(

@@ -1,7 +1,7 @@
-"""Where a result comes from: versions of the stack, hashes of the sources and inputs, and the seed.
+"""Provenance of a result: versions of the software, hashes of sources and inputs, and the seed.
 
-Nothing of it names a user, a machine or an absolute path, and nothing depends on the time of day, so that two
-equal runs carry equal provenance.
+It does not name a user, a machine or an absolute path, and does not depend on the time of day:
+equal runs have equal provenance.
 """
 
 import platform
@@ -15,14 +15,31 @@ from typing import Any
 from reporting.files import hash_tree
 
 STACK = (
-    "uav-twin", "numpy", "scipy", "scikit-fem", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf",
-    "h5py", "pydantic", "matplotlib",
-)  # fmt: skip
+    "uav-twin",
+    "numpy",
+    "scipy",
+    "scikit-fem",
+    "numba",
+    "fmpy",
+    "pythonfmu",
+    "xarray",
+    "h5netcdf",
+    "h5py",
+    "pydantic",
+    "matplotlib",
+)
 """Distributions whose version can change a figure of a result."""
 
 SOURCE_PACKAGES = (
-    "calibration", "discrepancy", "fe", "fmu_asset", "reporting", "scenarios", "twin_master", "uav_twin",
-)  # fmt: skip
+    "calibration",
+    "discrepancy",
+    "fe",
+    "fmu_asset",
+    "reporting",
+    "scenarios",
+    "twin_master",
+    "uav_twin",
+)
 """Packages of this project."""
 
 _SOURCE_SUFFIXES = frozenset({".py", ".toml", ".css"})
@@ -34,14 +51,14 @@ class Provenance:
 
     Attributes
     ----------
-    seed
-        Seed of the run's ``SeedSequence``; None if nothing random took part.
-    versions
-        Name of a distribution (and ``python``) -> version; ``not installed`` if it is missing.
-    source_hashes
-        Package of this project -> SHA-256 of its sources.
-    input_hashes
-        Name of an input (design, scenario, FMU, ...) -> SHA-256 of its content.
+    seed : int or None
+        The seed of the run's ``SeedSequence``; None if the run draws no random numbers.
+    versions : mapping of str to str
+        The version of each distribution and of ``python``; ``not installed`` if it is missing.
+    source_hashes : mapping of str to str
+        The SHA-256 of the sources of each package of this project.
+    input_hashes : mapping of str to str
+        The SHA-256 of each input, such as design, scenario or FMU.
     """
 
     seed: int | None
@@ -61,10 +78,23 @@ def collect_provenance(
     packages: Iterable[str] = SOURCE_PACKAGES,
     distributions: Iterable[str] = STACK,
 ) -> Provenance:
-    """Collect versions, source hashes and seed of what runs now."""
+    """Return the provenance of a result of the running software.
+
+    Parameters
+    ----------
+    seed : int, optional
+        The seed of the run.
+    input_hashes : mapping of str to str, optional
+        The SHA-256 of each input.
+    packages : iterable of str
+        The packages whose sources are hashed.
+    distributions : iterable of str
+        The distributions whose versions are stated.
+    """
+    versions = {name: _version(name) for name in distributions}
     return Provenance(
         seed=seed,
-        versions={"python": platform.python_version(), **{name: _version(name) for name in distributions}},
+        versions={"python": platform.python_version(), **versions},
         source_hashes={package: source_hash(package) for package in packages},
         input_hashes=dict(sorted((input_hashes or {}).items())),
     )
@@ -80,12 +110,12 @@ def _version(distribution: str) -> str:
 
 @cache
 def source_hash(package: str) -> str:
-    """Return the SHA-256 of the sources of an importable package: its files' names and contents.
+    """Return the SHA-256 of the names and contents of the source files of a package.
 
     Raises
     ------
     ValueError
-        No package of that name can be imported.
+        If no package of this name can be imported.
     """
     specification = util.find_spec(package)
     if specification is None or not specification.submodule_search_locations:

@@ -1,4 +1,4 @@
-"""Sentences in a TOML file of a package, filled in where they are said."""
+"""Messages of a package that stand in a TOML file and are filled in where they are raised."""
 
 import tomllib
 from collections.abc import Mapping, Set
@@ -7,32 +7,33 @@ from pathlib import Path
 from string import Formatter
 from typing import Any
 
-MOST_LISTED = 30
-"""Of several things, those that are written out."""
+from reporting.words import comma_list
 
 
-class _Written(Formatter):
-    """Braces as in `str.format`; several things are written one after the other, "none" if there is none.
+class _ListingFormatter(Formatter):
+    """A formatter like `str.format` that writes collections as "a, b, c", and "none" if empty.
 
-    As Python writes them with `!s`: a place in an array, a shape.
+    With `!s` a collection is written as Python writes it: an index into an array, or a shape.
     """
 
     def convert_field(self, value: Any, conversion: str | None) -> Any:
-        several = isinstance(value, tuple | list | Set | Mapping) and not hasattr(value, "_fields")
-        if not several or conversion == "s":
+        is_record = hasattr(value, "_fields")
+        is_collection = isinstance(value, tuple | list | Set | Mapping) and not is_record
+        if not is_collection or conversion == "s":
             return super().convert_field(value, conversion)
-        texts = [str(super(_Written, self).convert_field(item, conversion)) for item in value]
-        more = f" and {len(texts) - MOST_LISTED} more" if len(texts) > MOST_LISTED else ""
-        return (", ".join(texts[:MOST_LISTED]) or "none") + more
+        texts = []
+        for entry in value:
+            texts.append(str(super().convert_field(entry, conversion)))
+        return comma_list(texts)
 
 
 class Sentences:
-    """The sentences of a package.
+    """The messages of a package.
 
     Parameters
     ----------
     module : str
-        A file of the package; the sentences stand beside it, in ``sentences.toml``.
+        A file of the package; the messages stand beside it, in ``sentences.toml``.
     """
 
     def __init__(self, module: str) -> None:
@@ -40,18 +41,19 @@ class Sentences:
 
     @cached_property
     def tables(self) -> dict[str, Any]:
-        """Sentences by table and name; braces stand for what the caller gives. Read when one is said."""
+        """The messages by table and name, with fields in braces; read when the first is needed."""
         return tomllib.loads(self._file.read_text(encoding="utf-8"))
 
     def said(self, sentence: str, /, **values: object) -> str:
-        """Return a sentence by table and name, such as "mesh.empty", with its values.
+        """Return a message with its fields filled in.
 
-        Several values in one are written one after the other.
+        Parameters
+        ----------
+        sentence : str
+            Table and name of the message, such as "mesh.empty".
+        **values : object
+            The values of its fields; the entries of a collection are listed.
         """
         table, _, key = sentence.partition(".")
-        text: str = self.tables[table][key]
-        return _Written().vformat(text, (), values)
-
-
-said = Sentences(__file__).said
-"""A sentence of this package by "table.name", with its values."""
+        template: str = self.tables[table][key]
+        return _ListingFormatter().vformat(template, (), values)

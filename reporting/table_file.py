@@ -1,8 +1,10 @@
-"""The one reader of tables: text with one row of cells in a line; errors name file, line and column.
+"""The one reader of tables: text with one row of cells in a line.
 
-A reader that guesses is worse than none: a decimal comma makes two cells of a number, and whoever takes the
-first of them is wrong without a word. So every row has as many cells as the header, no column comes twice,
-and a number is written with the digits 0 to 9 and a point.
+Errors name the file, the line and the column.
+
+A reader must not guess: a decimal comma makes two cells of a number, and a reader that takes the
+first of them gives wrong numbers without a warning. So every row has as many cells as the header,
+every column has its own name, and numbers are written with the digits 0 to 9 and a point.
 """
 
 import csv
@@ -17,30 +19,38 @@ from typing import NamedTuple
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.sentences import said
 from reporting.text_file import read_text
-from reporting.words import counted
+from reporting.words import comma_list, counted
 
 
 class TableErrors(NamedTuple):
-    """What a reader raises: for a table that is laid out otherwise, and for values that none can have."""
+    """The exceptions of a reader: for the layout of a table, and for impossible values."""
 
     layout: type[Exception]
     value: type[Exception]
 
 
 def plain_number(text: str) -> float:
-    """Return the number of a text in the digits 0 to 9, or NaN or an infinity where it says so.
+    """Return the number in a text of the digits 0 to 9; NaN and infinities are numbers here.
 
     Raises
     ------
     ValueError
-        The text is no number, or one that `float` takes and no measuring programme writes: digits of another
-        script, or underscores between them.
+        If the text is no number, or is one that `float` accepts and no measuring software writes:
+        digits of another script, or underscores between digits.
     """
     if not text.isascii() or "_" in text:
         raise ValueError(f"{text!r} is not written with the digits 0 to 9")
     return float(text)
+
+
+def is_number(cell: str) -> bool:
+    """Return whether a text is a number, see `plain_number`."""
+    try:
+        plain_number(cell)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -50,13 +60,13 @@ class TextTable:
     Attributes
     ----------
     name : str
-        Name of the file, for error messages.
+        The name of the file, for messages.
     columns : mapping of str to tuple of str
-        Cells by column, stripped.
+        The cells of each column, stripped.
     lines : tuple of int
-        Line of the file that each row stands in.
+        The line of the file of each row.
     errors : TableErrors
-        What is raised.
+        The exceptions to raise.
     """
 
     name: str
@@ -70,83 +80,132 @@ class TextTable:
     def cells(self, column: str, needed_by: str) -> tuple[str, ...]:
         """Return the cells of a column.
 
+        Parameters
+        ----------
+        column : str
+            The name of the column.
+        needed_by : str
+            What needs the column, for the message.
+
         Raises
         ------
         errors.layout
-            There is no such column; the sentence says what there is.
+            If the table lacks the column; the message lists its columns.
         """
         if column not in self.columns:
-            lacks = said("table.no_column", table=self, column=column, needed_by=needed_by)
-            raise self.errors.layout(lacks)
+            raise self.errors.layout(
+                f"{self.name} has no column {column!r}, which {needed_by} needs; "
+                f"its columns are {comma_list(self.columns)}."
+            )
         return self.columns[column]
 
     def numbers(
         self, column: str, needed_by: str, *, empty_allowed: bool = False, positive: bool = False
     ) -> Float:
-        """Return a column as numbers; NaN stands for an empty cell where it is allowed.
+        """Return a column as numbers.
+
+        Parameters
+        ----------
+        column : str
+            The name of the column.
+        needed_by : str
+            What needs the column, for the message.
+        empty_allowed : bool
+            Whether cells may be empty; they become NaN.
+        positive : bool
+            Whether numbers must be positive.
 
         Raises
         ------
         errors.layout
-            There is no such column, or a cell is no number.
+            If the table lacks the column, or a cell is no number.
         errors.value
-            A cell is NaN or infinite, or where they must be `positive` zero or less.
+            If a number is NaN or infinite, or must be positive and is not.
         """
-        found = np.full(len(self), np.nan)
-        remedy = "; leave the cell of a reading empty that is to be left out"
+        values = np.full(len(self), np.nan)
         for row, cell in enumerate(self.cells(column, needed_by)):
             if empty_allowed and not cell:
                 continue
             try:
-                found[row] = value = plain_number(cell)
+                value = plain_number(cell)
             except ValueError:
-                place, came = self._place(column, row), repr(cell) if cell else "nothing"
-                raise self.errors.layout(said("table.no_number", place=place, came=came)) from None
-            if not isfinite(value):
-                advice = remedy if empty_allowed else ", and a finite number is needed"
-                raise self.errors.value(f"{self._place(column, row)} holds {cell}{advice}.")
-            if positive and value <= 0.0:
-                place = self._place(column, row)
-                raise self.errors.value(said("table.not_positive", place=place, cell=cell))
-        return found
+                content = repr(cell) if cell else "nothing"
+                raise self.errors.layout(
+                    f"{self._location(column, row)} must hold a number, and {content} came."
+                ) from None
+            self._check_value(value, column, row, empty_allowed=empty_allowed, positive=positive)
+            values[row] = value
+        return values
 
-    def _place(self, column: str, row: int) -> str:
+    def _check_value(
+        self, value: float, column: str, row: int, *, empty_allowed: bool, positive: bool
+    ) -> None:
+        if not isfinite(value):
+            if empty_allowed:
+                advice = "; leave the cell of a reading empty that is to be left out"
+            else:
+                advice = ", and a finite number is needed"
+            raise self.errors.value(
+                f"{self._location(column, row)} holds {self.columns[column][row]}{advice}."
+            )
+        if positive and value <= 0.0:
+            raise self.errors.value(
+                f"{self._location(column, row)} holds {self.columns[column][row]}, "
+                "and a positive number is needed; leave out readings of zero."
+            )
+
+    def _location(self, column: str, row: int) -> str:
         return f"{self.name}, line {self.lines[row]}: column {column!r}"
 
     def refuse_repeated(self, keys: Sequence[object], what: str, remedy: str) -> None:
-        """Refuse equal keys of two rows.
+        """Refuse a table in which two rows have the same key.
 
         Parameters
         ----------
         keys : sequence
-            One for each row.
+            The key of each row.
         what, remedy : str
-            What the two rows share, and what to do, for the sentence of `errors.layout`.
+            What the key is, and how to mend the file, for the message.
+
+        Raises
+        ------
+        errors.layout
+            If two rows have the same key.
         """
-        first: dict[object, int] = {}
+        line_of_key: dict[object, int] = {}
         for key, line in zip(keys, self.lines, strict=True):
-            if first.setdefault(key, line) != line:
-                of = {"name": self.name, "lines": (first[key], line)}
-                raise self.errors.layout(said("table.repeated", **of, what=what, remedy=remedy))
+            first_line = line_of_key.setdefault(key, line)
+            if first_line != line:
+                raise self.errors.layout(
+                    f"{self.name}: the lines {first_line} and {line} hold the same {what}; "
+                    f"{remedy}."
+                )
+
+
+class _Row(NamedTuple):
+    """The cells of a row, and its line in the file."""
+
+    line: int
+    cells: list[str]
 
 
 def read_table(path: Path | str, errors: TableErrors, *, name: str | None = None) -> TextTable:
-    """Read a table of comma-separated text.
+    """Return the table in a file of comma-separated text.
 
     Parameters
     ----------
     path : Path or str
         The file; UTF-8, with or without a byte order mark.
     errors : TableErrors
-        What is raised.
+        The exceptions to raise.
     name : str, optional
-        What sentences about its content call it; the path if left out.
+        The name of the table in messages; the path by default.
 
     Raises
     ------
     errors.layout
-        The file cannot be read, is not UTF-8, has no header or rows, names a column twice, or a row has
-        another number of cells than the header.
+        If the file cannot be read, is not UTF-8, has no header or no rows, repeats the name of a
+        column, or has a row whose number of cells is not that of the header.
     """
     text = read_text(path, errors.layout)
     return parse_table(text, str(path) if name is None else name, errors)
@@ -160,71 +219,123 @@ def parse_table(
     header: Sequence[str] | None = None,
     separator: str | None = ",",
 ) -> TextTable:
-    """Return the table of a text, separated by commas or (None) by blanks; errors as `read_table`.
+    """Return the table in a text.
 
-    `header` names the columns where the text has no line for them.
+    Parameters
+    ----------
+    text : str
+        The lines of the table; empty lines and lines that begin with # do not count.
+    name : str
+        The name of the table in messages.
+    errors : TableErrors
+        The exceptions to raise, for the reasons of `read_table`.
+    header : sequence of str, optional
+        The names of the columns, where the text has no header line.
+    separator : str or None
+        The character between cells; None for blanks.
     """
-    # Comments and blanks become empty lines, so that the reader's line numbers stay those of the file.
-    kept = ["" if not line.strip() or line.lstrip().startswith("#") else line for line in text.splitlines()]
-    if separator is None:
-        found = [(number, line.split()) for number, line in enumerate(kept, start=1) if line.strip()]
+    rows = _parse_rows(text, separator, name, errors)
+    if header is not None:
+        columns = list(header)
+    elif rows:
+        columns = rows.pop(0).cells
     else:
-        found = _separated(kept, separator, name, errors)
-    if not found and header is None:
-        raise errors.layout(f"{name} is empty: it needs a header line with the names of its columns.")
-    columns = found.pop(0)[1] if header is None else [*header]
-    if len(columns) == 1 and (";" in columns[0] or "\t" in columns[0]):
-        raise errors.layout(said("table.separated", name=name))
-    twice = sorted(column for column, count in Counter(columns).items() if count > 1)
-    if twice:
-        raise errors.layout(f"{name} has more than one column {twice[0]!r}: rename or remove one.")
-    if not found:
-        raise errors.layout(f"{name} has {'a header line but ' if header is None else ''}no rows.")
-    for line, row in found:
-        if len(row) != len(columns):
-            comma = separator and len(row) > len(columns) and all(map(is_number, row))
-            came, wanted = counted(len(row), "cell"), counted(len(columns), "column")
-            listed = f"{wanted} ({', '.join(columns)}) are expected"
-            of = {"came": came, "expected": f"the header has {wanted}" if header is None else listed}
-            of |= {"name": name, "line": str(line)}
-            raise errors.layout(said("table.decimal_comma" if comma else "table.width", **of))
-    cells = tuple(zip(*(row for _, row in found), strict=True))
-    return TextTable(name, dict(zip(columns, cells, strict=True)), tuple(line for line, _ in found), errors)
+        raise errors.layout(
+            f"{name} is empty: it needs a header line with the names of its columns."
+        )
+    _check_columns(columns, name, errors)
+    if not rows:
+        but = "a header line but " if header is None else ""
+        raise errors.layout(f"{name} has {but}no rows.")
+    for row in rows:
+        if len(row.cells) != len(columns):
+            has_commas = bool(separator)
+            message = _width_message(row, columns, has_header=header is None, has_commas=has_commas)
+            raise errors.layout(f"{name}, line {row.line}: {message}")
+    cells_by_column = zip(*(row.cells for row in rows), strict=True)
+    return TextTable(
+        name=name,
+        columns=dict(zip(columns, cells_by_column, strict=True)),
+        lines=tuple(row.line for row in rows),
+        errors=errors,
+    )
 
 
-def is_number(cell: str) -> bool:
-    """Return whether a text is a number, see `plain_number`."""
+def _parse_rows(text: str, separator: str | None, name: str, errors: TableErrors) -> list[_Row]:
+    """Return the rows of a text, its header among them."""
+    # Comments become empty lines, so that line numbers stay those of the file.
+    lines = []
+    for line in text.splitlines():
+        is_comment = line.lstrip().startswith("#")
+        lines.append("" if is_comment or not line.strip() else line)
+    if separator is not None:
+        return _parse_separated_rows(lines, separator, name, errors)
+    return [_Row(number, line.split()) for number, line in enumerate(lines, start=1) if line]
+
+
+def _parse_separated_rows(
+    lines: Sequence[str], separator: str, name: str, errors: TableErrors
+) -> list[_Row]:
+    stream = io.StringIO("\n".join(lines))
+    reader = csv.reader(stream, delimiter=separator, skipinitialspace=True)
+    rows = []
     try:
-        plain_number(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _separated(
-    kept: Sequence[str], separator: str, name: str, errors: TableErrors
-) -> list[tuple[int, list[str]]]:
-    reader = csv.reader(io.StringIO("\n".join(kept)), delimiter=separator, skipinitialspace=True)
-    found = []
-    try:
-        for row in reader:
-            if row:
-                found.append((reader.line_num, [cell.strip() for cell in row]))
+        for cells in reader:
+            if cells:
+                rows.append(_Row(reader.line_num, [cell.strip() for cell in cells]))
     except csv.Error as cause:
-        raise errors.layout(f"{name}, line {reader.line_num}: not comma-separated text ({cause}).") from cause
-    return found
+        raise errors.layout(
+            f"{name}, line {reader.line_num}: not comma-separated text ({cause})."
+        ) from cause
+    return rows
+
+
+def _check_columns(columns: Sequence[str], name: str, errors: TableErrors) -> None:
+    """Refuse a table with another separator, or in which two columns have the same name."""
+    if len(columns) == 1 and (";" in columns[0] or "\t" in columns[0]):
+        raise errors.layout(
+            f"{name} is not separated by commas: "
+            "write it with commas between cells and points in numbers."
+        )
+    repeated = sorted(column for column, count in Counter(columns).items() if count > 1)
+    if repeated:
+        raise errors.layout(
+            f"{name} has more than one column {repeated[0]!r}: rename or remove one."
+        )
+
+
+def _width_message(row: _Row, columns: Sequence[str], *, has_header: bool, has_commas: bool) -> str:
+    """Return why a row does not fit its table: the number of its cells is not that of columns."""
+    cells = counted(len(row.cells), "cell")
+    wanted = counted(len(columns), "column")
+    if has_header:
+        message = f"{cells} came, and the header has {wanted}."
+    else:
+        message = f"{cells} came, and {wanted} ({', '.join(columns)}) are expected."
+    has_more_cells = len(row.cells) > len(columns)
+    if has_commas and has_more_cells and all(is_number(cell) for cell in row.cells):
+        message += " A decimal comma makes two cells of a number: write it with a point."
+    return message
 
 
 def table_text(columns: Mapping[str, Sequence[str] | Float]) -> str:
-    """Return the text of a table, which `parse_table` reads back; a number that is none is an empty cell."""
-    cells = (
-        ["" if value != value else repr(value) for value in column.tolist()]
-        if isinstance(column, np.ndarray)
-        else column
-        for column in columns.values()
-    )
+    """Return a table as text, which `parse_table` reads back.
+
+    Parameters
+    ----------
+    columns : mapping of str to sequence of str or array
+        The cells or numbers of each column; NaN becomes an empty cell.
+    """
+    cells_by_column = [_cells_of(column) for column in columns.values()]
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(zip(*cells, strict=True))
+    writer.writerows(zip(*cells_by_column, strict=True))
     return stream.getvalue()
+
+
+def _cells_of(column: Sequence[str] | Float) -> Sequence[str]:
+    if not isinstance(column, np.ndarray):
+        return column
+    # NaN alone is not equal to itself.
+    return ["" if value != value else repr(value) for value in column.tolist()]

@@ -1,7 +1,8 @@
-"""What all commands have in common: `--quiet`, `--verbose`, results as text or JSON, and how they end.
+"""What all commands share: `--quiet`, `--verbose`, results as text or JSON, and how they end.
 
-Results go to the output stream, progress to the error stream. A command asks here for its console and its
-progress, and takes no option for them: `with_common_options` gives every command the same two.
+Results go to the output stream, progress to the error stream. A command gets its console and its
+progress from this module and has no options for them: `with_common_options` gives every command the
+same two.
 """
 
 import functools
@@ -15,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
@@ -28,265 +29,392 @@ if TYPE_CHECKING:
     from reporting.page import Words
     from reporting.progress import Progress
 
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
+
+_Command = Any  # Typer does not export the classes of its commands and options.
+_Option = Any
+
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as of shells."""
 
 WIDTH_OF_A_PIPE = 1000
-"""Columns of what is no terminal."""
+"""Width of a console that is not a terminal, in columns."""
 
 SHARED = {
     "json": "Print the result as JSON, and nothing else.",
     "no_report": "Draw no report and no figures.",
 }
-"""What is said of the options of the commands that answer a question, and that draw a report."""
+"""Help of options that commands of all packages have, by parameter."""
 
 
 @functools.cache
 def commands_of(package: str) -> dict[str, dict[str, Any]]:
-    """Return the tables of `commands.toml` of a package, by the words that call a command."""
-    return tomllib.loads(files(package).joinpath("commands.toml").read_text(encoding="utf-8"))
+    """Return the tables of the file `commands.toml` of a package, by the words of the commands."""
+    file = files(package).joinpath("commands.toml")
+    return tomllib.loads(file.read_text(encoding="utf-8"))
 
 
-def told(words: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function as a command, by what `commands.toml` of its package tells of its parameters.
+def as_command(
+    words: str, function: Callable[_Parameters, _Result]
+) -> Callable[_Parameters, _Result]:
+    """Return a function as a command of Typer, with the help in its package's `commands.toml`.
 
-    Parameters before `*` are arguments, the others options. A text is the help; a table holds what else Typer
-    takes (`metavar`, `min`, `show_default`, ...), and as `flags` the name of an option that has another one
-    than its parameter. What stands in `[shared]` holds for all commands that do not say otherwise.
+    Parameters before `*` become arguments, the others options. The entry of a parameter is its
+    help, or a table of arguments of Typer (`help`, `metavar`, `min`, `show_default`, ...), in which
+    `flags` is the name of an option that is not called like its parameter. Entries of the table
+    ``[shared]`` are for all commands that have no entry of their own.
+
+    Parameters
+    ----------
+    words : str
+        The words that call the command, which name its table in the file.
+    function : callable
+        The function that the command runs.
     """
     tables = commands_of(function.__module__.partition(".")[0])
-    known = SHARED | tables["shared"] | tables.get(words, {})
-
-    def described(parameter: inspect.Parameter) -> inspect.Parameter:
-        if parameter.name not in known:
-            return parameter
-        told = known[parameter.name]
-        given: dict[str, Any] = {"help": told} if isinstance(told, str) else dict(told)
-        if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
-            made = typer.Argument(**{"show_default": False} | given)
-        else:
-            made = typer.Option(given.pop("flags", "--" + parameter.name.replace("_", "-")), **given)
-        return parameter.replace(annotation=Annotated[parameter.annotation, made])
+    entries = SHARED | tables["shared"] | tables.get(words, {})
 
     @functools.wraps(function)
-    def command(*arguments: Any, **options: Any) -> Any:
+    def command(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:
         return function(*arguments, **options)
 
     signature = inspect.signature(function)
-    parameters = [described(parameter) for parameter in signature.parameters.values()]
+    parameters = []
+    for parameter in signature.parameters.values():
+        if parameter.name in entries:
+            parameter = _as_typer_parameter(parameter, entries[parameter.name])
+        parameters.append(parameter)
     vars(command)["__signature__"] = signature.replace(parameters=parameters)
     return command
 
 
+def _as_typer_parameter(
+    parameter: inspect.Parameter, entry: str | Mapping[str, Any]
+) -> inspect.Parameter:
+    """Return a parameter whose annotation tells Typer its help and settings."""
+    settings = {"help": entry} if isinstance(entry, str) else dict(entry)
+    if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
+        flags = settings.pop("flags", "--" + parameter.name.replace("_", "-"))
+        typer_information = typer.Option(flags, **settings)
+    else:
+        typer_information = typer.Argument(**{"show_default": False, **settings})
+    return parameter.replace(annotation=Annotated[parameter.annotation, typer_information])
+
+
 @dataclass
 class Loudness:
-    """How much a command says."""
+    """How much a command prints."""
 
     quiet: bool = False
     verbose: bool = False
 
 
 loudness = Loudness()
-"""Of the command that runs."""
+"""How much the running command prints."""
 
 
 def console() -> "Console":
     """Return the console for results; with `--quiet` it prints nothing.
 
-    In a pipe or a file nothing is cut or wrapped, unless COLUMNS says how wide it is.
+    In a pipe or a file no line is cut or wrapped, unless the variable COLUMNS gives a width.
     """
     from rich.console import Console
 
-    width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDTH_OF_A_PIPE
+    has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
+    width = None if has_width else WIDTH_OF_A_PIPE
     return Console(highlight=False, markup=False, width=width, quiet=loudness.quiet)
 
 
-def say(text: str, **look: Any) -> None:
-    """Print a line of the result, unless `--quiet`; it may be `bold`, or have a colour `fg`."""
+def say(text: str, **style: Any) -> None:
+    """Print a line of the result, unless `--quiet`.
+
+    Parameters
+    ----------
+    text : str
+        The line.
+    **style : object
+        The style, such as `bold` or the colour `fg`, as `typer.secho` takes it.
+    """
     if not loudness.quiet:
-        typer.secho(text, **look)
+        typer.secho(text, **style)
 
 
 def show(command: str, words: "Words | str", **values: Any) -> None:
-    """Print what a command found as `[printed]` of a file of words says, or of that of a package by its name.
+    """Print the result of a command.
 
-    It lists blocks as `Words.told` takes them. A row of a table with `colours` has that of its first cell of
-    which they hold one.
+    Parameters
+    ----------
+    command : str
+        The key of ``[printed]`` that holds the blocks to print, see `Words.rendered_blocks`. In a
+        table with `colours`, a row has the colour of its first cell that is named there.
+    words : Words or str
+        The file of words, or the name of its package.
+    **values : object
+        The values of the templates.
     """
     from reporting.page import Words
 
-    words = Words(words) if isinstance(words, str) else words
-    for kind, what in words.told(words.content["printed"][command], **values):
+    if isinstance(words, str):
+        words = Words(words)
+    for kind, content in words.rendered_blocks(words.content["printed"][command], **values):
         if kind == "table":
-            name, table = what
+            name, table = content
             colours = words.content["tables"][name].get("colours", {})
-            styles = [next((colours[cell] for cell in row if cell in colours), "") for row in table.rows]
-            print_table([column.name for column in table.columns], table.rows, styles)
+            headings = [column.name for column in table.columns]
+            print_table(headings, table.rows, [_row_colour(row, colours) for row in table.rows])
         else:
-            say(what, fg="yellow" if kind == "notice" else None)
+            say(content, fg="yellow" if kind == "notice" else None)
+
+
+def _row_colour(row: Sequence[str], colours: Mapping[str, str]) -> str:
+    """Return the colour of the first cell that has one, or ""."""
+    for cell in row:
+        if cell in colours:
+            return colours[cell]
+    return ""
 
 
 def answer(
     command: str, words: "Words | str", record: Mapping[str, Any], *, json: bool, **values: Any
 ) -> None:
-    """Print a record as JSON, or as `show` does."""
+    """Print a record as JSON, or as text like `show`.
+
+    Parameters
+    ----------
+    command, words, **values
+        As `show` takes them; the record is a further value.
+    record : mapping of str to object
+        The result.
+    json : bool
+        Whether to print JSON.
+    """
     if json:
         print_json(record)
     else:
         show(command, words, record=record, **values)
 
 
-def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], colours: Iterable[str] = ()) -> None:
+def print_table(
+    headings: Sequence[str], rows: Iterable[Sequence[str]], colours: Iterable[str] = ()
+) -> None:
     """Print a table of the result, unless `--quiet`.
 
     Parameters
     ----------
     headings : sequence of str
-        One for each column; a column without any text is left out.
+        The heading of each column; a column without any text is left out.
     rows : iterable of sequence of str
-        Cells.
+        The cells of each row.
     colours : iterable of str
         The style of each row, where rows have one.
     """
-    shown = console()
-    table = console_table(headings, rows, shown.width)
+    output = console()
+    table = console_table(headings, rows, output.width)
     for row, colour in zip(table.rows, colours, strict=False):
         row.style = colour
-    shown.print(table)
+    output.print(table)
 
 
 WIDE = 110
-"""Columns of a terminal from which on identifiers are not broken."""
+"""Width of a terminal from which on identifiers are not broken, in columns."""
 NARROWEST = 70
-"""Columns of a terminal from which on the first column of a table is never broken elsewhere."""
-LONGEST_NAME, LONGEST_WORD = 20, 14
-"""Letters of a word that stay on one line in a narrower terminal, in the first column and in the others."""
+"""Width of a terminal from which on the first column of a table is not wrapped, in columns."""
+LONGEST_NAME = 20
+"""Longest part of a word on one line in a narrower terminal, in the first column of a table."""
+LONGEST_WORD = 14
+"""Longest part of a word on one line in a narrower terminal, in the other columns."""
 
 
 def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> "Table":
-    """Return a table without the columns that are empty, whose long words break at underscores and hyphens.
+    """Return a table without empty columns, whose long words break at underscores and hyphens.
 
     Parameters
     ----------
     headings : sequence of str
-        One for each column.
+        The heading of each column.
     rows : iterable of sequence of str
-        Cells; what a row lacks at its end stays empty.
+        The cells of each row; missing cells at its end are empty.
     width : int
-        Columns of the terminal.
+        The width of the terminal in columns.
     """
     from rich import box
     from rich.table import Table
 
-    cells = [(*row, *[""] * (len(headings) - len(row))) for row in rows]
-    kept = [at for at in range(len(headings)) if not cells or any(row[at] for row in cells)]
-    first = next(iter(kept), 0)
+    cells = [[*row, *[""] * (len(headings) - len(row))] for row in rows]
+    columns = [
+        column for column in range(len(headings)) if not cells or any(row[column] for row in cells)
+    ]
+    first_column = columns[0] if columns else 0
     if width < WIDE:
-        longest_words = [LONGEST_NAME if at == first else LONGEST_WORD for at in range(len(headings))]
-        cells = [tuple(map(broken, row, longest_words)) for row in cells]
+        cells = [_with_broken_words(row, first_column) for row in cells]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for at in kept:
-        # The first column names the row; the others make room for it, unless it would take more than half.
-        longest = max((len(line) for row in cells for line in row[at].split("\n")), default=0)
-        kept_whole = at == first and width >= NARROWEST and longest <= width // 2
-        table.add_column(headings[at], overflow="fold", no_wrap=kept_whole)
+    for column in columns:
+        # The first column names the row, so the others make room for it, unless it is too wide.
+        lines = [line for row in cells for line in row[column].split("\n")]
+        longest_line = max(map(len, lines), default=0)
+        has_room = width >= NARROWEST and longest_line <= width // 2
+        no_wrap = column == first_column and has_room
+        table.add_column(headings[column], overflow="fold", no_wrap=no_wrap)
     for row in cells:
-        table.add_row(*(row[at] for at in kept))
+        table.add_row(*[row[column] for column in columns])
     return table
 
 
-def broken(text: str, longest: int) -> str:
-    """Return a text whose longer words go on in a new line after an underscore or a hyphen."""
-    return " ".join(_broken_word(word, longest) for word in text.split(" "))
+def _with_broken_words(row: Sequence[str], first_column: int) -> list[str]:
+    cells = []
+    for column, text in enumerate(row):
+        longest = LONGEST_NAME if column == first_column else LONGEST_WORD
+        cells.append(break_words(text, longest))
+    return cells
 
 
-def _broken_word(word: str, longest: int) -> str:
+def break_words(text: str, longest: int) -> str:
+    """Return a text whose long words continue on a new line after an underscore or a hyphen.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    longest : int
+        The longest part of a word on one line, in characters.
+    """
+    return " ".join(_break_word(word, longest) for word in text.split(" "))
+
+
+def _break_word(word: str, longest: int) -> str:
     lines = [""]
-    for part in re.findall(r"[^_-]*[_-]|[^_-]+", word):
-        if lines[-1] and len(lines[-1]) + len(part) > longest:
+    for syllable in re.findall(r"[^_-]*[_-]|[^_-]+", word):
+        if lines[-1] and len(lines[-1]) + len(syllable) > longest:
             lines.append("")
-        lines[-1] += part
+        lines[-1] += syllable
     return "\n".join(lines)
 
 
 def progress() -> "Progress":
-    """Return where the stages of a command are shown."""
+    """Return the progress that shows the stages of the running command."""
     from reporting.progress import RichProgress, SilentProgress
 
-    return SilentProgress() if loudness.quiet else RichProgress(lines=loudness.verbose)
+    if loudness.quiet:
+        return SilentProgress()
+    return RichProgress(lines=loudness.verbose)
 
 
-def failed(text: str, code: int = 1) -> typer.Exit:
-    """Return the end of a command that something was wrong with, and say what on the error stream."""
+def error_exit(text: str, code: int = 1) -> typer.Exit:
+    """Print an error message, and return the exception that ends the command.
+
+    Parameters
+    ----------
+    text : str
+        The message, for the error stream.
+    code : int
+        The exit code.
+    """
     typer.secho(text, fg="red", err=True)
     return typer.Exit(code)
 
 
 @contextmanager
-def interruptible(kept: Callable[[], str] = str) -> Iterator[None]:
-    """End a command after Ctrl-C, and say what is kept and how to go on."""
+def interruptible(how_to_go_on: Callable[[], str] = str) -> Iterator[None]:
+    """Return a context that ends the command with one line after Ctrl-C.
+
+    Parameters
+    ----------
+    how_to_go_on : callable
+        Returns what is kept and how to go on, for the message; nothing by default.
+    """
     try:
         yield
     except KeyboardInterrupt:
-        raise failed("; ".join(filter(None, ("Interrupted", kept()))) + ".", INTERRUPTED) from None
+        parts = ["Interrupted"]
+        advice = how_to_go_on()
+        if advice:
+            parts.append(advice)
+        raise error_exit("; ".join(parts) + ".", INTERRUPTED) from None
 
 
 def print_json(record: Mapping[str, Any]) -> None:
-    """Print a record as JSON text; a number that is not finite becomes null."""
+    """Print a record as JSON; a number that is not finite becomes null."""
     from reporting.json_file import plain
 
-    typer.echo(json.dumps(plain(record), indent=1, ensure_ascii=False, allow_nan=False, default=str))
+    text = json.dumps(plain(record), indent=1, ensure_ascii=False, allow_nan=False, default=str)
+    typer.echo(text)
 
 
 def with_common_options(application: typer.Typer) -> Callable[..., None]:
-    """Return a command line whose commands all take `--quiet` and `--verbose`, and end alike after Ctrl-C."""
+    """Return a command line whose commands all take `--quiet` and `--verbose`.
+
+    They also show their stages, and end with one line after Ctrl-C.
+    """
     from typer.main import get_command
 
-    loudness.quiet = loudness.verbose = False
-    common = typer.Typer(add_completion=False)
-    common.command()(_common_options)
-    options = [option for option in get_command(common).params if option.name in ("quiet", "verbose")]
+    loudness.quiet = False
+    loudness.verbose = False
+    command: Any = get_command(application)
+    _extend_commands(command, _make_common_options())
+    entry_point: Callable[..., None] = command
+    return entry_point
+
+
+def _make_common_options() -> list[_Option]:
+    """Return the options `--quiet` and `--verbose`, which set `loudness`."""
+    from typer.main import get_command
+
+    # Typer makes options only as parameters of a command.
+    carrier = typer.Typer(add_completion=False)
+    carrier.command()(_common_options)
+    options = [
+        option for option in get_command(carrier).params if option.name in ("quiet", "verbose")
+    ]
     for option in options:
-        option.expose_value = False  # the commands ask this module instead
-    command = get_command(application)
-    _extend(command, options)
-    return command
+        option.expose_value = False  # functions of commands read `loudness` instead
+    return options
 
 
-def _option(name: str, told: str) -> Any:
-    """Return the option that makes commands `name`."""
+def _loudness_option(name: str, help_text: str) -> _Option:
+    """Return the option that sets the field `name` of `loudness`."""
 
-    def louder(value: bool) -> None:
+    def set_loudness(value: bool) -> None:
         setattr(loudness, name, getattr(loudness, name) or value)
         if loudness.quiet and loudness.verbose:
             raise typer.BadParameter("--quiet and --verbose exclude each other.")
 
-    return typer.Option(f"--{name}", f"-{name[0]}", callback=louder, help=told)
+    return typer.Option(f"--{name}", f"-{name[0]}", callback=set_loudness, help=help_text)
 
 
 def _common_options(
-    quiet: Annotated[bool, _option("quiet", "Print nothing but errors, and what --json asks for.")] = False,
+    quiet: Annotated[
+        bool,
+        _loudness_option("quiet", "Print nothing but errors, and what --json asks for."),
+    ] = False,
     verbose: Annotated[
-        bool, _option("verbose", "Show stages as lines with their times, and the traceback of an error.")
+        bool,
+        _loudness_option(
+            "verbose", "Show stages as lines with their times, and the traceback of an error."
+        ),
     ] = False,
 ) -> None:
     """Carry the options that every command has."""
 
 
-def _extend(command: Any, options: Sequence[Any]) -> None:
+def _extend_commands(command: _Command, options: Sequence[_Option]) -> None:
+    """Add options to a command and its subcommands, and let them show their stages."""
     command.params.extend(options)
     if command.callback is not None:
-        command.callback = _narrated()(command.callback)
-    for inner in getattr(command, "commands", {}).values():
-        _extend(inner, options)
+        command.callback = _shown_progress()(command.callback)
+    subcommands: Mapping[str, _Command] = getattr(command, "commands", {})
+    for subcommand in subcommands.values():
+        _extend_commands(subcommand, options)
 
 
 @contextmanager
-def _narrated() -> Iterator[None]:
-    """Show the stages of a command, and end it alike after Ctrl-C."""
-    before, reporting.progress.narrator = reporting.progress.narrator, functools.cache(progress)
+def _shown_progress() -> Iterator[None]:
+    """Return a context in which library functions show their stages, and that Ctrl-C may end."""
+    previous_progress = reporting.progress.default_progress
+    # One object for all stages of the command, made when the first begins.
+    reporting.progress.default_progress = functools.cache(progress)
     try:
         with interruptible():
             yield
     finally:
-        reporting.progress.narrator = before
+        reporting.progress.default_progress = previous_progress

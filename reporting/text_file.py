@@ -1,11 +1,9 @@
-"""Text files of users: UTF-8 with or without a byte order mark, and one sentence for what is none."""
+"""Text files of users: UTF-8 with or without a byte order mark."""
 
 from pathlib import Path
 
-from reporting.sentences import said
-
 DEEPEST_NESTING = 32
-"""Tables and lists within each other that a document may hold; no format of this project needs a third."""
+"""Deepest nesting of tables and lists in a document; no format of ours needs a third of it."""
 
 
 def read_text(
@@ -18,18 +16,19 @@ def read_text(
     path : Path or str
         The file.
     error : type of Exception
-        What is raised, with one sentence.
+        The exception to raise.
     what : str
-        What the file is to be, for the sentence: "wing design".
+        What the file should be, for the message: "wing design".
     otherwise : str, optional
-        The encoding to take where the file is not UTF-8.
+        The encoding of a file that is not UTF-8.
 
     Raises
     ------
     error
-        The file is not there, cannot be read, or is not text in UTF-8.
+        If the file does not exist, cannot be read, or is not text in UTF-8.
     """
-    return decoded(read_bytes(path, error, what=what), f"The {what} {path}", error, otherwise)
+    content = read_bytes(path, error, what=what)
+    return decoded(content, f"The {what} {path}", error, otherwise)
 
 
 def read_bytes(path: Path | str, error: type[Exception], *, what: str = "file") -> bytes:
@@ -38,18 +37,39 @@ def read_bytes(path: Path | str, error: type[Exception], *, what: str = "file") 
         return Path(path).read_bytes()
     except OSError as cause:
         raise error(f"The {what} {path} cannot be read: {cause.strerror or cause}.") from cause
-    except ValueError:
+    except ValueError:  # the path holds a zero byte
         raise error(f"{str(path)!r} is no name of a {what}.") from None
 
 
-def decoded(content: bytes, subject: str, error: type[Exception], otherwise: str | None = None) -> str:
-    """Return bytes as text; `subject` begins the sentence of the `error` where they are not UTF-8."""
+def decoded(
+    content: bytes, subject: str, error: type[Exception], otherwise: str | None = None
+) -> str:
+    """Return bytes as text.
+
+    Parameters
+    ----------
+    content : bytes
+        The content of a file.
+    subject : str
+        The beginning of the message, such as "The wing design wing.toml".
+    error : type of Exception
+        The exception to raise.
+    otherwise : str, optional
+        The encoding of bytes that are not UTF-8.
+
+    Raises
+    ------
+    error
+        If the bytes are not text in UTF-8.
+    """
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as cause:
         if otherwise is None:
-            byte = cause.start + 1
-            raise error(said("text.encoding", subject=subject, cause=cause, byte=byte)) from cause
+            raise error(
+                f"{subject} is not text in UTF-8 ({cause.reason} at byte {cause.start + 1}): "
+                "save it as UTF-8."
+            ) from cause
         text = content.decode(otherwise)
     if "\0" in text:
         raise error(f"{subject} is not text: it holds a zero byte; save it as UTF-8.")
@@ -57,20 +77,31 @@ def decoded(content: bytes, subject: str, error: type[Exception], otherwise: str
 
 
 def check_nesting(content: object, subject: str, error: type[Exception]) -> None:
-    """Refuse a document deeper than `DEEPEST_NESTING`: what is read from it would exhaust Python's stack."""
-    level: list[object] = [content]
+    """Refuse a document nested deeper than `DEEPEST_NESTING`; it would exhaust Python's stack.
+
+    Parameters
+    ----------
+    content : object
+        The dictionaries and lists of a parsed document.
+    subject : str
+        The beginning of the message.
+    error : type of Exception
+        The exception to raise.
+    """
+    level = [content]
     for _ in range(DEEPEST_NESTING):
-        level = [
-            item
-            for node in level
-            if isinstance(node, dict | list)
-            for item in (node.values() if isinstance(node, dict) else node)
-        ]
+        next_level: list[object] = []
+        for node in level:
+            if isinstance(node, dict):
+                next_level.extend(node.values())
+            elif isinstance(node, list):
+                next_level.extend(node)
+        level = next_level
         if not level:
             return
     raise error(too_deep(subject))
 
 
 def too_deep(subject: str) -> str:
-    """Return the sentence for a document that is nested too deeply."""
+    """Return the message for a document that is nested too deeply."""
     return f"{subject} is nested deeper than {DEEPEST_NESTING} tables or lists within each other."

@@ -1,4 +1,9 @@
-"""The one reader of TOML, and its tables as checked records; a fault is one sentence of the caller's."""
+"""The one reader of TOML, and the validation of its tables.
+
+A fault of a file is one sentence of the caller's exception.
+
+Messages name the location in the file, what it holds and what was expected.
+"""
 
 import json
 import re
@@ -6,24 +11,27 @@ import tomllib
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar, cast
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from reporting.sentences import said
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
-from reporting.words import counted, listing
+from reporting.words import counted, is_or_are, listing, small
 
-_PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"?+|'[^'\n]*+'?+)"""
-_TEXT = (
-    r'''#[^\n]*+|"""(?:[^"\\]++|\\[\s\S]|"(?!""))*+(?:"""|\Z)|''' + r"""'''(?:[^']++|'(?!''))*+(?:'''|\Z)"""
-)
-_KEYS = re.compile(rf"{_TEXT}|({_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)")
-"""Comments and texts of several lines, then words and dotted keys; each is gone over once, however long."""
+# Possessive quantifiers (`*+`) keep the time of these patterns linear in the length of the text.
+_KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"?+|'[^'\n]*+'?+)"""
+_COMMENT = r"#[^\n]*+"
+_LONG_TEXT = r'''"""(?:[^"\\]++|\\[\s\S]|"(?!""))*+(?:"""|\Z)'''
+_LONG_LITERAL_TEXT = r"""'''(?:[^']++|'(?!''))*+(?:'''|\Z)"""
+_DOTTED_KEY = rf"({_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART})*+)"
+_KEYS = re.compile(f"{_COMMENT}|{_LONG_TEXT}|{_LONG_LITERAL_TEXT}|{_DOTTED_KEY}")
+"""Comments and texts of several lines, which are skipped, or a dotted key, which is group 1."""
 
 LONGEST_ARRAY = 90
-"""Characters of an array that stands in one line."""
+"""Longest array that is written in one line, in characters of its entries."""
+
+_LONGEST_SHOWN_VALUE = 60  # in a message, in characters
 
 
 def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -> dict[str, Any]:
@@ -34,101 +42,172 @@ def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -
     path : Path or str
         The file; UTF-8, with or without a byte order mark.
     error : type of Exception
-        What is raised, with one sentence.
+        The exception to raise.
     what : str
-        What the file is to be, for the sentence: "wing design".
+        What the file should be, for the message: "wing design".
 
     Raises
     ------
     error
-        The file is not there, cannot be read, is not UTF-8 or not TOML, is nested too deeply, or holds an
-        integer that 64 bits cannot.
+        If the file does not exist, cannot be read, is not UTF-8 or not TOML, is nested too deeply,
+        or holds an integer that does not fit in 64 bits.
     """
     return parse_toml(read_text(path, error, what=what), f"The {what} {path}", error)
 
 
 def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> dict[str, Any]:
-    """Return the content of TOML that was read elsewhere; `source` names it in the sentence of `error`."""
+    """Return the content of a TOML text.
+
+    Parameters
+    ----------
+    content : bytes or str
+        The text.
+    source : str
+        Where the text is from; begins the message.
+    error : type of Exception
+        The exception to raise, for the reasons of `read_toml`.
+    """
     text = decoded(content, source, error) if isinstance(content, bytes) else content
-    # The time that `tomllib` takes for a dotted key grows with the square of its parts.
-    if any(line.count(".") >= DEEPEST_NESTING for line in text.split("\n")):
-        keys = (match[1] or "" for match in _KEYS.finditer(text))
-        if any(key.count(".") >= DEEPEST_NESTING < len(re.findall(_PART, key)) for key in keys):
-            raise error(too_deep(source))
+    if _has_too_long_key(text):
+        raise error(too_deep(source))
     try:
-        found = tomllib.loads(text)
+        document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as cause:
         raise error(f"{source} is not valid TOML: {cause}.") from cause
     except RecursionError:
         raise error(too_deep(source)) from None
     except ValueError:  # Python turns no text of more than 4,300 digits into an integer
-        raise error(said("text.digits", subject=source)) from None
-    check_nesting(found, source, error)
-    _check_integers(found, "", source, error)
-    return found
+        raise error(
+            f"{source} holds an integer of thousands of digits; 64 bits are what TOML allows."
+        ) from None
+    check_nesting(document, source, error)
+    _check_integers(document, "", source, error)
+    return document
+
+
+def _has_too_long_key(text: str) -> bool:
+    """Return whether a text has a dotted key of more parts than tables may be nested.
+
+    The time that `tomllib` takes for a dotted key grows with the square of its parts.
+    """
+    if all(line.count(".") < DEEPEST_NESTING for line in text.split("\n")):
+        return False
+    for match in _KEYS.finditer(text):
+        key = match[1] or ""
+        # Points inside quotes separate no parts; the count of points is the faster test.
+        has_many_points = key.count(".") >= DEEPEST_NESTING
+        if has_many_points and len(re.findall(_KEY_PART, key)) > DEEPEST_NESTING:
+            return True
+    return False
 
 
 def _check_integers(
-    node: dict[str, Any] | list[Any], place: str, subject: str, error: type[Exception]
+    node: dict[str, Any] | list[Any], location: str, source: str, error: type[Exception]
 ) -> None:
-    """Refuse what TOML refuses (its specification, "Integer") and `tomllib` lets through."""
-    for key, item in node.items() if isinstance(node, dict) else enumerate(node, start=1):
-        large = isinstance(item, int) and not -(2**63) <= item < 2**63
-        if not large and not isinstance(item, dict | list):
+    """Refuse integers beyond 64 bits.
+
+    TOML refuses them (its specification, "Integer"), but `tomllib` does not.
+
+    Parameters
+    ----------
+    node : dict or list
+        A table or an array of the document.
+    location : str
+        The location of the node in the document, such as "tables[1].key".
+    source : str
+        Where the document is from; begins the message.
+    error : type of Exception
+        The exception to raise.
+    """
+    entries = list(node.items()) if isinstance(node, dict) else list(enumerate(node, start=1))
+    for key, value in entries:
+        is_large = isinstance(value, int) and not -(2**63) <= value < 2**63
+        if not is_large and not isinstance(value, dict | list):
             continue
-        here = f"{place}.{key}".lstrip(".") if isinstance(node, dict) else f"{place}[{key}]"
-        if large:
-            raise error(said("text.bits", subject=subject, key=here, bits=item.bit_length()))
-        _check_integers(item, here, subject, error)
+        if isinstance(node, dict):
+            location_of_value = f"{location}.{key}".lstrip(".")
+        else:
+            location_of_value = f"{location}[{key}]"
+        if is_large:
+            raise error(
+                f"{source}: `{location_of_value}` is an integer of {value.bit_length()} bits, "
+                "and 63 beside the sign are what TOML allows."
+            )
+        _check_integers(value, location_of_value, source, error)
 
 
 def toml_text(content: dict[str, Any]) -> str:
-    """Return plain data as TOML, of which `parse_toml` makes the same again; what is None is left out.
+    """Return plain data as TOML, from which `parse_toml` returns the same data.
 
-    Tables of tables stand in one line, longer arrays in several.
+    Values None are left out. A table inside a table is written in one line, a long array in
+    several.
     """
-    tables = {key: item for key, item in content.items() if isinstance(item, dict)}
-    arrays = {
-        key: item
-        for key, item in content.items()
-        if isinstance(item, list) and item and all(isinstance(row, dict) for row in item)
-    }
-    parts = [_lines({key: item for key, item in content.items() if key not in (*tables, *arrays)})]
-    parts += [f"[{_key(key)}]\n{_lines(item)}" for key, item in tables.items()]
-    parts += [f"[[{_key(key)}]]\n{_lines(row)}" for key, rows in arrays.items() for row in rows]
-    return "\n".join(part for part in parts if part)
+    values: dict[str, Any] = {}
+    tables: dict[str, dict[str, Any]] = {}
+    arrays_of_tables: dict[str, list[dict[str, Any]]] = {}
+    for key, value in content.items():
+        if isinstance(value, dict):
+            tables[key] = value
+        elif _is_array_of_tables(value):
+            arrays_of_tables[key] = value
+        else:
+            values[key] = value
+    sections = [_key_value_lines(values)]
+    for key, table in tables.items():
+        sections.append(f"[{_toml_key(key)}]\n{_key_value_lines(table)}")
+    for key, rows in arrays_of_tables.items():
+        for row in rows:
+            sections.append(f"[[{_toml_key(key)}]]\n{_key_value_lines(row)}")
+    return "\n".join(section for section in sections if section)
 
 
-def _lines(table: dict[str, Any]) -> str:
-    return "".join(f"{key} = {shown}\n" for key, shown in _pairs(table))
+def _is_array_of_tables(value: object) -> bool:
+    if not isinstance(value, list) or not value:
+        return False
+    return all(isinstance(row, dict) for row in value)
 
 
-def _pairs(table: dict[str, Any]) -> list[tuple[str, str]]:
-    return [(_key(key), toml_value(item)) for key, item in table.items() if item is not None]
+def _key_value_lines(table: dict[str, Any]) -> str:
+    return "".join(f"{pair}\n" for pair in _key_value_pairs(table))
 
 
-def _key(name: str) -> str:
+def _key_value_pairs(table: dict[str, Any]) -> list[str]:
+    """Return "key = value" for each value that is not None."""
+    return [
+        f"{_toml_key(key)} = {toml_value(value)}"
+        for key, value in table.items()
+        if value is not None
+    ]
+
+
+def _toml_key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
 
 
-def toml_value(item: Any) -> str:
-    """Return a value as TOML has it."""
-    if isinstance(item, str):  # the escapes of JSON are TOML's, but for DEL
-        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(item, bool):
-        return str(item).lower()
-    if isinstance(item, list | tuple):
-        shown = list(map(toml_value, item))
-        if sum(map(len, shown)) > LONGEST_ARRAY:
-            return "[\n" + "".join(f"    {one},\n" for one in shown) + "]"
-        return f"[{', '.join(shown)}]"
-    if isinstance(item, dict):
-        return f"{{ {', '.join(f'{key} = {shown}' for key, shown in _pairs(item))} }}"
-    return repr(float(item) if isinstance(item, float) else item)  # of a number of NumPy, too
+def toml_value(value: object) -> str:
+    """Return a value as text of TOML; NumPy's numbers are written as those of Python."""
+    if isinstance(value, str):
+        # The escapes of JSON are those of TOML, except for DEL.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return _toml_array([toml_value(entry) for entry in value])
+    if isinstance(value, dict):
+        return f"{{ {', '.join(_key_value_pairs(value))} }}"
+    if isinstance(value, float):
+        return repr(float(value))
+    return repr(value)
 
 
-_SHOWN_LENGTH = 60
-_EXPECTED = {
+def _toml_array(entries: list[str]) -> str:
+    if sum(len(entry) for entry in entries) > LONGEST_ARRAY:
+        lines = "".join(f"    {entry},\n" for entry in entries)
+        return f"[\n{lines}]"
+    return f"[{', '.join(entries)}]"
+
+
+_EXPECTED_TYPES = {
     "tuple_type": "a list",
     "dict_type": "a table",
     "model_type": "a table",
@@ -143,7 +222,7 @@ _EXPECTED = {
     "bool_parsing": "true or false",
     "finite_number": "a finite number",
 }
-"""What is expected, by pydantic's type of error, where its own words are those of Python."""
+"""What a file should hold, by pydantic's type of error, where its message has words of Python."""
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -153,142 +232,177 @@ Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 Fault = tuple[object, str]
-"""Whether a table has it, and the sentence on it."""
+"""Whether a table has the fault (a true value), and the message."""
 
 
 class Section(BaseModel):
-    """A table of a file: unknown keys are refused, and numbers and words are not turned into each other."""
+    """A table of a file; unknown keys are refused, and words are not converted to numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield for each fault that it may have whether it has it, and the sentence on it.
+        """Yield the possible faults of the table, each with whether the table has it.
 
-        A fault is looked for only in a table that has none of those before it.
+        The first fault that the table has is raised; those after it are not evaluated.
         """
         yield from ()
 
     @model_validator(mode="after")
     def _refuse_faults(self) -> Self:
-        for found, sentence in self.faults():
-            if found:
-                raise ValueError(sentence)
+        for has_fault, message in self.faults():
+            if has_fault:
+                raise ValueError(message)
         return self
 
 
 MISSING_KEY = "missing_key"
+"""Type of the errors of pydantic that `missing_keys` returns."""
 
 
 def missing_keys(keys: list[str], sentence: str) -> PydanticCustomError:
-    """Return the error of a validator that keys are missing; several are named at once, with those of others.
+    """Return the error that a validator raises where keys are missing.
+
+    The message names all missing keys of a file together.
 
     Parameters
     ----------
     keys : list of str
         The keys, as the file would have them in the table that is validated.
     sentence : str
-        What is said where only one key is missing.
+        The message where only one key of the file is missing.
     """
     return PydanticCustomError(MISSING_KEY, "{sentence}", {"keys": keys, "sentence": sentence})
 
 
-_Description = TypeVar("_Description")
-_reader: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
+_Model = TypeVar("_Model")
+_validator_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
+"""Makes the validator of a model once: pydantic takes long to make one."""
 
 
-def checked(
-    description: type[_Description],
+def validate(
+    model: type[_Model],
     content: object,
     source: str,
     error: type[Exception],
     *,
     what: str,
     first_index: int = 1,
-) -> _Description:
-    """Return the content of a file as its description.
+) -> _Model:
+    """Return the content of a file as a record of a model.
 
     Parameters
     ----------
-    description : type of BaseModel or dataclass
-        What the file may hold.
+    model : type of BaseModel or dataclass
+        The model, which describes what the file may hold.
     content : object
-        What it holds.
+        The content of the file.
     source : str
-        Where it comes from, for the sentence.
+        The name of the file; begins the message.
     error : type of Exception
-        What is raised, with one sentence.
+        The exception to raise.
     what : str
-        What it is, with its article, for the sentence: "a lumped model".
+        What the file describes, with its article, for the message: "a lumped model".
     first_index : int
-        Where the entries of a list are counted from.
+        The number of the first entry of a list in messages.
 
     Raises
     ------
     error
-        The sentence names `source`, the place, what came and what was expected.
+        If the content does not fit the model. The message states the file, the location in it, what
+        is there and what is expected.
     """
     try:
-        return cast(_Description, _reader(description).validate_python(content))
+        record: _Model = _validator_of(model).validate_python(content)
     except ValidationError as cause:
-        raise error(f"{source}: {_sentence(cause, what, first_index)}.") from None
+        message = _validation_message(cause, what, first_index)
+        raise error(f"{source}: {message}.") from None
+    return record
 
 
-def shown(value: object) -> str:
-    """Return a value as it can stand in a sentence, shortened if it is long."""
+def short_repr(value: object) -> str:
+    """Return the `repr` of a value for a message, shortened if it is long."""
     try:
         text = repr(value)
     except ValueError:  # an integer of thousands of digits
         return "a number of thousands of digits"
-    return text if len(text) <= _SHOWN_LENGTH else f"{text[: _SHOWN_LENGTH - 3]}..."
+    if len(text) <= _LONGEST_SHOWN_VALUE:
+        return text
+    return f"{text[: _LONGEST_SHOWN_VALUE - 3]}..."
 
 
-def _sentence(error: ValidationError, what: str, first_index: int) -> str:
-    found = error.errors(include_url=False)
-    # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
-    unknown = [item for item in found if item["type"] in ("extra_forbidden", "unexpected_keyword_argument")]
+_UNKNOWN_KEY_TYPES = ("extra_forbidden", "unexpected_keyword_argument")
+_MISSING_KEY_TYPES = ("missing", "missing_argument", MISSING_KEY)
+
+
+def _validation_message(error: ValidationError, what: str, first_index: int) -> str:
+    """Return the message about the most telling fault that pydantic found."""
+    faults = error.errors(include_url=False)
+    # A misspelt key is reported twice, as unknown and as missing; the unknown key tells more.
+    unknown = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
     if unknown:
-        places = [shown(_written(item["loc"], first_index)) for item in unknown]
-        are = "are not keys" if len(places) > 1 else "is not a key"
-        them = "them or correct their" if len(places) > 1 else "it or correct its"
-        return f"{listing(places)} {are} of {what}; remove {them} spelling"
-    missing = [item for item in found if item["type"] in ("missing", "missing_argument", MISSING_KEY)]
-    places = [shown(place) for item in missing for place in _missing_places(item, first_index)]
-    if len(places) > 1 or (missing and missing[0]["type"] != MISSING_KEY):
-        return f"{listing(places)} {'are' if len(places) > 1 else 'is'} missing"
-    found = missing or found
-    first = found[0]
-    place = _written(first["loc"], first_index)
-    before = f"{place}: " if place else ""
-    if first["type"] == MISSING_KEY:
-        return f"{before}{first['ctx']['sentence']}"
-    if first["type"] == "value_error":
-        return f"{before}{first['ctx']['error']}"
-    if first["type"] == "tuple_type" and isinstance(first["input"], dict):
-        return f"there can be several of {place!r}, so write [[{place}]] for each, not [{place}]"
-    if first["type"] == "too_short":
-        least = first["ctx"]["min_length"]
-        message = f"at least {counted(least, 'entry', 'entries')} {'is' if least == 1 else 'are'} expected"
-    elif first["type"] in _EXPECTED:
-        message = f"{_EXPECTED[first['type']]} is expected"
+        return _unknown_keys_message(unknown, what, first_index)
+    missing = [fault for fault in faults if fault["type"] in _MISSING_KEY_TYPES]
+    if not missing:
+        return _value_message(faults[0], first_index)
+    keys = []
+    for fault in missing:
+        keys += [short_repr(location) for location in _missing_locations(fault, first_index)]
+    if missing[0]["type"] == MISSING_KEY and len(keys) <= 1:
+        return _value_message(missing[0], first_index)
+    return f"{listing(keys)} {is_or_are(len(keys))} missing"
+
+
+def _unknown_keys_message(faults: list[ErrorDetails], what: str, first_index: int) -> str:
+    keys = [short_repr(_location_in_file(fault["loc"], first_index)) for fault in faults]
+    if len(keys) > 1:
+        return f"{listing(keys)} are not keys of {what}; remove them or correct their spelling"
+    return f"{keys[0]} is not a key of {what}; remove it or correct its spelling"
+
+
+def _value_message(fault: ErrorDetails, first_index: int) -> str:
+    """Return the message about a value that does not fit its model."""
+    location = _location_in_file(fault["loc"], first_index)
+    prefix = f"{location}: " if location else ""
+    kind = fault["type"]
+    if kind == MISSING_KEY:
+        return f"{prefix}{fault['ctx']['sentence']}"
+    if kind == "value_error":
+        return f"{prefix}{fault['ctx']['error']}"
+    if kind == "tuple_type" and isinstance(fault["input"], dict):
+        return (
+            f"there can be several of {location!r}, "
+            f"so write [[{location}]] for each, not [{location}]"
+        )
+    if kind == "too_short":
+        least = fault["ctx"]["min_length"]
+        entries = counted(least, "entry", "entries")
+        expectation = f"at least {entries} {is_or_are(least)} expected"
+    elif kind in _EXPECTED_TYPES:
+        expectation = f"{_EXPECTED_TYPES[kind]} is expected"
     else:
-        message = first["msg"][0].lower() + first["msg"][1:]
-    return f"{before}{message}, but {shown(first['input'])} came"
+        expectation = small(fault["msg"])
+    return f"{prefix}{expectation}, but {short_repr(fault['input'])} came"
 
 
-def _missing_places(item: ErrorDetails, first_index: int) -> list[str]:
-    """Return the places of the keys that are missing by one error of pydantic."""
-    place = _written(item["loc"], first_index)
-    if item["type"] != MISSING_KEY:
-        return [place]
-    return [f"{place}.{key}".lstrip(".") for key in item["ctx"]["keys"]]
+def _missing_locations(fault: ErrorDetails, first_index: int) -> list[str]:
+    """Return the locations of the keys that are missing according to one error of pydantic."""
+    location = _location_in_file(fault["loc"], first_index)
+    if fault["type"] != MISSING_KEY:
+        return [location]
+    return [f"{location}.{key}".lstrip(".") for key in fault["ctx"]["keys"]]
 
 
-def _written(location: tuple[int | str, ...], first_index: int) -> str:
-    """Return a place as the file has it, without pydantic's names of types."""
+def _location_in_file(location: tuple[int | str, ...], first_index: int) -> str:
+    """Return a location such as "tables[1].key", without the names of types that pydantic adds."""
     text = ""
-    for part in location:
-        if isinstance(part, int):
-            text += f"[{part + first_index}]"
-        elif not re.search(r"[^\w]|^constrained", part):
-            text += f".{part}" if text else part
+    for step in location:
+        if isinstance(step, int):
+            text += f"[{step + first_index}]"
+        elif not _is_type_name_of_pydantic(step):
+            text += f".{step}" if text else step
     return text
+
+
+def _is_type_name_of_pydantic(step: str) -> bool:
+    """Return whether a step of a location is no key but like "list[float]" or "constrained-str"."""
+    return re.search(r"[^\w]|^constrained", step) is not None

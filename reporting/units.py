@@ -1,4 +1,4 @@
-"""What the text of a unit means in SI, as pint knows it."""
+"""Conversion of units to SI, from their text, as pint knows them."""
 
 import re
 import unicodedata
@@ -14,147 +14,233 @@ if TYPE_CHECKING:
     from pint import UnitRegistry
 
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-"""In the order of `Meaning.exponents`."""
-_ROOTS = ("gram", "meter", "second", "ampere", "kelvin", "mole", "candela", "radian")
-"""The same in pint, which counts in grams."""
-_ALIASES = {
-    "kp": "kgf", "rev": "turn", "U": "turn", "%": "percent", "‰": "permille", "°": "degree", "°C": "degC",
+"""Units of SI, in the order of `Meaning.exponents`."""
+_PINT_BASE_UNITS = ("gram", "meter", "second", "ampere", "kelvin", "mole", "candela", "radian")
+"""The same units in pint, whose unit of mass is the gram."""
+_PINT_NAMES = {
+    "kp": "kgf",
+    "rev": "turn",
+    "U": "turn",
+    "%": "percent",
+    "‰": "permille",
+    "°": "degree",
+    "°C": "degC",
     "-": "1",
-}  # fmt: skip
-"""Names of units that pint does not know, or reads as something else."""
-_LONGEST = 40
-"""Letters of a unit: pint takes long over more."""
+}
+"""Pint's names of units that pint does not know, or reads as something else."""
+_LONGEST_UNIT = 40
+"""Longest text of a unit, in characters; pint takes long to parse more."""
 _FACTOR = re.compile(
-    r"(?P<opening>\(*)(?P<name>[^\W\d_]+|[%‰°]|1)(?P<caret>\^?)(?P<power>[+-]?[0-9])?(?P<closing>\)*)"
+    r"(?P<opening>\(*)"
+    r"(?P<name>[^\W\d_]+|[%‰°]|1)"
+    r"(?P<caret>\^?)"
+    r"(?P<power>[+-]?[0-9])?"
+    r"(?P<closing>\)*)"
 )
-"""One factor of a unit: a name and its power, and parentheses that begin before and end after it."""
-_SMALLEST_FACTOR, _LARGEST_FACTOR = Fraction(10) ** -150, Fraction(10) ** 150
-"""Between them quotients of two units are numbers, too."""
-_WORDS = {
-    "chain", "chains", "dB", "decade", "hand", "hands", "link", "links", "octave", "point", "points", "rod",
+"""One factor of a unit: a name and its power, with parentheses before and after it."""
+_SMALLEST_FACTOR = Fraction(10) ** -150
+_LARGEST_FACTOR = Fraction(10) ** 150
+"""Between these factors the quotient of two units is a finite number, too."""
+_WORDS_THAT_ARE_NO_UNITS = {
+    "chain",
+    "chains",
+    "dB",
+    "decade",
+    "hand",
+    "hands",
+    "link",
+    "links",
+    "octave",
+    "point",
+    "points",
+    "rod",
     "rods",
-}  # fmt: skip
-"""What pint takes for lengths and ratios, and measuring programmes do not."""
-
-
-_PLAIN = {
-    "1": (1.0, {}), "%": (0.01, {}), "microstrain": (1e-6, {}), "m": (1.0, {"m": 1}), "mm": (1e-3, {"m": 1}),
-    "kg": (1.0, {"kg": 1}), "g": (1e-3, {"kg": 1}), "s": (1.0, {"s": 1}), "Hz": (1.0, {"s": -1}),
-    "1/s": (1.0, {"s": -1}), "N": (1.0, {"kg": 1, "m": 1, "s": -2}),
-}  # fmt: skip
-"""Factors and exponents of units that nearly every FMU has: pint takes long to begin."""
+}
+"""Names that pint takes for lengths and ratios, and measuring software does not."""
 
 
 class Meaning(NamedTuple):
-    """SI value = `factor` * value + `offset`, in the SI unit with these exponents (of `BASE_UNITS`)."""
+    """The conversion of a unit: SI value = `factor` * value + `offset`.
+
+    Attributes
+    ----------
+    exponents : tuple of int
+        The exponents of `BASE_UNITS` in the SI unit.
+    factor, offset : float
+        The factor and the offset, in this SI unit.
+    """
 
     exponents: tuple[int, ...]
     factor: float
     offset: float = 0.0
 
 
+class ExactMeaning(NamedTuple):
+    """The conversion of a unit in fractions, see `Meaning`."""
+
+    exponents: tuple[int, ...]
+    factor: Fraction
+    offset: Fraction
+
+
+def _meaning(factor: float, **exponents: int) -> Meaning:
+    return Meaning(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor)
+
+
+_COMMON_UNITS = {
+    "1": _meaning(1.0),
+    "%": _meaning(0.01),
+    "microstrain": _meaning(1e-6),
+    "m": _meaning(1.0, m=1),
+    "mm": _meaning(1e-3, m=1),
+    "kg": _meaning(1.0, kg=1),
+    "g": _meaning(1e-3, kg=1),
+    "s": _meaning(1.0, s=1),
+    "Hz": _meaning(1.0, s=-1),
+    "1/s": _meaning(1.0, s=-1),
+    "N": _meaning(1.0, kg=1, m=1, s=-2),
+}
+"""Units of nearly every FMU; pint takes long to import."""
+
+
 @cache
-def _known_units() -> "UnitRegistry[Any]":
-    """Return the units of pint in fractions of integers; pi is that of floats, and so are its multiples."""
+def _unit_registry() -> "UnitRegistry[Any]":
+    """Return pint's units with factors in fractions; multiples of pi are those of the float."""
     import pint
 
-    known: UnitRegistry[Any] = pint.UnitRegistry(None, non_int_type=Fraction, on_redefinition="ignore")
-    known.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
-    known.define(f"pi = {Decimal(pi)} = π")
-    known.define("@alias ohm = Ohm")
-    return known
+    registry: UnitRegistry[Any] = pint.UnitRegistry(
+        None, non_int_type=Fraction, on_redefinition="ignore"
+    )
+    registry.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
+    registry.define(f"pi = {Decimal(pi)} = π")
+    registry.define("@alias ohm = Ohm")
+    return registry
 
 
-def _expression(unit: str, *, gravity: bool) -> str:
-    """Return a unit as pint reads it; raises ValueError if it is not made of names and powers."""
-    text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST]).replace("**", "^")
-    if len(unit) > _LONGEST or len(text) > _LONGEST:
+def _pint_expression(unit: str, *, gravity: bool) -> str:
+    """Return a unit in the notation of pint.
+
+    Raises
+    ------
+    ValueError
+        If the unit is not a product of names and powers.
+    """
+    text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST_UNIT]).replace("**", "^")
+    if len(unit) > _LONGEST_UNIT or len(text) > _LONGEST_UNIT:
         raise ValueError(f"{unit!r} is no unit")
-    text = _ALIASES.get(text, text)
+    text = _PINT_NAMES.get(text, text)
     if text == "1":
         return text
-    parts = re.split(r"\s*([*/.·⋅]|\s)\s*", text)
-    for at in range(0, len(parts), 2):
-        factor = _FACTOR.fullmatch(parts[at])
-        is_divided = parts[at + 1 : at + 2] == ["/"]
-        if factor is None or not _is_unit_with_power(factor, is_first=at == 0, is_divided=is_divided):
+    # The group keeps the operators: factors have even indices, operators odd ones.
+    tokens = re.split(r"\s*([*/.·⋅]|\s)\s*", text)
+    factors = tokens[0::2]
+    operators = tokens[1::2]
+    expression = ""
+    for index, factor_text in enumerate(factors):
+        factor = _FACTOR.fullmatch(factor_text)
+        is_dividend = operators[index : index + 1] == ["/"]
+        if factor is None:
             raise ValueError(f"{unit!r} is no unit")
-        parts[at] = _factor_for_pint(factor, gravity=gravity)
-        if at:
-            parts[at - 1] = "/" if parts[at - 1] == "/" else "*"
-    return "".join(parts)
+        if not _is_unit_with_power(factor, is_first=index == 0, is_dividend=is_dividend):
+            raise ValueError(f"{unit!r} is no unit")
+        if index > 0:
+            expression += "/" if operators[index - 1] == "/" else "*"
+        expression += _pint_factor(factor, gravity=gravity)
+    return expression
 
 
-def _is_unit_with_power(factor: re.Match[str], *, is_first: bool, is_divided: bool) -> bool:
-    """Return whether a factor can be of a unit.
+def _is_unit_with_power(factor: re.Match[str], *, is_first: bool, is_dividend: bool) -> bool:
+    """Return whether a factor can belong to a unit.
 
-    A digit that makes no other unit of a name is the number of a pin, gauge or channel: `A0`, `N1`. One is a
-    factor only where it is divided by others: `1/s`, `m.(1/s)`; `12` or `m 1` are no units.
+    A power of 0 or 1 without caret is the number of a pin, gauge or channel: `A0`, `N1`. The
+    number 1 is a factor only where it is divided by others: `1/s`, `m.(1/s)`; `12` or `m 1` are no
+    units.
+
+    Parameters
+    ----------
+    factor : re.Match
+        The factor, as a match of `_FACTOR`.
+    is_first : bool
+        Whether the factor is the first of the unit.
+    is_dividend : bool
+        Whether the factor is divided by the next one.
     """
-    name, caret, power = factor["name"], factor["caret"], factor["power"]
-    if name == "1":
-        return not caret and power is None and is_divided and (is_first or bool(factor["opening"]))
-    if name in _WORDS or (caret and power is None):
+    has_caret = bool(factor["caret"])
+    if factor["name"] == "1":
+        has_power = has_caret or factor["power"] is not None
+        begins_quotient = is_first or bool(factor["opening"])
+        return not has_power and is_dividend and begins_quotient
+    if factor["name"] in _WORDS_THAT_ARE_NO_UNITS:
         return False
-    return power is None or int(power) not in (0, 1) or (bool(caret) and int(power) == 1)
+    if factor["power"] is None:
+        return not has_caret
+    power = int(factor["power"])
+    if power == 1:
+        return has_caret
+    return power != 0
 
 
-def _factor_for_pint(factor: re.Match[str], *, gravity: bool) -> str:
-    """Return a factor of a unit as pint reads it."""
-    name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", _ALIASES.get(factor["name"], factor["name"]))
-    name = re.sub(r"^([mμ]?)g$", r"\1g_0", name) if gravity else name
-    power = "" if factor["power"] is None else f"({name})**{factor['power']}"
-    return factor["opening"] + (power or name) + factor["closing"]
+def _pint_factor(factor: re.Match[str], *, gravity: bool) -> str:
+    """Return a factor of a unit in the notation of pint."""
+    name = _PINT_NAMES.get(factor["name"], factor["name"])
+    # Nm and Nmm are products; pint would look for a unit of this name.
+    name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", name)
+    if gravity:
+        name = re.sub(r"^([mμ]?)g$", r"\1g_0", name)
+    if factor["power"] is not None:
+        name = f"({name})**{factor['power']}"
+    return factor["opening"] + name + factor["closing"]
 
 
 @cache
-def exact_meaning(unit: str, *, gravity: bool = False) -> tuple[tuple[int, ...], Fraction, Fraction]:
-    """Return what a unit means: its exponents, and factor and offset as fractions, see `Meaning`.
+def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
+    """Return the conversion of a unit to SI, in fractions.
 
-    Names with SI prefixes are joined by `.`, `*`, `/` or a blank; a power follows its name (`m2`, `m^2`,
-    `s-1`, `m**2`) and is not 0, and 1 only behind a caret: `A0` and `N1` are names of pins and gauges. A `/`
-    divides by the next name or parenthesis only, as in Modelica. An angle is no number here, and a hertz no
-    rad/s.
+    Names with SI prefixes are joined by `.`, `*`, `/` or a blank. A power follows its name (`m2`,
+    `m^2`, `s-1`, `m**2`); it is not 0, and 1 only after a caret: `A0` and `N1` are names of pins
+    and gauges. A `/` divides by the next name or parenthesis only, as in Modelica. An angle has the
+    unit rad, and a hertz is not 1 rad/s.
 
     Parameters
     ----------
     unit : str
-        Such as `kN`, `kg/m3`, `W/(m2.K)`, `1/s`, `degC`, `N mm`.
+        The unit, such as `kN`, `kg/m3`, `W/(m2.K)`, `1/s`, `degC`, `N mm`.
     gravity : bool
         Whether g is an acceleration, not a mass.
 
     Raises
     ------
     ValueError
-        If it is no unit that pint knows, none of SI, or beyond the numbers of a computer.
+        If pint does not know the unit, it cannot be expressed in SI, or its factor exceeds the
+        range of floating-point numbers.
     """
-    text = _expression(unit, gravity=gravity)
+    text = _pint_expression(unit, gravity=gravity)
     from pint.errors import PintError
 
-    known = _known_units()
+    registry = _unit_registry()
     try:
-        parsed = known.parse_units(text)
-        factor, roots = known.get_root_units(parsed)
-        offset = known.Quantity(Fraction(0), parsed).to_root_units().magnitude
+        parsed = registry.parse_units(text)
+        factor_to_grams, root_units = registry.get_root_units(parsed)
+        offset = registry.Quantity(Fraction(0), parsed).to_root_units().magnitude
     except (PintError, TokenError, AttributeError, TypeError, ArithmeticError) as cause:
         raise ValueError(f"{unit!r} is no unit") from cause
-    powers: dict[str, Any] = dict(roots._units)
-    exponents = tuple(powers.pop(root, 0) for root in _ROOTS)
-    if powers or any(exponent != int(exponent) for exponent in exponents):
+    powers: dict[str, Any] = dict(root_units._units)
+    exponents = [powers.pop(base_unit, 0) for base_unit in _PINT_BASE_UNITS]
+    has_other_units = bool(powers)
+    if has_other_units or any(exponent != int(exponent) for exponent in exponents):
         raise ValueError(f"{unit!r} is no unit of SI")
-    kilograms = int(exponents[0])
-    size = Fraction(str(factor)) / Fraction(1000) ** kilograms
-    if not _SMALLEST_FACTOR < abs(size) < _LARGEST_FACTOR:
+    exponent_of_mass = int(exponents[0])
+    factor = Fraction(str(factor_to_grams)) / Fraction(1000) ** exponent_of_mass
+    if not _SMALLEST_FACTOR < abs(factor) < _LARGEST_FACTOR:
         raise ValueError(f"{unit!r} is beyond the numbers of a computer")
-    return tuple(int(exponent) for exponent in exponents), size, Fraction(offset)
+    return ExactMeaning(tuple(int(exponent) for exponent in exponents), factor, Fraction(offset))
 
 
 @lru_cache(maxsize=1024)
 def meaning_of(unit: str) -> Meaning | None:
-    """Return what a unit means, or None if it is not understood; see `exact_meaning`."""
-    if unit in _PLAIN:
-        size, powers = _PLAIN[unit]
-        return Meaning(tuple(powers.get(base, 0) for base in BASE_UNITS), size)
+    """Return the conversion of a unit to SI, or None if `exact_meaning` refuses it."""
+    if unit in _COMMON_UNITS:
+        return _COMMON_UNITS[unit]
     try:
         exponents, factor, offset = exact_meaning(unit)
         return Meaning(exponents, float(factor), float(offset))

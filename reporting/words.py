@@ -1,12 +1,16 @@
-"""Numbers beside their nouns and their uncertainties, names of parameters, and reasons, for sentences."""
+"""Numbers, lists of words and names of parameters, as sentences show them."""
 
 import re
 from collections.abc import Iterable, Mapping
 from math import floor, isfinite, log10
-from typing import Any
 
 LONGEST_FACT = 60
-"""Letters of a fact that `brief` tells."""
+"""Longest text of a value in `brief`, in characters."""
+
+MOST_LISTED = 30
+"""Largest number of words that `comma_list` writes out."""
+
+_LISTED_ITEMS = 3  # of a collection in `brief`
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
@@ -15,77 +19,112 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
     Parameters
     ----------
     count : int
-        How many.
+        The number of things.
     noun : str
-        Of one.
+        The noun in the singular.
     plural : str, optional
-        Of any other number; `noun` with an "s" if left out.
+        The noun in the plural; `noun` with an "s" by default.
     """
-    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
+    if count == 1:
+        return f"{count} {noun}"
+    return f"{count} {plural or f'{noun}s'}"
 
 
 def brief(record: object, **facts: object) -> str:
-    """Return a record in one line, for `__repr__`: its class, and facts by name.
+    """Return a record in one line, for `__repr__`: its class, and some of its values by name.
 
-    Long text is cut; of a collection of names its length and the first three are told.
+    Long texts are cut; a collection shows its length and its first three entries.
     """
-    return f"{type(record).__name__}({', '.join(f'{name}={_short(fact)}' for name, fact in facts.items())})"
+    pairs = ", ".join(f"{name}={_short(value)}" for name, value in facts.items())
+    return f"{type(record).__name__}({pairs})"
 
 
-def _short(fact: object) -> str:
-    if isinstance(fact, float):
-        return f"{fact:.4g}"
-    if isinstance(fact, Mapping | list | tuple):
-        first = [_short(item) for item in list(fact)[:3]] + ["..."] * (len(fact) > 3)
-        return f"{len(fact)} ({', '.join(first)})" if first else "none"
-    if isinstance(fact, str) and len(fact) > LONGEST_FACT:
-        return f"{fact[: LONGEST_FACT - 3]}..."
-    return str(fact)
+def _short(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping | list | tuple):
+        return _short_collection(list(value))
+    if isinstance(value, str) and len(value) > LONGEST_FACT:
+        return f"{value[: LONGEST_FACT - 3]}..."
+    return str(value)
 
 
-def be(count: int) -> str:
+def _short_collection(entries: list[object]) -> str:
+    if not entries:
+        return "none"
+    texts = [_short(entry) for entry in entries[:_LISTED_ITEMS]]
+    if len(entries) > _LISTED_ITEMS:
+        texts.append("...")
+    return f"{len(entries)} ({', '.join(texts)})"
+
+
+def is_or_are(count: int) -> str:
     """Return "is" for one and "are" for any other count."""
     return "is" if count == 1 else "are"
 
 
 def listing(words: Iterable[str], joint: str = "and") -> str:
     """Return words as "a, b and c", or with another `joint`."""
-    found = list(words)
-    if len(found) < 2:
-        return "".join(found)
-    return f"{', '.join(found[:-1])} {joint} {found[-1]}"
+    texts = list(words)
+    if len(texts) < 2:
+        return "".join(texts)
+    return f"{', '.join(texts[:-1])} {joint} {texts[-1]}"
+
+
+def comma_list(words: Iterable[object]) -> str:
+    """Return words as "a, b, c", or "none"; of many the first are written out."""
+    texts = [str(word) for word in words]
+    listed = ", ".join(texts[:MOST_LISTED]) or "none"
+    if len(texts) > MOST_LISTED:
+        return f"{listed} and {len(texts) - MOST_LISTED} more"
+    return listed
 
 
 def one_line(reason: object) -> str:
-    """Return what a foreign error says as one line without its full stop, to stand in a sentence."""
+    """Return the message of a foreign error as one line without full stop."""
     return " ".join(str(reason).split()).removesuffix(".")
 
 
 def parameter_title(name: str) -> str:
-    """Return the name of a parameter in words, "young_modulus_factor" as "Young modulus factor"."""
+    """Return the name of a parameter in words: "young_modulus_factor" as "Young modulus factor"."""
     return re.sub(r"\byoung\b", "Young", name.replace("_", " "))
 
 
-def number(value: Any) -> str:
-    """Return a figure as printed: text as it is, five significant digits, a dash for none."""
+def number(value: object) -> str:
+    """Return a table cell: a float to five digits, a text as it is, a dash for None."""
     if value is None:
         return "—"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.5g}".replace("-", "−") if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return _with_minus_sign(f"{value:.5g}")
+    return str(value)
 
 
 def rounded(value: float, deviation: float) -> str:
-    """Return a value with as many decimals as two digits of its deviation need."""
+    """Return a value with the decimals that two digits of its standard deviation need.
+
+    Parameters
+    ----------
+    value, deviation : float
+        The value and its standard deviation, in one unit.
+    """
     if not isfinite(value):
         return "—"
     if not (deviation > 0.0 and isfinite(deviation)):
-        return f"{value:.6g}".replace("-", "−")
+        return _with_minus_sign(f"{value:.6g}")
     decimals = 1 - floor(log10(deviation))
     if abs(value) >= 1e6 or deviation < 1e-6:
-        digits = max(2, floor(log10(max(abs(value), deviation))) + decimals + 1)
+        leading_exponent = floor(log10(max(abs(value), deviation)))
+        digits = max(2, leading_exponent + decimals + 1)
         return f"{value:.{min(digits, 12) - 1}e}"
-    return f"{value:z.{max(decimals, 0)}f}".replace("-", "−")  # nothing is less than none
+    # The option "z" writes a rounded negative zero without its sign.
+    return _with_minus_sign(f"{value:z.{max(decimals, 0)}f}")
+
+
+def _with_minus_sign(text: str) -> str:
+    """Return a number with the minus sign of typography in the place of the hyphen."""
+    return text.replace("-", "−")
 
 
 def plus_minus(value: float, deviation: float) -> str:
@@ -94,16 +133,17 @@ def plus_minus(value: float, deviation: float) -> str:
 
 
 def between(low: float, high: float, deviation: float | None = None) -> str:
-    """Return an interval with as many decimals as its width or another deviation needs."""
-    spread = high - low if deviation is None else deviation
-    return f"{rounded(low, spread)} to {rounded(high, spread)}"
+    """Return an interval with the decimals that its width, or a standard deviation, needs."""
+    if deviation is None:
+        deviation = high - low
+    return f"{rounded(low, deviation)} to {rounded(high, deviation)}"
 
 
 def capital(text: str) -> str:
-    """Return the text with its first letter capital."""
+    """Return the text with a capital first letter."""
     return text[:1].upper() + text[1:]
 
 
 def small(text: str) -> str:
-    """Return the text with its first letter small, to stand in a sentence."""
+    """Return the text with a small first letter, for use inside a sentence."""
     return text[:1].lower() + text[1:]

@@ -153,7 +153,7 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
 def main() -> None:
     """Run `python -m twin_master`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    application.command()(terminal.told("run", run))
+    application.command()(terminal.as_command("run", run))
     guarded(lambda: terminal.with_common_options(application)(prog_name="python -m twin_master"))
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from reporting.files import atomic_write_text, remove_leftovers, write_members
-from reporting.folders import held, lock_folder, restore_folder, whole_folder
+from reporting.folders import closing_lock, lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance
@@ -253,7 +253,7 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
         other = f"{scenario.mission.name}, {file.get('name')}"
         there = {"folder": folder, "does": does, "other": other}
         raise NotResumableError(said("mission.another", **there, path=loaded.path))
-    with held(lock_run_folder(folder)):
+    with closing_lock(lock_run_folder(folder)):
         yield config, scenario.moved(folder)
 
 

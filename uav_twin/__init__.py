@@ -13,11 +13,11 @@ def __getattr__(name: str) -> Any:
     if name.startswith("__") and name != "__all__":  # asked for by Python itself
         raise AttributeError(name)
     refuse_shadowing()
-    from reporting.lazy import handed_on, homes_of
+    from reporting.lazy import lazy_getattr, reexported_names
 
-    homes = homes_of(__file__)
+    homes = reexported_names(__file__)
     known: dict[str, Any] = {"_HOMES": homes, "__all__": sorted(homes)}
-    return known[name] if name in known else handed_on(__name__, __file__)(name)
+    return known[name] if name in known else lazy_getattr(__name__, __file__)(name)
 
 
 def __dir__() -> list[str]:

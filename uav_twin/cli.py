@@ -36,7 +36,7 @@ def _application() -> typer.Typer:
             whole.add_typer(groups[words], name=words)
         if "function" in table:
             module, _, name = table["function"].partition(":")
-            function = terminal.told(words, getattr(import_module(module), name))
+            function = terminal.as_command(words, getattr(import_module(module), name))
             group, _, last = words.rpartition(" ")
             if words in groups:
                 groups[words].callback(invoke_without_command=True)(_alone(function))

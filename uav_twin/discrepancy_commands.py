@@ -186,7 +186,7 @@ def check(
         given |= {"data": data, "model": chosen, "faults": faults, "catalogue": catalogue}
         options.show("check", words=WORDS, able=able, **given)
     if able is None:
-        raise terminal.failed("Mend the faults first: conclusions from these data would be wrong.")
+        raise terminal.error_exit("Mend the faults first: conclusions from these data would be wrong.")
 
 
 def _record(

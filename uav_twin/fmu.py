@@ -64,7 +64,7 @@ def check(
     findings = [asdict(finding) for finding in result.findings]
     answer("fmu check", record={"file": str(file), "passed": result.passed, "findings": findings}, json=json)
     if not result.passed:
-        raise terminal.failed(f"{file}: {counted(len(result.problems), 'problem')}.")
+        raise terminal.error_exit(f"{file}: {counted(len(result.problems), 'problem')}.")
 
 
 def build(

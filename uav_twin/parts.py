@@ -1,5 +1,5 @@
 """What commands take from the other packages, imported when it is used; `--help` needs none."""
 
-from reporting.lazy import handed_on
+from reporting.lazy import lazy_getattr
 
-__getattr__ = handed_on(__name__, __file__)
+__getattr__ = lazy_getattr(__name__, __file__)

@@ -1,5 +1,6 @@
 """What commands take from the other packages: read by type checkers, by editors and by `parts.py`."""
 
+from calibration.dynamics.extremes import refine_by_extremes as refine_by_extremes
 from calibration.dynamics.figures import ring_down_figure as ring_down_figure
 from calibration.dynamics.records import read_records as read_records
 from calibration.dynamics.trials import FIRST_PEAK as FIRST_PEAK
@@ -7,7 +8,6 @@ from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS as PUBLISHED_DA
 from calibration.dynamics.trials import PUBLISHED_FREQUENCIES as PUBLISHED_FREQUENCIES
 from calibration.dynamics.trials import average as average
 from calibration.dynamics.trials import fit_trials as fit_trials
-from calibration.dynamics.trials import refine_by_extremes as refine_by_extremes
 from calibration.result.file import check_folder as check_folder
 from calibration.result.file import load_calibration as load_calibration
 from calibration.result.file import tailoring as tailoring

@@ -70,7 +70,7 @@ def end_with(checks: "Sequence[parts.Check]") -> None:
     """End with 1, and say which limits are broken, if any is."""
     broken = [f"{check.group}, {check.name}" for check in checks if not check.passed]
     if broken:
-        raise terminal.failed(
+        raise terminal.error_exit(
             f"{len(broken)} of {len(checks)} checks broke their limit: {'; '.join(broken)}."
         )
 

@@ -1,6 +1,7 @@
 """A sum of damped cosines, an offset and a drift: Kapteyn et al. 2021, eq. (22).
 
-A wave is the real part of A exp(s t) with the pole s = -decay rate + i damped angular frequency [1/s].
+A damped cosine ("wave") is the real part of A exp(s t) with the complex amplitude A and the pole
+s = -decay rate + i damped angular frequency [1/s].
 """
 
 import math
@@ -14,26 +15,28 @@ from reporting.arrays import Float
 
 ComplexArray = NDArray[np.complex128]
 
-_GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growing waves
-_LEAST_VARIANCE = 1e-200  # that a record without noise, or a wave that is gone, is not divided by
+_GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growth
+_LEAST_VARIANCE = (
+    1e-200  # keeps a record without noise, or a vanished wave, from a division by zero
+)
 _MOST_EVALUATIONS = 300  # of the least squares, for each unknown
 
 
 class RingDownMode(NamedTuple):
     """One damped cosine of a record as a mode: Kapteyn et al. 2021, eqs. (23) and (24).
 
-    With the natural angular frequency |s|: f = |s| / 2 pi and zeta = -Re s / |s|. Standard errors are
-    propagated to first order with all of the covariance, that between both parts of s too, for independent
-    residuals of equal variance. A frequency that was not fitted has the share of Re s alone.
+    The natural angular frequency is |s|, so f = |s| / 2 pi and zeta = -Re s / |s|. Standard errors
+    are propagated to first order with the full covariance of Re s and Im s, for independent
+    residuals of equal variance. If the frequency was not fitted, its variance is zero.
 
     Attributes
     ----------
     pole : complex
-        s [1/s].
+        The pole s [1/s].
     wave : complex
-        Amplitude at the start of the record [V].
+        The complex amplitude at the start of the record [V].
     covariance : (2, 2) array
-        Of Re s and Im s [1/s^2].
+        The covariance of Re s and Im s [1/s^2].
     """
 
     pole: complex
@@ -62,37 +65,59 @@ class RingDownMode(NamedTuple):
 
     @property
     def standard_error(self) -> dict[str, float]:
-        """Of `frequency` [Hz] and `damping_ratio` [1], by these names."""
-        slopes = zip(("frequency", "damping_ratio"), modal_slopes(self.pole), strict=True)
-        return {name: math.sqrt(max(float(slope @ self.covariance @ slope), 0.0)) for name, slope in slopes}
+        """Standard errors of `frequency` [Hz] and `damping_ratio` [1], by these names."""
+        frequency_gradient, ratio_gradient = modal_gradients(self.pole)
+        return {
+            "frequency": self._standard_error_along(frequency_gradient),
+            "damping_ratio": self._standard_error_along(ratio_gradient),
+        }
+
+    def _standard_error_along(self, gradient: Float) -> float:
+        variance = float(gradient @ self.covariance @ gradient)
+        return math.sqrt(max(variance, 0.0))
 
 
-def modal_slopes(pole: complex) -> Float:
-    """Return the derivatives (2, 2) of natural frequency [Hz] and damping ratio [1] by Re s and Im s."""
-    real, imaginary, size = pole.real, pole.imag, abs(pole)
-    of_ratio = np.array([-(imaginary**2), real * imaginary]) / size**3
-    return np.array([np.array([real, imaginary]) / size / (2.0 * math.pi), of_ratio])
+def modal_gradients(pole: complex) -> Float:
+    """Return the derivatives of natural frequency and damping ratio with respect to a pole.
+
+    Parameters
+    ----------
+    pole : complex
+        The pole s [1/s].
+
+    Returns
+    -------
+    (2, 2) array
+        The derivatives of the frequency [Hz] and of the damping ratio [1] (rows) with respect to
+        Re s and Im s (columns).
+    """
+    real = pole.real
+    imaginary = pole.imag
+    magnitude = abs(pole)
+    frequency_gradient = np.array([real, imaginary]) / magnitude / (2.0 * math.pi)
+    ratio_gradient = np.array([-(imaginary**2), real * imaginary]) / magnitude**3
+    return np.array([frequency_gradient, ratio_gradient])
 
 
-class Solution(NamedTuple):
-    """K waves against C signals of N samples, at given poles.
+class DampedCosineFit(NamedTuple):
+    """K waves fitted to C signals of N samples.
 
     Attributes
     ----------
     pole : (K,) array
-        s [1/s].
+        The poles s [1/s].
     amplitude : (K, C) array
-        Complex, at the first sample [V].
+        The complex amplitudes at the first sample [V].
     fitted : (N, C) array
-        [V].
+        The fitted signals [V].
     deviation : (C,) array
-        Standard deviation of the residuals [V].
+        The standard deviation of the residuals of each signal [V].
     covariance : (U, U) array
-        Of the K Re s and K Im s, and for each signal of the K Re A, the K Im A, and the line; zero for
-        frequencies that were not fitted.
-    seen : (K,) array
-        Squared amplitudes over their covariance, summed over the signals: what a wave takes off the sum of
-        squares, over its scatter [1].
+        The covariance of the K Re s and K Im s, followed for each signal by the K Re A, the K Im A
+        and the coefficients of the line; zero for frequencies that were not fitted.
+    chi_square : (K,) array
+        The squared amplitudes over their covariance, summed over the signals: the reduction of the
+        sum of squares by a wave, over the variance of the residuals [1].
     """
 
     pole: ComplexArray
@@ -100,34 +125,38 @@ class Solution(NamedTuple):
     fitted: Float
     deviation: Float
     covariance: Float
-    seen: Float
+    chi_square: Float
 
     @property
     def modes(self) -> tuple[RingDownMode, ...]:
-        """The waves as the first signal has them, in the order of the poles."""
+        """The waves with their amplitudes in the first signal, in the order of the poles."""
         count = len(self.pole)
-        pairs = [np.ix_([at, count + at], [at, count + at]) for at in range(count)]
-        return tuple(
-            RingDownMode(complex(pole), complex(wave), self.covariance[pair])
-            for pole, wave, pair in zip(self.pole, self.amplitude[:, 0], pairs, strict=True)
-        )
+        modes = []
+        for number in range(count):
+            real_and_imaginary = [number, count + number]
+            covariance = self.covariance[np.ix_(real_and_imaginary, real_and_imaginary)]
+            pole = complex(self.pole[number])
+            wave = complex(self.amplitude[number, 0])
+            modes.append(RingDownMode(pole, wave, covariance))
+        return tuple(modes)
 
 
 class DampedCosines:
-    """Damped cosines and a line against one record of one or more signals, each with noise of its own.
+    """A model of one record: damped cosines and a line in one or more signals.
 
-    A value that is the average over an interval of width w carries g(s) = sinh(s w / 2) / (s w / 2).
+    Each signal has noise with a variance of its own. The average of a wave over an interval of
+    width w is the wave times g(s) = sinh(s w / 2) / (s w / 2).
 
     Parameters
     ----------
     time : (N,) array
-        [s].
+        The instants [s].
     signal : (N,) or (N, C) array
-        [V].
+        The signals [V].
     averaging_width : float
-        w [s]; 0 for samples.
+        The width w of the interval over which each value is an average [s]; 0 for samples.
     drift : bool
-        Whether the line may slope; an offset alone otherwise.
+        Whether the line may have a slope; otherwise it is an offset.
     """
 
     def __init__(
@@ -135,25 +164,56 @@ class DampedCosines:
     ) -> None:
         self._time = time - time[0]
         self._signal = signal.reshape(len(time), -1)
-        self._width = averaging_width
-        self._line = np.column_stack([np.ones(time.size), self._time - self._time.mean()])[:, : 1 + drift]
+        self._averaging_width = averaging_width
+        offset = np.ones(time.size)
+        if drift:
+            self._line = np.column_stack([offset, self._time - self._time.mean()])
+        else:
+            self._line = offset[:, None]
 
     def residual(self, pole: ComplexArray) -> Float:
-        """Return the residuals [V], (N C,), with the best amplitudes, offset and drift."""
-        orthogonal = np.linalg.qr(self._basis(self._waves(pole)))[0]
-        return np.asarray(self._signal - orthogonal @ (orthogonal.T @ self._signal)).ravel()
+        """Return the residuals with the best amplitudes and line at given poles.
 
-    def fit(self, start: NDArray[np.complexfloating], *, frequencies_fitted: bool = True) -> Solution:
-        """Return the waves nearest to the record, begun at these poles."""
-        count, damped = start.size, start.imag
-        scale = np.concatenate([start.real, damped] if frequencies_fitted else [start.real])
+        Parameters
+        ----------
+        pole : (K,) array
+            The poles s [1/s].
 
-        def pole(unknown: Float) -> ComplexArray:
+        Returns
+        -------
+        (N C,) array
+            The residuals of all signals [V].
+        """
+        # Variable projection: the linear unknowns are eliminated by an orthogonal projection.
+        orthogonal_basis = np.linalg.qr(self._basis(self._waves(pole)))[0]
+        fitted = orthogonal_basis @ (orthogonal_basis.T @ self._signal)
+        return np.asarray(self._signal - fitted).ravel()
+
+    def fit(
+        self, start: NDArray[np.complexfloating], *, frequencies_fitted: bool = True
+    ) -> DampedCosineFit:
+        """Return the least-squares fit to the record.
+
+        Parameters
+        ----------
+        start : (K,) array
+            The poles at which the iteration begins [1/s].
+        frequencies_fitted : bool
+            Whether the damped frequencies are unknown; otherwise they keep their values.
+        """
+        count = start.size
+        if frequencies_fitted:
+            scale = np.concatenate([start.real, start.imag])
+        else:
+            scale = np.concatenate([start.real])
+
+        def pole_of(unknown: Float) -> ComplexArray:
             scaled = unknown * scale
-            return np.asarray(scaled[:count] + 1j * (scaled[count:] if frequencies_fitted else damped))
+            imaginary = scaled[count:] if frequencies_fitted else start.imag
+            return np.asarray(scaled[:count] + 1j * imaginary)
 
-        found = least_squares(
-            lambda unknown: self.residual(pole(unknown)),
+        optimum = least_squares(
+            lambda unknown: self.residual(pole_of(unknown)),
             np.ones(scale.size),
             method="lm",
             xtol=1e-12,
@@ -161,47 +221,132 @@ class DampedCosines:
             gtol=1e-14,
             max_nfev=_MOST_EVALUATIONS * scale.size,
         )
-        return self.solve(pole(found.x), frequencies_fitted=frequencies_fitted)
+        return self.solve(pole_of(optimum.x), frequencies_fitted=frequencies_fitted)
 
-    def solve(self, pole: ComplexArray, *, frequencies_fitted: bool = True) -> Solution:
-        """Return amplitudes, fitted signals and the covariance at these poles."""
+    def solve(self, pole: ComplexArray, *, frequencies_fitted: bool = True) -> DampedCosineFit:
+        """Return amplitudes, fitted signals and covariance at given poles.
+
+        Parameters
+        ----------
+        pole : (K,) array
+            The poles s [1/s].
+        frequencies_fitted : bool
+            Whether the damped frequencies count as unknown in the covariance.
+        """
         wave = self._waves(pole)
         basis = self._basis(wave)
-        coefficient = np.asarray(np.linalg.lstsq(basis, self._signal, rcond=None)[0], dtype=np.float64)
-        count, channels, own = pole.size, self._signal.shape[1], basis.shape[1]
+        solution = np.linalg.lstsq(basis, self._signal, rcond=None)[0]
+        coefficient = np.asarray(solution, dtype=np.float64)
+        count = pole.size
         amplitude = coefficient[:count] + 1j * coefficient[count : 2 * count]
         fitted = basis @ coefficient
-        square = np.sum((self._signal - fitted) ** 2, axis=0)
-        # by the poles; what averages add to it is in proportion to the wave, as its amplitude is
-        moved = self._time[:, None] * wave
-        covariance = np.zeros((2 * count + channels * own,) * 2)
-        used = np.delete(np.arange(len(covariance)), [] if frequencies_fitted else np.s_[count : 2 * count])
-        freedom = max(self._signal.size - used.size, 1)
-        variance = np.maximum(square * channels / freedom, _LEAST_VARIANCE)
-        information = np.zeros_like(covariance)
-        for channel in range(channels):
-            turned = moved * amplitude[:, channel]
-            columns = np.hstack([turned.real, -turned.imag, basis]) / math.sqrt(variance[channel])
-            rows = np.r_[: 2 * count, np.arange(own) + 2 * count + channel * own]
-            information[np.ix_(rows, rows)] += columns.T @ columns
-        np.fill_diagonal(information, np.maximum(np.diag(information), _LEAST_VARIANCE))
-        size = np.sqrt(np.diag(information))[used]
-        scaled = information[np.ix_(used, used)] / np.outer(size, size)
-        covariance[np.ix_(used, used)] = np.linalg.pinv(scaled, hermitian=True) / np.outer(size, size)
-        # what is known of the amplitudes of each wave at these poles, (K, 2, 2)
-        spread = np.linalg.pinv(basis.T @ basis)[: 2 * count, : 2 * count].reshape(2, count, 2, count)
-        weight = np.linalg.pinv(np.einsum("ikjk->kij", spread))
-        pair = coefficient[: 2 * count].reshape(2, count, channels)
-        scatter = np.maximum(square / max(len(basis) - own, 1), _LEAST_VARIANCE)
-        seen = np.einsum("ikc,kij,jkc,c->k", pair, weight, pair, 1.0 / scatter)
-        return Solution(pole, amplitude, fitted, np.sqrt(variance), covariance, seen)
-
-    def _waves(self, pole: ComplexArray) -> ComplexArray:
-        s = np.minimum(pole.real, _GREATEST_GROWTH / self._time[-1]) + 1j * pole.imag
-        half = 0.5 * s * self._width
-        return np.asarray(
-            (np.sinh(half) / half if self._width else 1.0) * np.exp(np.multiply.outer(self._time, s))
+        sum_of_squares = np.sum((self._signal - fitted) ** 2, axis=0)
+        variance, covariance = self._covariance(
+            wave, basis, amplitude, sum_of_squares, frequencies_fitted=frequencies_fitted
+        )
+        return DampedCosineFit(
+            pole=pole,
+            amplitude=amplitude,
+            fitted=fitted,
+            deviation=np.sqrt(variance),
+            covariance=covariance,
+            chi_square=_wave_chi_square(count, basis, coefficient, sum_of_squares),
         )
 
+    def _covariance(
+        self,
+        wave: ComplexArray,
+        basis: Float,
+        amplitude: ComplexArray,
+        sum_of_squares: Float,
+        *,
+        frequencies_fitted: bool,
+    ) -> tuple[Float, Float]:
+        """Return the variance of the residuals (C,), and the covariance (U, U) of all unknowns.
+
+        Parameters
+        ----------
+        wave : (N, K) array
+            The waves of unit amplitude.
+        basis : (N, B) array
+            The basis of the linear unknowns of a signal.
+        amplitude : (K, C) array
+            The complex amplitudes.
+        sum_of_squares : (C,) array
+            The sum of squared residuals of each signal.
+        frequencies_fitted : bool
+            Whether the damped frequencies are unknown.
+        """
+        count = wave.shape[1]
+        channels = self._signal.shape[1]
+        linear_count = basis.shape[1]
+
+        # Variance of the residuals
+        unknown_count = 2 * count + channels * linear_count
+        fixed = slice(0, 0) if frequencies_fitted else slice(count, 2 * count)
+        fitted_unknowns = np.delete(np.arange(unknown_count), fixed)
+        degrees_of_freedom = max(self._signal.size - fitted_unknowns.size, 1)
+        variance = np.maximum(sum_of_squares * channels / degrees_of_freedom, _LEAST_VARIANCE)
+
+        # Information matrix. The derivative of an average with respect to its pole has a further
+        # term in proportion to the wave, which a change of the amplitude can replace.
+        wave_derivative = self._time[:, None] * wave
+        information = np.zeros((unknown_count, unknown_count))
+        for channel in range(channels):
+            by_pole = wave_derivative * amplitude[:, channel]
+            jacobian = np.hstack([by_pole.real, -by_pole.imag, basis]) / math.sqrt(
+                variance[channel]
+            )
+            first_linear = 2 * count + channel * linear_count
+            unknowns = np.r_[: 2 * count, np.arange(linear_count) + first_linear]
+            information[np.ix_(unknowns, unknowns)] += jacobian.T @ jacobian
+        np.fill_diagonal(information, np.maximum(np.diag(information), _LEAST_VARIANCE))
+
+        # Inverse, scaled to a unit diagonal
+        block = np.ix_(fitted_unknowns, fitted_unknowns)
+        scale = np.sqrt(np.diag(information))[fitted_unknowns]
+        scaled_information = information[block] / np.outer(scale, scale)
+        covariance = np.zeros((unknown_count, unknown_count))
+        inverse = np.linalg.pinv(scaled_information, hermitian=True)
+        covariance[block] = inverse / np.outer(scale, scale)
+        return variance, covariance
+
+    def _waves(self, pole: ComplexArray) -> ComplexArray:
+        """Return the waves of unit amplitude (N, K), averaged over the intervals of the record."""
+        decay = np.minimum(pole.real, _GREATEST_GROWTH / self._time[-1])
+        s = decay + 1j * pole.imag
+        half = 0.5 * s * self._averaging_width
+        averaging_factor = np.sinh(half) / half if self._averaging_width else 1.0
+        return np.asarray(averaging_factor * np.exp(np.multiply.outer(self._time, s)))
+
     def _basis(self, wave: ComplexArray) -> Float:
+        """Return the columns that multiply Re A, Im A and the coefficients of the line."""
         return np.hstack([wave.real, -wave.imag, self._line])
+
+
+def _wave_chi_square(count: int, basis: Float, coefficient: Float, sum_of_squares: Float) -> Float:
+    """Return the squared amplitudes of each wave over their covariance, summed over the signals.
+
+    Parameters
+    ----------
+    count : int
+        The number of waves K.
+    basis : (N, B) array
+        The basis, whose first 2 K columns belong to Re A and Im A.
+    coefficient : (B, C) array
+        The coefficients of each signal.
+    sum_of_squares : (C,) array
+        The sum of squared residuals of each signal.
+    """
+    channels = coefficient.shape[1]
+    # Covariance of Re A and Im A of each wave at unit variance, (K, 2, 2), and its inverse
+    unit_covariance = np.linalg.pinv(basis.T @ basis)[: 2 * count, : 2 * count]
+    blocks = unit_covariance.reshape(2, count, 2, count)
+    weight = np.linalg.pinv(np.einsum("ikjk->kij", blocks))
+    real_and_imaginary = coefficient[: 2 * count].reshape(2, count, channels)
+    degrees_of_freedom = max(len(basis) - basis.shape[1], 1)
+    variance = np.maximum(sum_of_squares / degrees_of_freedom, _LEAST_VARIANCE)
+    chi_square: Float = np.einsum(
+        "ikc,kij,jkc,c->k", real_and_imaginary, weight, real_and_imaginary, 1.0 / variance
+    )
+    return chi_square

@@ -1,46 +1,76 @@
 """Figure of ring-down records: fit, spectra, dependence on the amplitude."""
 
+from typing import NamedTuple
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from reporting import figures as style
 
+from .damped_cosine import RingDownMode
 from .trials import Fits, ModalFigure, RingDownFit, amplitude_dependence, average, spectrum
+
+_MILLIVOLTS = 1e3  # in a volt
+
+
+class _AmplitudePanel(NamedTuple):
+    """A panel that shows a quantity of the first mode over its amplitude."""
+
+    axes: Axes
+    quantity: ModalFigure
+    scale: float
+    ylabel: str
+    letter: str
+    title: str
 
 
 @style.publication_style()
 def ring_down_figure(trials: Fits) -> Figure:
-    """Draw the first trial with its two modes, all spectra, and the first mode over its amplitude."""
-    figure, ((record, spectra), lower) = style.panels(
+    """Return the figure of fitted trials.
+
+    It shows the first trial with its two modes, the spectra of all trials, and frequency and
+    damping ratio of the first mode over its amplitude.
+    """
+    figure, (upper, lower) = style.panels(
         2, 2, 4.8, 0.29, 0.43, left=0.075, wspace=0.26, hspace=0.48
     )
-    _draw_record(record, trials[0])
-    _draw_spectra(spectra, trials)
-    points = [point for fit in trials for point in amplitude_dependence(fit)]
-    amplitude = [point.amplitude * 1e3 for point in points]
-    shown: tuple[tuple[Axes, ModalFigure, float, str, str, str], ...] = (
-        (lower[0], "frequency", 1.0, "natural frequency (Hz)", "c", "First mode within windows of 0.8 s"),
-        (lower[1], "damping_ratio", 100.0, "damping ratio (%)", "d", "Its damping"),
-    )
-    for axes, name, scale, ylabel, label, title in shown:
-        axes.semilogx(
-            amplitude, [scale * getattr(point, name) for point in points], "o", color=style.OBSERVED, ms=2.4
-        )
-        axes.axhline(scale * average(trials, name, 0).mean, color=style.PAST, lw=1.0, label="whole record")
-        axes.set(xlabel="amplitude of the first mode (mV)", ylabel=ylabel)
-        style.plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
-        axes.legend(loc="best")
-        style.panel_label(axes, label, title)
+    _draw_record(upper[0], trials[0])
+    _draw_spectra(upper[1], trials)
+    windows = [window for fit in trials for window in amplitude_dependence(fit)]
+    frequency_title = "First mode within windows of 0.8 s"
+    for panel in (
+        _AmplitudePanel(lower[0], "frequency", 1.0, "natural frequency (Hz)", "c", frequency_title),
+        _AmplitudePanel(lower[1], "damping_ratio", 100.0, "damping ratio (%)", "d", "Its damping"),
+    ):
+        mean = average(trials, panel.quantity, 0).mean
+        _draw_amplitude_dependence(panel, windows, mean)
     return figure
+
+
+def _draw_amplitude_dependence(
+    panel: _AmplitudePanel, windows: list[RingDownMode], mean: float
+) -> None:
+    axes = panel.axes
+    amplitudes = [window.amplitude * _MILLIVOLTS for window in windows]
+    values = [panel.scale * getattr(window, panel.quantity) for window in windows]
+    axes.semilogx(amplitudes, values, "o", color=style.OBSERVED, ms=2.4)
+    axes.axhline(panel.scale * mean, color=style.PAST, lw=1.0, label="whole record")
+    axes.set(xlabel="amplitude of the first mode (mV)", ylabel=panel.ylabel)
+    style.plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
+    axes.legend(loc="best")
+    style.panel_label(axes, panel.letter, panel.title)
 
 
 def _draw_record(axes: Axes, fit: RingDownFit) -> None:
     time = fit.record.time
-    axes.plot(time, fit.record.signal * 1e3, ".", color=style.OBSERVED, ms=2.2, label="measured")
-    axes.plot(time, fit.fitted * 1e3, color=style.PAST, lw=0.9, label="two modes")
-    for mode, colour, dashes in zip(fit.modes, (style.PRESENT, style.PREDICTION), ("--", ":"), strict=True):
-        envelope = mode.amplitude * np.exp(mode.pole.real * (time - time[0])) * 1e3
+    measured = fit.record.signal * _MILLIVOLTS
+    axes.plot(time, measured, ".", color=style.OBSERVED, ms=2.2, label="measured")
+    axes.plot(time, fit.fitted * _MILLIVOLTS, color=style.PAST, lw=0.9, label="two modes")
+    colours = (style.PRESENT, style.PREDICTION)
+    for mode, colour, dashes in zip(fit.modes, colours, ("--", ":"), strict=True):
+        decay = np.exp(mode.pole.real * (time - time[0]))
+        envelope = mode.amplitude * decay * _MILLIVOLTS
         label = f"envelope, {mode.frequency:.2f} Hz"
         axes.plot(time, envelope, color=colour, lw=0.9, ls=dashes, label=label)
     axes.set(xlim=(0.0, min(2.0, float(time[-1]))), xlabel="time (s)", ylabel="strain signal (mV)")
@@ -52,13 +82,20 @@ def _draw_spectra(axes: Axes, trials: Fits) -> None:
     spectra = [spectrum(fit.record) for fit in trials]
     for number, (frequency, amplitude) in enumerate(spectra):
         label = f"{len(spectra)} trials" if number == 0 else None
-        axes.semilogy(frequency, amplitude * 1e3, color=style.OBSERVED, lw=0.5, alpha=0.6, label=label)
-    for mode, name, dashes in ((0, "first", "--"), (1, "second", ":")):
-        axes.axvline(
-            average(trials, "frequency", mode).mean, color=style.PAST, lw=0.8, ls=dashes, label=f"{name} mode"
+        axes.semilogy(
+            frequency,
+            amplitude * _MILLIVOLTS,
+            color=style.OBSERVED,
+            lw=0.5,
+            alpha=0.6,
+            label=label,
         )
-    top = 1e3 * max(float(amplitude.max()) for _, amplitude in spectra)
-    axes.set(xlim=(0.0, float(spectra[-1][0][-1])), ylim=(2e-4 * top, 2.0 * top))
+    for mode, name, dashes in ((0, "first", "--"), (1, "second", ":")):
+        mean = average(trials, "frequency", mode).mean
+        axes.axvline(mean, color=style.PAST, lw=0.8, ls=dashes, label=f"{name} mode")
+    highest = _MILLIVOLTS * max(float(amplitude.max()) for _, amplitude in spectra)
+    last_frequency, _ = spectra[-1]
+    axes.set(xlim=(0.0, float(last_frequency[-1])), ylim=(2e-4 * highest, 2.0 * highest))
     axes.set(xlabel="frequency (Hz)", ylabel="amplitude (mV)")
     axes.legend(loc="upper right", fontsize=6.8)
     style.panel_label(axes, "b", "Spectra")

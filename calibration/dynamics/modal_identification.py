@@ -1,56 +1,54 @@
 """Modes of a record of accelerations, each with its covariance.
 
-Ambient vibration: covariance-driven stochastic subspace identification (Peeters and De Roeck 1999). The
-correlations of the record have the covariance that its blocks show, and it is propagated to first order
-(Reynders, Pintelon and De Roeck 2008); blocks must be long beside the memory of the modes.
-Free decay: the same identification as a start, then least squares with the modes common to all channels; its
-covariance is that of the least squares, with white noise of its own on each channel.
+Ambient vibration: covariance-driven stochastic subspace identification (Peeters and De Roeck 1999).
+The covariance of the correlations of the record follows from the differences between its blocks,
+and is propagated to first order (Reynders, Pintelon and De Roeck 2008); blocks must be long
+compared with the memory of the modes. Free decay: the same identification as a start, then least
+squares with the modes common to all channels; the covariance is that of the least squares, with
+white noise of its own on each channel.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, Protocol, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri
+from numpy.typing import ArrayLike
 
-from calibration.errors import ExperimentDataError, said
+from calibration.errors import ExperimentDataError
 from reporting.arrays import Float
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 
-from .damped_cosine import ComplexArray, DampedCosines, Solution, modal_slopes
+from .damped_cosine import ComplexArray, DampedCosineFit, DampedCosines, modal_gradients
+from .subspace import IdentifiedPoles, Subspace
 
 RecordKind = Literal["ambient", "decay"]
 
 LARGEST_ORDER = 24
-"""States of the identified system at most. The least number is taken whose correlations are those of the
-record within their scatter: with more, poles of noise come to lie beside those of modes and spoil them."""
+"""Largest number of states of the identified system. The smallest number is taken whose
+correlations are those of the record within their scatter: with more, poles of noise come to lie
+beside those of modes and spoil them."""
 BLOCKS = 50
-"""Of a record, from whose differences the covariance follows."""
+"""Number of blocks of a record, from whose differences the covariance follows."""
 _FEWEST_BLOCKS = 10
-_STEP = 1e-4
-"""Share of the difference of a block by which correlations are changed: small, that no pole is mistaken."""
-LARGEST_RATIO = 0.3
-"""A mode with more damping is none of a structure."""
+_DIFFERENCE_STEP = 1e-4
+"""Fraction of a block's difference by which correlations are changed in a numerical derivative. It
+is small, so that changed poles can be assigned to the original ones."""
 _MOST_LAGS = 40
-_SMALLEST_SHARE = 1e-2  # of the strongest mode, from which one is fitted to a free decay
-_FALSE_MODE = 1e-3
-"""Probability that noise alone is taken for a mode, over all frequencies where one could have been found."""
+_SMALLEST_RELATIVE_SIZE = 1e-2  # of a mode that is fitted to a free decay, over the strongest mode
 
 
 @dataclass(frozen=True)
 class IdentifiedModes:
-    """M modes at A accelerometers; NaN where a band shows no mode that noise alone would not show.
+    """M modes at A accelerometers; NaN where a band shows no mode beyond noise.
 
     Attributes
     ----------
-    value : (M, 1 + A)
-        Natural frequency [Hz], damping ratio [1], and the shape at the accelerometers behind the first,
-        divided by that at the first [1].
-    covariance : (M, 1 + A, 1 + A)
-        Of the values of each mode; modes are taken as independent of each other.
+    value : (M, 1 + A) array
+        The natural frequency [Hz], the damping ratio [1], and the shape at the accelerometers after
+        the first, divided by that at the first [1].
+    covariance : (M, 1 + A, 1 + A) array
+        The covariance of the values of each mode; different modes are taken as independent.
     """
 
     value: Float
@@ -63,17 +61,17 @@ class IdentifiedModes:
 
     @property
     def damping_ratio(self) -> Float:
-        """Damping ratios (M,)."""
+        """Damping ratios (M,) [1]."""
         return self.value[:, 1]
 
     @property
     def shape(self) -> Float:
-        """Shapes (M, A - 1), divided by that at the first accelerometer."""
+        """Shapes (M, A - 1), divided by that at the first accelerometer [1]."""
         return self.value[:, 2:]
 
     @property
     def standard_error(self) -> Float:
-        """Of the values, (M, 1 + A)."""
+        """Standard errors of the values, (M, 1 + A)."""
         return np.asarray(np.sqrt(np.einsum("mii->mi", self.covariance)))
 
 
@@ -83,235 +81,285 @@ def identify_modes(
     bands: ArrayLike,
     kind: RecordKind = "ambient",
 ) -> IdentifiedModes:
-    """Identify one mode in each band of frequency: the one that the record shows most of.
+    """Return the strongest mode of a record in each band of frequency.
 
     Parameters
     ----------
-    acceleration : (N, A)
-        The record, in any unit. Its mean is taken out.
+    acceleration : (N, A) array
+        The record, in any unit. Its mean is removed.
     sampling_rate : float
-        Of the record [Hz].
-    bands : (M, 2)
-        Least and largest natural frequency of each mode [Hz].
+        The sampling rate of the record [Hz].
+    bands : (M, 2) array
+        The smallest and the largest natural frequency of each mode [Hz].
     kind : {"ambient", "decay"}
-        Vibration under forces that nobody knows, as even over the band as may be; or free decay.
+        Vibration under unknown forces, whose spectrum is about flat in the bands; or free decay.
 
     Raises
     ------
     InvalidChoiceError
         If the kind is neither of the two.
     ExperimentDataError
-        If the record holds values that are not finite or is too short, a band is none, or above half the
-        sampling rate, or overlaps another.
+        If the record holds values that are not finite or is too short, or a band is empty, reaches
+        above half the sampling rate, or overlaps another.
     """
-    one_of(kind, get_args(RecordKind), "kind")
-    record, limits = _checked(acceleration, sampling_rate, bands)
-    fewest = LARGEST_ORDER // record.shape[1] + 2
-    lags = int(np.clip(np.ceil(2.0 * sampling_rate / limits.min()), fewest, _MOST_LAGS))
-    needed = (BLOCKS if kind == "ambient" else 4) * 2 * lags
+    require_one_of(kind, get_args(RecordKind), "kind")
+    record = _centred_record(acceleration)
+    limits = np.array(bands, dtype=np.float64)
+    _check_bands(limits, sampling_rate)
+    _refuse_dead_accelerometers(record)
+    lags = _number_of_lags(limits, sampling_rate, channels=record.shape[1])
+    _refuse_short_record(record, lags, kind)
+    identification: _Identification
+    if kind == "ambient":
+        identification = _AmbientIdentification(record, sampling_rate, lags, len(limits))
+    else:
+        identification = _DecayIdentification(record, sampling_rate, lags)
+    return _modes_in_bands(identification, limits, values_per_mode=1 + record.shape[1])
+
+
+def _centred_record(acceleration: ArrayLike) -> Float:
+    """Return a record (N, A) without its mean."""
+    record = np.array(acceleration, dtype=np.float64)
+    if record.ndim == 1:
+        record = record[:, None]
+    if record.ndim != 2 or not np.all(np.isfinite(record)):
+        raise ExperimentDataError(
+            "a record of accelerations must be finite numbers, one row for each sample; "
+            "lost values must be cut out or filled before."
+        )
+    return np.asarray(record - record.mean(axis=0))
+
+
+def _check_bands(limits: Float, sampling_rate: float) -> None:
+    """Refuse bands (M, 2) [Hz] that are empty, overlap, or exceed half the sampling rate [Hz]."""
+    if limits.ndim != 2 or limits.shape[1] != 2 or not np.all(np.diff(limits, prepend=0.0) > 0.0):
+        raise ExperimentDataError(
+            "each band is its least and its largest frequency [Hz], above zero."
+        )
+    highest = 0.5 * sampling_rate
+    if limits.max() > highest:
+        raise ExperimentDataError(
+            f"a band ends at {limits.max():g} Hz, and a record at {sampling_rate:g} Hz "
+            f"shows nothing above {highest:g} Hz."
+        )
+    if 2 * len(limits) > LARGEST_ORDER:
+        raise ExperimentDataError(
+            f"{LARGEST_ORDER // 2} modes are identified at most, and {len(limits)} are asked for."
+        )
+    ascending = limits[np.argsort(limits[:, 0])]
+    starts = ascending[1:, 0]
+    ends_of_previous = ascending[:-1, 1]
+    if np.any(starts < ends_of_previous):
+        raise ExperimentDataError("bands overlap, and one mode could be found in two: part them.")
+
+
+def _refuse_dead_accelerometers(record: Float) -> None:
+    dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
+    if dead.size:
+        raise ExperimentDataError(
+            f"accelerometer {dead[0] + 1} of the record shows one value throughout: "
+            "leave it out, or mend it."
+        )
+
+
+def _number_of_lags(limits: Float, sampling_rate: float, channels: int) -> int:
+    """Return the number of lags, which last two periods of the lowest mode if that is possible."""
+    fewest = LARGEST_ORDER // channels + 2
+    samples_of_two_periods = np.ceil(2.0 * sampling_rate / limits.min())
+    return int(np.clip(samples_of_two_periods, fewest, _MOST_LAGS))
+
+
+def _refuse_short_record(record: Float, lags: int, kind: RecordKind) -> None:
+    blocks = BLOCKS if kind == "ambient" else 4
+    needed = blocks * 2 * lags
     if len(record) < needed:
-        few = len(record), needed
-        raise ExperimentDataError(said("record.short", few=few))
-    way = partial(_ambient, modes=len(limits)) if kind == "ambient" else _decay
-    found, covariances = way(record, sampling_rate, lags)
-    strongest = [found.strongest(low, high) for low, high in limits]
-    chosen = {mode: pole for mode, pole in enumerate(strongest) if pole is not None}
-    shape = len(limits), 1 + record.shape[1]
-    value, covariance = np.full(shape, np.nan), np.full((*shape, shape[1]), np.nan)
-    if chosen:
-        value[[*chosen]] = [found.values(pole) for pole in chosen.values()]
-        covariance[[*chosen]] = covariances([*chosen.values()])
+        raise ExperimentDataError(
+            f"the record has {len(record)} samples; {needed} are needed to tell modes and their "
+            "covariance: record longer, or take a smaller sampling rate."
+        )
+
+
+class _Identification(Protocol):
+    """The poles of a record, with the covariance of their modal values."""
+
+    poles: IdentifiedPoles
+
+    def covariances(self, numbers: Sequence[int]) -> list[Float]:
+        """Return the covariances (1 + A, 1 + A) of the modal values of some poles."""
+
+
+def _modes_in_bands(
+    identification: _Identification, limits: Float, values_per_mode: int
+) -> IdentifiedModes:
+    """Return the strongest pole in each band as a mode."""
+    poles = identification.poles
+    pole_of_mode: dict[int, int] = {}
+    for mode, (low, high) in enumerate(limits):
+        pole = poles.strongest(low, high)
+        if pole is not None:
+            pole_of_mode[mode] = pole
+    value = np.full((len(limits), values_per_mode), np.nan)
+    covariance = np.full((len(limits), values_per_mode, values_per_mode), np.nan)
+    if pole_of_mode:
+        covariances = identification.covariances(list(pole_of_mode.values()))
+        for (mode, pole), mode_covariance in zip(pole_of_mode.items(), covariances, strict=True):
+            value[mode] = poles.modal_values(pole)
+            covariance[mode] = mode_covariance
     return IdentifiedModes(value, covariance)
 
 
-def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Float, Float]:
-    record = np.array(acceleration, dtype=np.float64)
-    record = record[:, None] if record.ndim == 1 else record
-    limits = np.array(bands, dtype=np.float64)
-    if record.ndim != 2 or not np.all(np.isfinite(record)):
-        raise ExperimentDataError(said("record.finite"))
-    if limits.ndim != 2 or limits.shape[1] != 2 or not np.all(np.diff(limits, prepend=0.0) > 0.0):
-        raise ExperimentDataError("each band is its least and its largest frequency [Hz], above zero.")
-    if limits.max() > 0.5 * rate:
-        rates = limits.max(), rate, 0.5 * rate
-        raise ExperimentDataError(said("record.band_end", rates=rates))
-    if 2 * len(limits) > LARGEST_ORDER:
-        raise ExperimentDataError(said("record.many_modes", most=LARGEST_ORDER // 2, asked=len(limits)))
-    rising = limits[np.argsort(limits[:, 0])]
-    if np.any(rising[1:, 0] < rising[:-1, 1]):
-        raise ExperimentDataError("bands overlap, and one mode could be found in two: part them.")
-    dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
-    if dead.size:
-        raise ExperimentDataError(said("record.dead", number=dead[0] + 1))
-    return record - record.mean(axis=0), limits
+class _AmbientIdentification:
+    """Identification of a record of ambient vibration.
 
-
-class _Poles(NamedTuple):
-    """Poles with positive frequency: s [1/s] (P,), shapes (P, A), shares in the record (P,).
-
-    `seen` (P,) is what each takes off the sum of squares over the scatter, a chi-square where there is noise
-    alone, and `places` at how many frequencies noise could have shown as much.
+    Parameters
+    ----------
+    record : (N, A) array
+        The record, without its mean.
+    sampling_rate : float
+        The sampling rate [Hz].
+    lags : int
+        Half the number of lags of the correlations.
+    mode_count : int
+        The number of modes that are asked for.
     """
 
-    pole: ComplexArray
-    shape: ComplexArray
-    share: Float
-    seen: Float
-    places: int
+    poles: IdentifiedPoles
 
-    @property
-    def damped(self) -> NDArray[np.bool_]:
-        """Whether each is one of a structure (P,)."""
-        ratio = -self.pole.real / np.abs(self.pole)
-        return np.asarray((ratio > 0.0) & (ratio < LARGEST_RATIO))
+    def __init__(self, record: Float, sampling_rate: float, lags: int, mode_count: int) -> None:
+        self._sampling_rate = sampling_rate
+        self._block_length = (len(record) - 2 * lags) // BLOCKS
+        self._block_correlations = self._correlate_blocks(record, lags)
+        self._correlation = self._block_correlations.mean(axis=0)
+        variance = self._block_correlations.var(axis=0, ddof=1) / BLOCKS
+        self._subspace = Subspace(self._correlation, sampling_rate)
+        for order in range(2 * mode_count, LARGEST_ORDER + 1, 2):
+            self._order = order
+            self.poles, misfit = self._subspace.poles(order, variance)
+            if misfit < 1.0:
+                break
 
-    @property
-    def beyond_noise(self) -> NDArray[np.bool_]:
-        """Whether noise alone would hardly show so much anywhere (P,)."""
-        return np.asarray(self.seen > chdtri(2 + 4 * self.shape.shape[1], _FALSE_MODE / self.places))
+    def _correlate_blocks(self, record: Float, lags: int) -> Float:
+        """Return the correlations (B, 2 L, A, A) of each block at the lags 1 to 2 L."""
+        length = self._block_length
+        sample_count = length * BLOCKS
+        blocks = record[:sample_count].reshape(BLOCKS, length, -1)
+        correlations = []
+        for lag in range(1, 2 * lags + 1):
+            later_blocks = record[lag : lag + sample_count].reshape(BLOCKS, length, -1)
+            correlations.append(later_blocks.transpose(0, 2, 1) @ blocks / length)
+        return np.stack(correlations, axis=1)
 
-    def values(self, chosen: int) -> Float:
-        """Return frequency, damping ratio and relative shape of a pole."""
-        s = self.pole[chosen]
-        relative = (self.shape[chosen, 1:] / self.shape[chosen, 0]).real
-        return np.array([abs(s) / (2.0 * np.pi), -s.real / abs(s), *relative])
+    def covariances(self, numbers: Sequence[int]) -> list[Float]:
+        """Return the covariances (1 + A, 1 + A) of the modal values of some poles.
 
-    def strongest(self, low: float, high: float) -> int | None:
-        """Return the pole in a band that the record shows most of; None without one beyond noise."""
-        frequency = np.abs(self.pole) / (2.0 * np.pi)
-        inside = (frequency >= low) & (frequency <= high) & self.damped
-        if not inside.any():
-            return None
-        best = int(np.argmax(np.where(inside, self.share, -1.0)))
-        return best if self.beyond_noise[best] else None
-
-
-_Found = tuple[_Poles, Callable[[list[int]], list[Float]]]
-"""Poles, and what gives the covariances of the values of some of them."""
-
-
-def _hankel(correlation: Float) -> Float:
-    """Return the block Hankel matrix (L C, L C) of correlations (2 L, C, C) from lag one on, C channels."""
-    lags, count = len(correlation) // 2, correlation.shape[1]
-    place = np.arange(lags)[:, None] + np.arange(lags)
-    return np.asarray(correlation[place].transpose(0, 2, 1, 3).reshape(lags * count, lags * count))
-
-
-class _Subspace:
-    """What the correlations of a record (2 L, C, C) say of systems of any order."""
-
-    def __init__(self, correlation: Float, rate: float) -> None:
-        self._correlation, self._rate = correlation, rate
-        _, self._singular, self._right = np.linalg.svd(_hankel(correlation))
-
-    def _modal(self, correlation: Float, basis: Float) -> tuple[ComplexArray, ...]:
-        """Return poles (n,) [1/s], eigenvectors (n, n) and shapes (C, n) as seen on a basis (L C, n)."""
-        count = correlation.shape[1]
-        observability = _hankel(correlation) @ basis
-        transition = np.linalg.lstsq(observability[:-count], observability[count:], rcond=None)[0]
-        eigenvalue, vector = np.linalg.eig(transition.astype(np.complex128))
-        return np.log(eigenvalue) * self._rate, vector, observability[:count] @ vector
-
-    def _basis(self, order: int) -> Float:
-        """Return right singular vectors over the roots of their values (L C, order)."""
-        return np.asarray(self._right[:order].T / np.sqrt(self._singular[:order]))
-
-    def poles(self, order: int, variance: Float | float = 1.0) -> tuple[_Poles, float]:
-        """Return the poles of the system of an order, and its mean square misfit over the variance.
-
-        `variance` (2 L, C, C) is that of the correlations; without it nothing tells poles from noise.
+        Raises
+        ------
+        ExperimentDataError
+            If the record is too short compared with the memory of the modes.
         """
-        basis, count = self._basis(order), self._correlation.shape[1]
-        pole, vector, shape = self._modal(self._correlation, basis)
-        part = np.linalg.solve(vector, (basis[:count] * self._singular[:order]).T.astype(np.complex128))
-        powers = np.exp(np.multiply.outer(np.arange(len(self._correlation)) / self._rate, pole))
-        each = np.einsum("cn,ln,nd->nlcd", shape, powers, part)
-        inside = pole.imag > 0.0
-        left, alone = self._correlation - each.sum(axis=0).real, 2.0 * each[inside].real
-        seen = np.sum(((left + alone) ** 2 - left**2) / variance, axis=(1, 2, 3))
-        share = np.sqrt(np.sum(np.abs(each[inside]) ** 2, axis=(1, 2, 3)))
-        found = _Poles(pole[inside], shape.T[inside], share, seen, len(self._correlation))
-        return found, float(np.mean(left**2 / variance))
+        poles = self.poles.pole[numbers]
+        correlations = self._correlate_long_blocks(poles)
+        count = len(correlations)
 
-    def moved(self, change: Float, order: int, poles: ComplexArray) -> _Poles:
-        """Return poles under a small change of the correlations, seen on the same basis."""
-        pole, _, shape = self._modal(self._correlation + change, self._basis(order))
-        nearest = np.argmin(np.abs(pole - poles[:, None]), axis=1)
-        ones = np.ones(len(poles))
-        return _Poles(pole[nearest], shape.T[nearest], ones, ones, 1)
-
-
-def _ambient(record: Float, rate: float, lags: int, modes: int) -> _Found:
-    length = (len(record) - 2 * lags) // BLOCKS
-    size = length * BLOCKS
-    blocks = record[:size].reshape(BLOCKS, length, -1)
-    each = np.stack(
-        [
-            record[lag : lag + size].reshape(BLOCKS, length, -1).transpose(0, 2, 1) @ blocks / length
-            for lag in range(1, 2 * lags + 1)
-        ],
-        axis=1,
-    )  # (B, 2 L, A, A)
-    whole = each.mean(axis=0)
-    variance = each.var(axis=0, ddof=1) / BLOCKS
-    subspace = _Subspace(whole, rate)
-    for order in range(2 * modes, LARGEST_ORDER + 1, 2):
-        found, misfit = subspace.poles(order, variance)
-        if misfit < 1.0:
-            break
-
-    def covariances(chosen: list[int]) -> list[Float]:
-        poles = found.pole[chosen]
-        # blocks that last as long as the modes remember, by taking some together
-        memory = float(np.max(-1.0 / poles.real))
-        together = int(np.ceil(memory * rate / length))
-        count = BLOCKS // together
-        if count < _FEWEST_BLOCKS:
-            times = memory, size / rate, _FEWEST_BLOCKS
-            raise ExperimentDataError(said("record.memory", times=times))
-        long = each[: count * together].reshape(count, together, *whole.shape).mean(axis=1)
-        moved = [subspace.moved(_STEP * (one - whole), order, poles) for one in long]
-        changes = [
-            (np.array([other.values(at) for other in moved]) - found.values(pole)) / _STEP
-            for at, pole in enumerate(chosen)
+        # Derivative of the modal values along the difference of each block
+        changed_values = [
+            self._subspace.modal_values_after_change(
+                _DIFFERENCE_STEP * (block - self._correlation), self._order, poles
+            )
+            for block in correlations
         ]
-        return [change.T @ change / (len(long) * (len(long) - 1)) for change in changes]
+        covariances = []
+        for index, number in enumerate(numbers):
+            changed = np.array([values[index] for values in changed_values])
+            derivative = (changed - self.poles.modal_values(number)) / _DIFFERENCE_STEP
+            covariances.append(derivative.T @ derivative / (count * (count - 1)))
+        return covariances
 
-    return found, covariances
-
-
-def _decay(record: Float, rate: float, lags: int) -> _Found:
-    size = len(record) - 2 * lags
-    whole = np.stack([record[lag : lag + size].T @ record[:size] / size for lag in range(1, 2 * lags + 1)])
-    start, _ = _Subspace(whole, rate).poles(LARGEST_ORDER)
-    waves = DampedCosines(np.arange(len(record)) / rate, record, drift=False)
-    poles = start.pole[start.damped & (start.share > _SMALLEST_SHARE * start.share.max())]
-    # Most poles of noise are seen at once to be such; those that are left spoil the covariance of the others.
-    poles = poles[_of(waves.solve(poles)).beyond_noise]
-    while True:
-        solution = waves.fit(poles) if poles.size else waves.solve(poles)
-        found = _of(solution)
-        real = found.damped & found.beyond_noise
-        if real.all():
-            return found, partial(_decay_covariances, solution)
-        poles = found.pole[real]
-
-
-def _of(solution: Solution) -> _Poles:
-    share = np.linalg.norm(solution.amplitude, axis=1)
-    return _Poles(solution.pole, solution.amplitude, share, solution.seen, len(solution.fitted))
+    def _correlate_long_blocks(self, poles: ComplexArray) -> Float:
+        """Return correlations (B', 2 L, A, A) of blocks that last as long as the modes remember."""
+        memory = float(np.max(-1.0 / poles.real))
+        joined_blocks = int(np.ceil(memory * self._sampling_rate / self._block_length))
+        count = BLOCKS // joined_blocks
+        if count < _FEWEST_BLOCKS:
+            duration = self._block_length * BLOCKS / self._sampling_rate
+            raise ExperimentDataError(
+                f"a mode dies away in {memory:.3g} s, and the record of {duration:.3g} s holds "
+                f"that less than {_FEWEST_BLOCKS} times, too few for a covariance: record longer."
+            )
+        joined = self._block_correlations[: count * joined_blocks]
+        groups = joined.reshape(count, joined_blocks, *self._correlation.shape)
+        return np.asarray(groups.mean(axis=1))
 
 
-def _decay_covariances(solution: Solution, chosen: list[int]) -> list[Float]:
-    count, channels = solution.amplitude.shape
-    found = []
-    for pole in chosen:
-        first, *others = solution.amplitude[pole].tolist()
-        slope = np.zeros((1 + channels, len(solution.covariance)))
-        slope[:2, [pole, count + pole]] = modal_slopes(complex(solution.pole[pole]))
-        for channel, other in enumerate(others, start=1):
-            for which, change in ((channel, 1.0 / first), (0, -other / first**2)):
-                place = 2 * count + which * (2 * count + 1) + pole
-                slope[1 + channel, [place, place + count]] = change.real, -change.imag
-        found.append(slope @ solution.covariance @ slope.T)
-    return found
+class _DecayIdentification:
+    """Identification of a record of free decay.
+
+    Parameters
+    ----------
+    record : (N, A) array
+        The record, without its mean.
+    sampling_rate : float
+        The sampling rate [Hz].
+    lags : int
+        Half the number of lags of the correlations.
+    """
+
+    poles: IdentifiedPoles
+
+    def __init__(self, record: Float, sampling_rate: float, lags: int) -> None:
+        time = np.arange(len(record)) / sampling_rate
+        model = DampedCosines(time, record, drift=False)
+        start = _starting_poles(record, sampling_rate, lags)
+        # Most poles of noise are recognised here; the others would spoil the covariance.
+        poles = start[_poles_of_fit(model.solve(start)).is_beyond_noise]
+        while True:
+            self._fit = model.fit(poles) if poles.size else model.solve(poles)
+            self.poles = _poles_of_fit(self._fit)
+            is_mode = self.poles.is_structural & self.poles.is_beyond_noise
+            if is_mode.all():
+                return
+            poles = self.poles.pole[is_mode]
+
+    def covariances(self, numbers: Sequence[int]) -> list[Float]:
+        """Return the covariances (1 + A, 1 + A) of the modal values of some poles."""
+        return [_decay_covariance(self._fit, number) for number in numbers]
+
+
+def _starting_poles(record: Float, sampling_rate: float, lags: int) -> ComplexArray:
+    """Return the poles of the correlations of a decay, without the weakest ones."""
+    sample_count = len(record) - 2 * lags
+    first = record[:sample_count]
+    correlations = [
+        record[lag : lag + sample_count].T @ first / sample_count for lag in range(1, 2 * lags + 1)
+    ]
+    poles, _ = Subspace(np.stack(correlations), sampling_rate).poles(LARGEST_ORDER)
+    is_strong = poles.size > _SMALLEST_RELATIVE_SIZE * poles.size.max()
+    return np.asarray(poles.pole[poles.is_structural & is_strong])
+
+
+def _poles_of_fit(fit: DampedCosineFit) -> IdentifiedPoles:
+    return IdentifiedPoles(
+        pole=fit.pole,
+        shape=fit.amplitude,
+        size=np.linalg.norm(fit.amplitude, axis=1),
+        chi_square=fit.chi_square,
+        frequency_count=len(fit.fitted),
+    )
+
+
+def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
+    """Return the covariance (1 + A, 1 + A) of the modal values of one wave, to first order."""
+    count, channels = fit.amplitude.shape
+    first_amplitude, *other_amplitudes = fit.amplitude[number].tolist()
+    gradient = np.zeros((1 + channels, len(fit.covariance)))
+    gradient[:2, [number, count + number]] = modal_gradients(complex(fit.pole[number]))
+    for channel, amplitude in enumerate(other_amplitudes, start=1):
+        # Relative shape A_c / A_0: derivatives with respect to A_c and to A_0
+        by_amplitude = 1.0 / first_amplitude
+        by_first_amplitude = -amplitude / first_amplitude**2
+        for of_channel, derivative in ((channel, by_amplitude), (0, by_first_amplitude)):
+            # After the poles follow, for each channel, K Re A, K Im A and the offset.
+            real = 2 * count + of_channel * (2 * count + 1) + number
+            imaginary = real + count
+            gradient[1 + channel, [real, imaginary]] = derivative.real, -derivative.imag
+    return np.asarray(gradient @ fit.covariance @ gradient.T)

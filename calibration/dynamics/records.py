@@ -1,33 +1,40 @@
-"""Ring-down records: the strain signal after the tip is let go, raw or read off the published plots."""
+"""Ring-down records: the strain signal after release of the tip, raw or read off plots."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from calibration.errors import ExperimentDataError, ExperimentFileError, said
+from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.lab_folder import LAB_ERRORS, places_of
 from reporting.arrays import Float
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
-from reporting.words import counted
+from reporting.words import comma_list, counted
 
 STEP_FOLDER = Path("step3")
 """Folder of step 3 in the authors' calibration folder."""
 
-FILE_PATTERNS = ("initialconditiondata_*.DAT", "initialconditiondata_*.dat", "ringdown_trial*_digitised.csv")
-"""Names of the records there, best first: raw at 100 kHz, or read off the published plots."""
+FILE_PATTERNS = (
+    "initialconditiondata_*.DAT",
+    "initialconditiondata_*.dat",
+    "ringdown_trial*_digitised.csv",
+)
+"""Names of record files, best first: raw at 100 kHz, or read off the published plots."""
 
 MINIMUM_COUNT = 64
-"""Fewest samples that a record may have."""
+"""Fewest samples of a record."""
 
 _RAW_COLUMNS = ["time", "spanwise", "chordwise"]
-_NAMES = (
-    ("time", "t", "t_s"), ("spanwise", "V_mid", "middle"), ("V_low", "lowest"), ("V_high", "highest"),
-)  # fmt: skip
-"""What the columns of a record may be called, those of a record read off a plot last."""
-_ROUNDING = 1e-4  # s; a time printed to few digits may stand still at 100 kHz
+_TIME_NAMES = ("time", "t", "t_s")
+_SIGNAL_NAMES = ("spanwise", "V_mid", "middle")
+_LOWEST_NAMES = ("V_low", "lowest")
+_HIGHEST_NAMES = ("V_high", "highest")
+"""Possible names of the columns of a record; only records read off a plot have the last two."""
+_ROUNDING = 1e-4  # s; a time printed to few digits may not change between samples at 100 kHz
 _CLIPPED_DURATION = 3e-3  # s at the extreme value; natural peaks of a 30 Hz mode are sharper
 
 
@@ -38,21 +45,22 @@ class RingDownRecord:
     Attributes
     ----------
     time : (N,) array
-        Instants, evenly spaced but for the rounding of a printed time, 0.1 ms at most [s].
+        The instants [s]. They are evenly spaced, up to 0.1 ms by the rounding of a printed time.
     signal : (N,) array
-        Spanwise strain signal [V]; its scale does not matter.
+        The spanwise strain signal [V]; its scale does not matter.
     lowest, highest : (N,) array or None
-        Extremes of the signal within each interval, for a record read off a plot [V].
+        The extremes of the signal within each interval, for a record read off a plot [V].
     averaging_width : float
-        Interval over which each value is an average: the width of a column of pixels; 0 for samples [s].
+        The interval over which each value is an average [s]: the width of a column of pixels; 0 for
+        samples.
     source : str
-        Where the record comes from.
+        Where the record is from.
 
     Raises
     ------
     ExperimentDataError
-        If the record is shorter than `MINIMUM_COUNT`, time does not run evenly upwards, or the signal stands
-        still at an extreme for 3 ms, as a clipped one does.
+        If the record is shorter than `MINIMUM_COUNT`, its time does not increase evenly, or its
+        signal stays at an extreme for 3 ms, as a clipped signal does.
     """
 
     time: Float
@@ -64,15 +72,16 @@ class RingDownRecord:
 
     def __post_init__(self) -> None:
         if self.count < MINIMUM_COUNT:
-            raise ExperimentDataError(said("record.samples", self=self, least=MINIMUM_COUNT))
-        step = np.diff(self.time)
-        usual = float(self.time[-1] - self.time[0]) / (self.count - 1)
-        astray = np.abs(self.time - np.linspace(self.time[0], self.time[-1], self.count)).max()
-        if not (step.min() >= 0.0 and usual > 0.0 and astray <= max(0.05 * usual, _ROUNDING)):
-            place = int(np.argmax(np.abs(step - np.median(step))))
-            steps = step[place], np.median(step)
-            raise ExperimentDataError(said("record.uneven", self=self, number=place + 1, steps=steps))
-        _refuse_clipped(self)
+            raise ExperimentDataError(
+                f"{self.source}: the record has {self.count} samples; "
+                f"at least {MINIMUM_COUNT} are needed."
+            )
+        _refuse_uneven_time(self)
+        _refuse_constant_signal(self)
+        lowest = self.signal if self.lowest is None else self.lowest
+        highest = self.signal if self.highest is None else self.highest
+        _refuse_clipping(self, lowest, float(lowest.min()), "smallest")
+        _refuse_clipping(self, highest, float(highest.max()), "largest")
 
     @property
     def count(self) -> int:
@@ -81,36 +90,78 @@ class RingDownRecord:
 
     @property
     def sampling_rate(self) -> float:
-        """Samples per second [Hz]."""
+        """Number of samples in a second [Hz]."""
         return float((self.count - 1) / (self.time[-1] - self.time[0]))
 
 
+def _refuse_uneven_time(record: RingDownRecord) -> None:
+    time = record.time
+    step = np.diff(time)
+    mean_step = float(time[-1] - time[0]) / (record.count - 1)
+    even_time = np.linspace(time[0], time[-1], record.count)
+    largest_deviation = np.abs(time - even_time).max()
+    is_increasing = step.min() >= 0.0 and mean_step > 0.0
+    if is_increasing and largest_deviation <= max(0.05 * mean_step, _ROUNDING):
+        return
+    usual_step = np.median(step)
+    sample = int(np.argmax(np.abs(step - usual_step)))
+    raise ExperimentDataError(
+        f"{record.source}: time must run upwards in even steps, but after sample {sample + 1} "
+        f"it moves by {step[sample]:.6g} s where {usual_step:.6g} s is usual."
+    )
+
+
+def _refuse_constant_signal(record: RingDownRecord) -> None:
+    if np.ptp(record.signal) == 0.0:
+        raise ExperimentDataError(f"{record.source}: the signal is constant; nothing rings.")
+
+
+def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name: str) -> None:
+    """Refuse a record whose signal stays at its smallest or largest value, as `name` says."""
+    is_extreme = np.abs(signal - extreme) <= 1e-9 * np.ptp(signal)
+    padded = np.concatenate([[False], is_extreme, [False]]).astype(np.int8)
+    changes = np.flatnonzero(np.diff(padded))
+    starts = changes[::2]
+    ends = changes[1::2]
+    longest_run = int(np.max(ends - starts))
+    if longest_run >= 3 and longest_run / record.sampling_rate >= _CLIPPED_DURATION:
+        raise ExperimentDataError(
+            f"{record.source}: {longest_run} samples in a row have the {name} value {extreme:g}, "
+            "as if the recorder had clipped the signal; repeat the test with a wider range."
+        )
+
+
 def read_records(path: Path) -> tuple[RingDownRecord, ...]:
-    """Read the ring-down trials from the authors' calibration folder, or one record from its file.
+    """Return the ring-down trials in the authors' calibration folder, or the record in one file.
 
     Parameters
     ----------
     path : Path
-        The folder that holds `step3` (also the folder above it in the authors' repository), a folder that
-        holds the records themselves, or one file. A text file without header has the columns time [s],
-        spanwise and chordwise signal [V], as published at 100 kHz; a CSV file has a header with `time` and
-        `spanwise`; a record read off a plot has `t_s`, `V_low`, `V_mid`, `V_high`.
+        The folder that holds `step3` (also the folder above it in the authors' repository), a
+        folder that holds the records themselves, or one file. A text file without header has the
+        columns time [s], spanwise and chordwise signal [V], as published at 100 kHz; a CSV file has
+        a header with `time` and `spanwise`; a record read off a plot has `t_s`, `V_low`, `V_mid`,
+        `V_high`.
 
     Raises
     ------
     ExperimentFileError
         If there is no record, or a file is empty or lacks a column.
     ExperimentDataError
-        If a record holds values that none can have; see `RingDownRecord`.
+        If a record holds impossible values; see `RingDownRecord`.
     """
     files = find_records(path)
     if not files:
-        raise ExperimentFileError(said("record.none", path=path, files=FILE_PATTERNS, folder=STEP_FOLDER))
+        raw, _, read_off = FILE_PATTERNS
+        raise ExperimentFileError(
+            f"{path} holds no ring-down record; {raw} or {read_off} is needed, "
+            f"there or in its folder {STEP_FOLDER}."
+        )
     return tuple(_read_record(file) for file in files)
 
 
 def find_records(path: Path) -> tuple[Path, ...]:
-    """Return the files that `read_records` reads, best kind first; none if there are none.
+    """Return the files that `read_records` reads: those of the best kind, or none.
 
     Raises
     ------
@@ -121,63 +172,111 @@ def find_records(path: Path) -> tuple[Path, ...]:
     if path.is_file():
         return (path,)
     if not path.exists():
-        raise ExperimentFileError(f"{path} does not exist; give a folder of ring-down records or one file.")
+        raise ExperimentFileError(
+            f"{path} does not exist; give a folder of ring-down records or one file."
+        )
     for pattern in FILE_PATTERNS:
         for folder in (*places_of(path, STEP_FOLDER), path):
-            if files := sorted(folder.glob(pattern)):
+            files = sorted(folder.glob(pattern))
+            if files:
                 return tuple(files)
     return ()
 
 
 def _read_record(file: Path) -> RingDownRecord:
     text = read_text(file, ExperimentFileError)
-    first = next((line for line in text.splitlines() if line.strip()), "").strip()
-    if not first:
-        raise ExperimentFileError(f"{file} is empty; columns of time [s] and spanwise signal [V] are needed.")
-    separator = "," if "," in first and "\t" not in first else None
-    header = _RAW_COLUMNS[: len(first.split(separator))]
-    if re.search(r"[^\d\s.,;eE+-]", first.lstrip("#")):  # a word
-        # A remark in brackets may hold separators of its own.
-        between = separator or (r"\t+" if "\t" in first else r"\s+")
-        cells = re.split(between + r"(?![^(\[]*[)\]])", first.lstrip("#").strip())
-        header = [_named(cell.strip().strip('"'), file) for cell in cells]
-        text = text if first.startswith("#") else text.replace(first, f"#{first}", 1)
-    elif not 2 <= (count := len(first.split(separator))) <= len(_RAW_COLUMNS):
-        came = counted(count, "column")
-        raise ExperimentFileError(said("record.columns", file=file, came=came))
-    table = parse_table(text, str(file), LAB_ERRORS, header=header, separator=separator)
-    time, signal = (_column(table, spellings) for spellings in _NAMES[:2])
-    if "spanwise" in header:
+    layout = _layout_of(text, file)
+    table = parse_table(
+        layout.rows, str(file), LAB_ERRORS, header=layout.header, separator=layout.separator
+    )
+    time = _column(table, _TIME_NAMES)
+    signal = _column(table, _SIGNAL_NAMES)
+    if "spanwise" in layout.header:
         return RingDownRecord(time, signal, source=file.name)
-    lowest, highest = (_column(table, spellings) for spellings in _NAMES[2:])
-    width = float(np.median(np.diff(time))) if time.size > 1 else 0.0
-    return RingDownRecord(time, signal, lowest, highest, width, file.name)
+    return RingDownRecord(
+        time,
+        signal,
+        lowest=_column(table, _LOWEST_NAMES),
+        highest=_column(table, _HIGHEST_NAMES),
+        averaging_width=float(np.median(np.diff(time))) if time.size > 1 else 0.0,
+        source=file.name,
+    )
 
 
-def _named(cell: str, file: Path) -> str:
-    """Return the name in a header's cell without unit or remark in brackets."""
+class _Layout(NamedTuple):
+    """The layout of a record file.
+
+    Attributes
+    ----------
+    header : sequence of str
+        The names of the columns.
+    separator : str or None
+        The character between cells; None for blanks.
+    rows : str
+        The text, in which the header line is a comment.
+    """
+
+    header: Sequence[str]
+    separator: str | None
+    rows: str
+
+
+def _layout_of(text: str, file: Path) -> _Layout:
+    filled_lines = [line for line in text.splitlines() if line.strip()]
+    if not filled_lines:
+        raise ExperimentFileError(
+            f"{file} is empty; columns of time [s] and spanwise signal [V] are needed."
+        )
+    first_line = filled_lines[0].strip()
+    separator = "," if "," in first_line and "\t" not in first_line else None
+    has_words = re.search(r"[^\d\s.,;eE+-]", first_line.lstrip("#"))
+    if has_words:
+        header = _column_names(first_line, separator, file)
+        if not first_line.startswith("#"):
+            text = text.replace(first_line, f"#{first_line}", 1)
+        return _Layout(header, separator, text)
+    count = len(first_line.split(separator))
+    if not 2 <= count <= len(_RAW_COLUMNS):
+        raise ExperimentFileError(
+            f"{file} has {counted(count, 'column')}; time [s], spanwise and, if there is one, "
+            "chordwise signal [V] are needed, without header."
+        )
+    return _Layout(_RAW_COLUMNS[:count], separator, text)
+
+
+def _column_names(header_line: str, separator: str | None, file: Path) -> list[str]:
+    """Return the names in a header line, without units."""
+    if separator is not None:
+        between_cells = separator
+    else:
+        between_cells = r"\t+" if "\t" in header_line else r"\s+"
+    # A remark in brackets may hold separators of its own.
+    outside_brackets = r"(?![^(\[]*[)\]])"
+    cells = re.split(between_cells + outside_brackets, header_line.lstrip("#").strip())
+    return [_column_name(cell.strip().strip('"'), file) for cell in cells]
+
+
+def _column_name(cell: str, file: Path) -> str:
+    """Return the name in a cell of a header without unit or remark in brackets.
+
+    Raises
+    ------
+    ExperimentDataError
+        If the time has another unit than s.
+    """
     name = re.split(r"\s*[(\[]", cell, maxsplit=1)[0]
     unit = re.search(r"[(\[]\s*(\w+)\s*[)\]]", cell)
-    if name in _NAMES[0] and unit and unit[1] not in ("s", "sec", "second", "seconds"):
+    if name in _TIME_NAMES and unit and unit[1] not in ("s", "sec", "second", "seconds"):
         raise ExperimentDataError(f"{file} gives {name} in {unit[1]}: give it in s.")
     return name
 
 
-def _column(table: TextTable, spellings: tuple[str, ...]) -> Float:
-    for name in spellings:
+def _column(table: TextTable, names: tuple[str, ...]) -> Float:
+    """Return the column that has one of several names."""
+    for name in names:
         if name in table.columns:
             return table.numbers(name, "a ring-down")
-    raise ExperimentFileError(said("record.no_column", table=table, wanted=" or ".join(spellings)))
-
-
-def _refuse_clipped(record: RingDownRecord) -> None:
-    if np.ptp(record.signal) == 0.0:
-        raise ExperimentDataError(f"{record.source}: the signal is constant; nothing rings.")
-    lowest = record.signal if record.lowest is None else record.lowest
-    highest = record.signal if record.highest is None else record.highest
-    for column, extreme, name in ((lowest, lowest.min(), "smallest"), (highest, highest.max(), "largest")):
-        there = np.abs(column - extreme) <= 1e-9 * np.ptp(column)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(np.int8)))
-        run = int(np.max(edges[1::2] - edges[::2]))
-        if run >= 3 and run / record.sampling_rate >= _CLIPPED_DURATION:
-            raise ExperimentDataError(said("record.clipped", record=record, run=run, name=name, end=extreme))
+    raise ExperimentFileError(
+        f"{table.name} lacks the column {' or '.join(names)}; "
+        f"its columns are {comma_list(table.columns)}."
+    )

@@ -1,16 +1,17 @@
-"""What is known of a wing before the ring-down, and what it shows: priors, weighed mass, and a table.
+"""Priors of a wing's parameters, its weighed mass, and its outputs as a table.
 
-A healthy wing's figures are polynomials of its parameters there, so that many states cost little.
+The table holds polynomials of the parameters of a healthy wing, so that many states cost little.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebval3d, chebvander3d
 from numpy.typing import ArrayLike
 
-from calibration.errors import OutsideValidityError, PosteriorError, said
+from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
 from calibration.static.posterior import PRIOR_DEVIATION, StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
@@ -21,29 +22,50 @@ TOTAL_MASS = 0.472
 """Weighed mass of two servos and the pitot tube [kg] (Kapteyn et al. 2021, eqs. (19) and (20))."""
 
 MODEL_ERROR = (0.01, 0.05)
-"""How far the model's two frequencies may lie from those of the wing with the very same digital state [1].
+"""Relative standard deviations of the model's two frequencies about those of the wing [1].
 
-The wing's frequency is f_i (1 + delta_i) with the model's f_i and independent delta_i ~ N(0, tau_i^2); these
-are tau_1 and tau_2. See `docs/calibration.md` for the choice and for other choices.
+The frequency of a wing is f_i (1 + delta_i) with the frequency f_i of the model with the same
+state, and independent delta_i ~ N(0, tau_i^2); these are tau_1 and tau_2. See `docs/calibration.md`
+for the choice and for other choices.
 """
 
 
 def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> Reading:
-    """Return the reading of a weighing of two servos and the pitot tube [kg].
+    """Return the reading of a weighing of two servos and the pitot tube.
 
-    The paper gives no uncertainty: 1 g is our choice, a scale that shows grams and leads that may or may not
-    have been weighed.
+    The paper gives no uncertainty. Our choice is 1 g: a scale that shows grams, and leads that may
+    or may not have been weighed.
+
+    Parameters
+    ----------
+    mass, deviation : float
+        The mass and its standard deviation [kg].
     """
     return Reading("weighed_mass", "weighing", mass, deviation)
 
 
-_PAPER, _OURS = "the paper", "our choice"
+class _Prior(NamedTuple):
+    """A Gaussian prior before its truncation, see `ParameterPrior`."""
+
+    unit: str
+    mean: float
+    deviation: float
+    stated_by: str
+    title: str
+
+
+_PAPER = "the paper"
+_OURS = "our choice"
 _PRIORS = {
-    "young_modulus_factor": ("1", 1.0, PRIOR_DEVIATION, _PAPER, "factor on Young's modulus of the skin, e"),
-    "servo_mass": ("kg", TOTAL_MASS / 3.0, 0.05, _OURS, "mass of each servo"),
-    "pitot_mass": ("kg", TOTAL_MASS / 3.0, 0.10, _OURS, "mass of the pitot tube"),
-    "damping_alpha": ("1/s", 0.0, 3.0, _OURS, "mass-proportional Rayleigh damping, alpha"),
-    "damping_beta": ("s", 0.0, 1.5e-3, _OURS, "stiffness-proportional Rayleigh damping, beta"),
+    "young_modulus_factor": _Prior(
+        "1", 1.0, PRIOR_DEVIATION, _PAPER, "factor on Young's modulus of the skin, e"
+    ),
+    "servo_mass": _Prior("kg", TOTAL_MASS / 3.0, 0.05, _OURS, "mass of each servo"),
+    "pitot_mass": _Prior("kg", TOTAL_MASS / 3.0, 0.10, _OURS, "mass of the pitot tube"),
+    "damping_alpha": _Prior("1/s", 0.0, 3.0, _OURS, "mass-proportional Rayleigh damping, alpha"),
+    "damping_beta": _Prior(
+        "s", 0.0, 1.5e-3, _OURS, "stiffness-proportional Rayleigh damping, beta"
+    ),
 }
 SHIPPED_PRIOR = {
     "young_modulus_factor": (1.0073, 0.0103),
@@ -52,34 +74,49 @@ SHIPPED_PRIOR = {
     "damping_alpha": (1.03, 0.37),
     "damping_beta": (7.56e-4, 1.84e-4),
 }
-"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
-paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
+"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e
+of the paper, its masses, and the damping of the joint posterior, whose standard deviation includes
+that of the measurement."""
 _DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 
 
 def wing_priors(
     validity: Mapping[str, tuple[float, float]], **stated: tuple[float, float]
 ) -> tuple[ParameterPrior, ...]:
-    """Return the priors of e, masses and damping for a model of this validity, in the order of `STATE`.
+    """Return the priors of e, masses and damping, in the order of `STATE`.
 
-    e is the paper's N(1, (0.05 / 1.96)^2). The others are weak: of the masses a third of the weighed total
-    each, with standard deviations of 50 and 100 g, which under the weighed total leave 30 g of uncertainty to
-    a servo; of the damping half Gaussians from zero, of scales 3 1/s and 1.5e-3 s, which alone would damp
-    mode 1 by 4 % and mode 2 by 14 %, twice what was measured. e and the masses are confined to the range of
-    the model.
+    The prior of e is the paper's N(1, (0.05 / 1.96)^2). The others are weak. Each mass has a mean
+    of a third of the weighed total and a standard deviation of 50 g (servo) or 100 g (pitot tube);
+    given the weighed total, that leaves 30 g of uncertainty to a servo. The damping coefficients
+    have half Gaussians from zero, of scales 3 1/s and 1.5e-3 s; each alone would damp mode 1 by 4 %
+    and mode 2 by 14 %, twice the measured ratios. e and the masses are confined to the range of the
+    model.
 
     Parameters
     ----------
     validity : mapping of str to (float, float)
-        Range of e and the masses.
+        The ranges of e and the masses in the model.
     **stated : (float, float)
-        Mean and standard deviation by name, in the place of these.
+        Means and standard deviations by name, instead of these.
     """
     ranges = {**validity, **_DAMPING_RANGES}
-    return tuple(
-        ParameterPrior(name, unit, *stated.get(name, (mean, deviation)), *ranges[name], stated_by, title)
-        for name, (unit, mean, deviation, stated_by, title) in _PRIORS.items()
-    )
+    priors = []
+    for name, prior in _PRIORS.items():
+        mean, deviation = stated.get(name, (prior.mean, prior.deviation))
+        low, high = ranges[name]
+        priors.append(
+            ParameterPrior(
+                name=name,
+                unit=prior.unit,
+                mean=mean,
+                deviation=deviation,
+                low=low,
+                high=high,
+                stated_by=prior.stated_by,
+                title=prior.title,
+            )
+        )
+    return tuple(priors)
 
 
 QUANTITIES = (
@@ -90,14 +127,17 @@ QUANTITIES = (
     CalibratedFigure("damping_ratio_2", "1", "damping ratio of the second flapwise bending mode"),
     CalibratedFigure("weighed_mass", "kg", "mass of two servos and the pitot tube"),
 )
-"""What is measured of a wing and follows from its parameters."""
+"""The measured quantities that follow from the parameters of a wing."""
 
 TOLERANCE = 1e-5
-"""Largest relative error of a tabulated frequency that is accepted; 0.1 % of f1 is 1 g of servo mass."""
+"""Largest relative error of a tabulated frequency; 1 g of servo mass changes f1 by 0.1 %."""
 
-_DEGREES = ((5, 7, 7), (8, 11, 11))
-_CHECKS = 128
-_NAMES = ("young_modulus_factor", "servo_mass", "pitot_mass")
+_DEGREES = (
+    (5, 7, 7),
+    (8, 11, 11),
+)  # of the polynomials in the three parameters, to be tried in turn
+_CHECK_COUNT = 128
+_PARAMETERS = ("young_modulus_factor", "servo_mass", "pitot_mass")
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +147,13 @@ class WingTable:
     Attributes
     ----------
     limits : (3, 2) array
-        Range of e [1], servo mass and pitot mass [kg].
+        The ranges of e [1], servo mass and pitot mass [kg].
     coefficient : (I, J, K, 2) array
-        Of the products of Chebyshev polynomials in the three scaled parameters.
+        The coefficients of products of Chebyshev polynomials in the three scaled parameters.
     stiffness : StiffnessCurve
-        k(e) of the tip.
+        The tip stiffness k(e).
     error : float
-        Largest relative error of a frequency, found at points between the nodes [1].
+        The largest relative error of a frequency at points between the nodes [1].
     """
 
     limits: Float
@@ -123,11 +163,23 @@ class WingTable:
 
     @property
     def validity(self) -> dict[str, tuple[float, float]]:
-        """Range of e and the masses in which the table holds."""
-        return {name: (low, high) for name, (low, high) in zip(_NAMES, self.limits.tolist(), strict=True)}
+        """The ranges of e and the masses in which the table holds."""
+        lower, upper = self.limits.T.tolist()
+        ranges = zip(lower, upper, strict=True)
+        return dict(zip(_PARAMETERS, ranges, strict=True))
 
     def frequency(self, states: ArrayLike) -> Float:
-        """Return f1 and f2 (N, 2) [Hz] at rows (N, 3 or more) of e [1] and the masses [kg].
+        """Return the frequencies of states.
+
+        Parameters
+        ----------
+        states : (N, 3 or more) array
+            States, whose first values are e [1] and the masses [kg].
+
+        Returns
+        -------
+        (N, 2) array
+            The frequencies f1 and f2 [Hz].
 
         Raises
         ------
@@ -135,75 +187,139 @@ class WingTable:
             If a state lies outside the range of the model or is not finite.
         """
         points = np.atleast_2d(np.asarray(states, dtype=np.float64))[:, :3]
-        inside = (points >= self.limits[:, 0]) & (points <= self.limits[:, 1])
-        if not inside.all():
-            row, place = np.argwhere(~inside)[0]
-            prior = wing_priors(self.validity)[place]
+        lower, upper = self.limits.T
+        is_inside = (points >= lower) & (points <= upper)
+        if not is_inside.all():
+            state, parameter = np.argwhere(~is_inside)[0]
+            prior = wing_priors(self.validity)[parameter]
             unit = f" {prior.figure.shown_unit}".rstrip()
-            value = points[row, place]
-            raise OutsideValidityError(said("joint.outside", prior=prior, value=value, unit=unit))
+            raise OutsideValidityError(
+                f"the {prior.title} is {points[state, parameter]:.4g}{unit}, but the model holds "
+                f"for {prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a "
+                "model with a wider range."
+            )
         scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
-        return _values(scaled, self.coefficient)
+        return _evaluate(scaled, self.coefficient)
 
     def outputs(self, states: Float) -> Float:
-        """Return `QUANTITIES` (N, 6) of states (N, 5 or more), e, masses, alpha and beta first [SI].
+        """Return the outputs of states.
+
+        Parameters
+        ----------
+        states : (N, 5 or more) array
+            States, whose first values are e, masses, alpha and beta [SI].
+
+        Returns
+        -------
+        (N, 6) array
+            The `QUANTITIES` [SI].
 
         Raises
         ------
         OutsideValidityError
-            As `frequency`.
+            If a state lies outside the range of the model or is not finite.
         """
         frequency = self.frequency(states)
-        factor, servo, pitot, alpha, beta = states[:, :5].T[:, :, None]
+        factor, servo, pitot, alpha, beta = states[:, :5].T[:, :, None]  # each (N, 1)
         ratio = rayleigh_damping_ratio(alpha, beta, frequency)
-        return np.hstack([self.stiffness.stiffness(factor), frequency, ratio, 2.0 * servo + pitot])
+        total_mass = 2.0 * servo + pitot
+        return np.hstack([self.stiffness.stiffness(factor), frequency, ratio, total_mass])
 
 
-def _values(scaled: Float, coefficient: Float) -> Float:
-    first, second, third = scaled.T
-    return np.asarray(np.exp(chebval3d(first, second, third, coefficient)).T)
+def _evaluate(scaled: Float, coefficient: Float) -> Float:
+    """Return the frequencies (N, 2) [Hz] of parameters (N, 3) that are scaled to [-1, 1]."""
+    x, y, z = scaled.T
+    return np.asarray(np.exp(chebval3d(x, y, z, coefficient)).T)
+
+
+def _interpolate(scaled: Float, frequency: Float, degrees: tuple[int, int, int]) -> Float:
+    """Return the coefficients of polynomials through frequencies at nodes.
+
+    Parameters
+    ----------
+    scaled : (N, 3) array
+        The nodes, in parameters scaled to [-1, 1].
+    frequency : (N, 2) array
+        The frequencies there [Hz].
+    degrees : (int, int, int)
+        The degrees of the polynomials in each parameter.
+    """
+    x, y, z = scaled.T
+    coefficient = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequency))
+    return np.asarray(coefficient.reshape(*(degree + 1 for degree in degrees), 2))
+
+
+def _chebyshev_grid(degrees: tuple[int, int, int]) -> Float:
+    """Return the grid (N, 3) of Chebyshev nodes for polynomials of these degrees."""
+    nodes = []
+    for degree in degrees:
+        angles = np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
+        nodes.append(np.cos(angles))
+    return np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTable:
-    """Tabulate a healthy model, its flapwise modes followed by their shape, and check between the nodes.
+    """Return the table of a healthy model, checked between its nodes.
+
+    The flapwise modes are followed by their shapes.
 
     Parameters
     ----------
     model : ReducedModel
         The wing.
     tolerance : float
-        Largest relative error of a frequency at 128 points that fill the range evenly [1].
+        The largest relative error of a frequency at 128 points that fill the range evenly [1].
 
     Raises
     ------
     PosteriorError
-        If no polynomial of the degrees tried meets the tolerance.
-    PosteriorError
-        As `stiffness_curve_of`.
+        If no polynomial of the degrees tried meets the tolerance, or the tip stiffness is too rough
+        for a polynomial.
     """
-    limits = np.array([model.validity[name] for name in _NAMES])
-    centre, half = limits.mean(axis=1), 0.5 * np.diff(limits, axis=1)[:, 0]
-    from scipy.stats import qmc  # takes a second to load
+    from scipy.stats import qmc  # takes a second to import
 
-    def exact(points: Float) -> Float:
-        # a node may leave the range by a rounding error
-        states = np.clip(centre + half * points, *limits.T)
-        found = (model.modes(**dict(zip(_NAMES, state, strict=True))) for state in states.tolist())
-        return np.array([modes.frequency[list(modes.followed)] for modes in found])
-
+    limits = np.array([model.validity[name] for name in _PARAMETERS])
     curve = stiffness_curve_of(
-        model.tip_stiffness, model.validity[_NAMES[0]], "tip stiffness of the tailored model"
+        model.tip_stiffness, model.validity[_PARAMETERS[0]], "tip stiffness of the tailored model"
     )
-    checks = 2.0 * qmc.Halton(3, scramble=False).random(_CHECKS + 1)[1:] - 1.0
-    expected = exact(checks)
+    # The first point of the sequence is a corner of the range.
+    halton = qmc.Halton(3, scramble=False).random(_CHECK_COUNT + 1)[1:]
+    check_points = 2.0 * halton - 1.0
+    expected = _model_frequencies(model, limits, check_points)
     error = np.inf
     for degrees in _DEGREES:
-        nodes = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in degrees]
-        grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
-        first, second, third = grid.T
-        coefficient = np.linalg.solve(chebvander3d(first, second, third, degrees), np.log(exact(grid)))
-        coefficient = coefficient.reshape(*(degree + 1 for degree in degrees), 2)
-        error = float(np.abs(_values(checks, coefficient) / expected - 1.0).max())
+        grid = _chebyshev_grid(degrees)
+        coefficient = _interpolate(grid, _model_frequencies(model, limits, grid), degrees)
+        relative_errors = _evaluate(check_points, coefficient) / expected - 1.0
+        error = float(np.abs(relative_errors).max())
         if error <= tolerance:
             return WingTable(limits, coefficient, curve, error)
-    raise PosteriorError(said("joint.rough", error=error, tolerance=tolerance))
+    raise PosteriorError(
+        "the flapwise frequencies of the model are not smooth over its range: a polynomial errs by "
+        f"{error:.2g} where {tolerance:.2g} are allowed; build a model with a narrower range of "
+        "masses."
+    )
+
+
+def _model_frequencies(model: ReducedModel, limits: Float, scaled: Float) -> Float:
+    """Return the flapwise frequencies (N, 2) [Hz] of a model at scaled parameters (N, 3).
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The wing.
+    limits : (3, 2) array
+        The ranges of the parameters.
+    scaled : (N, 3) array
+        The parameters, scaled to [-1, 1].
+    """
+    centre = limits.mean(axis=1)
+    half_width = 0.5 * np.diff(limits, axis=1)[:, 0]
+    lower, upper = limits.T
+    # A node at an end may leave the range by a rounding error.
+    states = np.clip(centre + half_width * scaled, lower, upper)
+    frequencies = []
+    for state in states.tolist():
+        modes = model.modes(**dict(zip(_PARAMETERS, state, strict=True)))
+        frequencies.append(modes.frequency[list(modes.followed)])
+    return np.array(frequencies)

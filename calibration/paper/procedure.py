@@ -14,7 +14,8 @@ from scipy.optimize import minimize_scalar
 
 from calibration.dynamics.records import STEP_FOLDER
 from calibration.errors import ExperimentDataError, said
-from calibration.joint.posterior import MODAL, servo_range
+from calibration.joint.measured_modes import MODAL
+from calibration.joint.posterior import servo_range
 from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_coefficients

@@ -106,7 +106,7 @@ def readings_figure(result: Calibration) -> Figure:
     figure, grid = style.panels(
         rows, _COLUMNS, height, 0.1 * height, 0.28 / rows * height, left=0.02, wspace=0.14, hspace=0.75
     )
-    for axes, reading in zip(style.first_of(grid, len(readings)), readings, strict=True):
+    for axes, reading in zip(style.keep_first_panels(grid, len(readings)), readings, strict=True):
         _draw_reading(axes, result, reading)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="upper left", ncols=3)
     return figure

@@ -14,7 +14,7 @@ from calibration.result.text import (
     correlation_lines,
 )
 from reporting.figures import save_figure
-from reporting.files import atomic_write_bytes, atomic_write_text, written
+from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors
 from reporting.page import Page, ReportFigure
 from reporting.progress import stage
 
@@ -38,7 +38,7 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
         If a file cannot be written; the folder is then as it was.
     """
     content = result_bytes(result)
-    with written(folder):
+    with explained_write_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
             fresh = Path(scratch)

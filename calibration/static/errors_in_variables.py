@@ -1,32 +1,37 @@
-r"""The exact posterior of the Young's modulus factor: both load and displacement are read with errors.
+r"""The exact posterior of the Young's modulus factor, with errors of load and displacement.
 
-The wing obeys f° = k(e) x°, with true load f° and true displacement x°; the readings are f ~ N(f°, R_f)
-and x ~ N(x°, R_x), independent. For one pair and a flat prior on the true displacement,
+The wing obeys f° = k(e) x°, with true load f° and true displacement x°; the readings are f ~ N(f°,
+R_f) and x ~ N(x°, R_x), independent. For one pair and a flat prior on the true displacement,
 
     L(e) = ∫ N(f; k x°, R_f) N(x; x°, R_x) dx°.
 
-Given e, f - k x = (f - f°) - k (x - x°) is free of x°, so the integrand, as a function of x°, is a Gaussian
-in x° times a factor without x°; the integral over the line of the Gaussian in x° is one and leaves
+Given e, f - k x = (f - f°) - k (x - x°) is free of x°, so the integrand, as a function of x°, is a
+Gaussian in x° times a factor without x°; the integral over the line of the Gaussian in x° is one
+and leaves
 
     L(e) = N(f - k(e) x; 0, S(e)),   S(e) = R_f + k(e)^2 R_x,
 
-with its normalising factor S^(-1/2), which depends on e and must stay. (Completing the square: the exponent
-is (f - k x)^2 / S + (x° - x̂)^2 / V with x̂ = (x R_f + k f R_x) / S and V = R_x R_f / S, and
-sqrt(R_f R_x) = sqrt(S V).)
+with its normalising factor S^(-1/2), which depends on e and must stay. (Completing the square: the
+exponent is (f - k x)^2 / S + (x° - x̂)^2 / V with x̂ = (x R_f + k f R_x) / S and V = R_x R_f / S,
+and sqrt(R_f R_x) = sqrt(S V).)
 
-"Flat" is not one prior. Flat in the true load instead of the true displacement, dx° = df° / k, gives
-L(e) k(e). And the density of e = k^-1(f° / x°) for f°, x° drawn about the readings, which the paper's
-particle filter takes for the likelihood, is (Hinkley 1969)
+"Flat" is not one prior. Flat in the true load instead of the true displacement, dx° = df° / k,
+gives L(e) k(e). And the density of e = k^-1(f° / x°) for f°, x° drawn about the readings, which the
+paper's particle filter takes for the likelihood, is (Hinkley 1969)
 
-    p(e) = |dk/de| ∫ |x°| N(k x°; f, R_f) N(x°; x, R_x) dx° = |dk/de| E|X| N(f - k x; 0, S),  X ~ N(x̂, V).
+    p(e) = |dk/de| ∫ |x°| N(k x°; f, R_f) N(x°; x, R_x) dx° = |dk/de| E|X| N(f - k x; 0, S)
 
-All three are offered as `measure`; on the published pairs their means lie within 0.0014 of each other.
+with X ~ N(x̂, V).
 
-A zero offset c_r ~ N(0, R_0) that all displacements of one loading run share can be integrated out as well:
-the residuals of a run then have the covariance S I + k^2 R_0 1 1'.
+All three are offered as `measure`; on the published pairs their means lie within 0.0014 of each
+other.
+
+A zero offset c_r ~ N(0, R_0) that all displacements of one loading run share can be integrated out
+as well: the residuals of a run then have the covariance S I + k^2 R_0 1 1'.
 """
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
@@ -34,29 +39,31 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import erf
 
-from calibration.errors import OutsideValidityError, said
+from calibration.errors import OutsideValidityError
 from reporting.arrays import Float
 
 from .experiments import LoadDisplacementData
 from .posterior import PUBLISHED_LINE, GaussianPrior, ScalarPosterior, StiffnessCurve
 
 Measure = Literal["displacement", "load", "ratio"]
-"""In which quantity of a pair the prior is flat: true displacement, true load, or the paper's ratio."""
+"""The quantity of a pair with a flat prior: true displacement, true load, or the paper's ratio."""
 
 GRID_SIZE = 2001
 """Points of the posterior's grid, over +-10 standard deviations."""
 
 NOTICEABLE_SCORE = 2.0
-"""Standard deviations from which a difference between runs, or a pair, is pointed out."""
+"""Score from which a difference between runs, or a pair, is reported [standard deviations]."""
 
-_REACH = 10.0  # standard deviations
+_REACH = 10.0  # of the grid, in standard deviations
+_MOST_REFINEMENTS = 60
 _LARGEST_PROBABILITY_OUTSIDE = 1e-4
 
 
 def residual_variance(data: LoadDisplacementData, stiffness: ArrayLike) -> Float:
-    """Return S = R_f + k^2 R_x [N^2], elementwise in the stiffness [N/m]."""
+    """Return S = R_f + k^2 R_x [N^2], elementwise in the stiffness k [N/m]."""
     k = np.asarray(stiffness, dtype=float)
-    return np.asarray(data.load_standard_deviation**2 + (k * data.displacement_standard_deviation) ** 2)
+    load_variance = data.load_standard_deviation**2
+    return np.asarray(load_variance + (k * data.displacement_standard_deviation) ** 2)
 
 
 def pair_log_likelihoods(
@@ -65,39 +72,52 @@ def pair_log_likelihoods(
     young_modulus_factor: ArrayLike,
     measure: Measure = "displacement",
 ) -> Float:
-    """Return the log likelihood of each pair; as "ratio" the limit of the paper's kernel likelihoods.
+    """Return the log likelihood of each pair at values of e.
+
+    With the measure "ratio" it is the limit of the paper's kernel likelihoods.
 
     Parameters
     ----------
     curve : StiffnessCurve
-        k(e).
+        The stiffness k(e).
     data : LoadDisplacementData
         The measured pairs.
     young_modulus_factor : (N,) array
-        Values of e.
+        The values of e.
     measure : {"displacement", "load", "ratio"}
-        See the module's docstring.
+        The quantity whose prior is flat, see the module's docstring.
 
     Returns
     -------
-    (n_pairs, N) array, log of 1/N
+    (n_pairs, N) array
+        The logarithms of likelihoods in 1/N.
     """
     factor = np.atleast_1d(np.asarray(young_modulus_factor, dtype=float))
-    k, load, displacement = curve.stiffness(factor), data.load[:, None], data.displacement[:, None]
+    k = curve.stiffness(factor)
+    load = data.load[:, None]
+    displacement = data.displacement[:, None]
     variance = residual_variance(data, k)
-    likelihood = -0.5 * ((load - k * displacement) ** 2 / variance + np.log(2.0 * math.pi * variance))
+    squared_score = (load - k * displacement) ** 2 / variance
+    likelihood = -0.5 * (squared_score + np.log(2.0 * math.pi * variance))
     if measure == "load":
         likelihood += np.log(k)
     if measure == "ratio":
-        load_variance, own = data.load_standard_deviation**2, data.displacement_standard_deviation**2
-        centre = (displacement * load_variance + k * load * own) / variance
-        spread = np.sqrt(load_variance * own / variance)
-        # E|X| of X ~ N(centre, spread^2), the mean of the folded Gaussian.
-        standard = np.divide(centre, spread, out=np.full_like(centre, np.inf), where=spread > 0.0)
-        folded = spread * math.sqrt(2.0 / math.pi) * np.exp(-0.5 * standard**2)
-        folded += centre * erf(standard / math.sqrt(2.0))
-        likelihood += np.log(folded) + np.log(curve.slope(factor))
+        # Mean and standard deviation of the true displacement given both readings
+        load_variance = data.load_standard_deviation**2
+        displacement_variance = data.displacement_standard_deviation**2
+        mean = (displacement * load_variance + k * load * displacement_variance) / variance
+        deviation = np.sqrt(load_variance * displacement_variance / variance)
+        mean_displacement = _mean_of_folded_gaussian(mean, deviation)
+        likelihood += np.log(mean_displacement) + np.log(curve.slope(factor))
     return np.asarray(likelihood)
+
+
+def _mean_of_folded_gaussian(mean: Float, deviation: Float) -> Float:
+    """Return E|X| of X ~ N(mean, deviation^2), elementwise."""
+    score = np.divide(mean, deviation, out=np.full_like(mean, np.inf), where=deviation > 0.0)
+    folded = deviation * math.sqrt(2.0 / math.pi) * np.exp(-0.5 * score**2)
+    folded += mean * erf(score / math.sqrt(2.0))
+    return np.asarray(folded)
 
 
 def log_likelihood(
@@ -108,25 +128,28 @@ def log_likelihood(
     measure: Measure = "displacement",
     zero_offset_standard_deviation: float = 0.0,
 ) -> Float:
-    """Return the log likelihood (N,) of all pairs.
+    """Return the log likelihood (N,) of all pairs at values of e.
 
     Parameters
     ----------
     curve, data, young_modulus_factor, measure
         As in `pair_log_likelihoods`.
     zero_offset_standard_deviation : float
-        Standard deviation of the zero offset of the displacement that a loading run shares [m]; of the ratio
-        there is no likelihood with one.
+        The standard deviation of the zero offset of the displacement that the pairs of a loading
+        run share [m]. The measure "ratio" has no likelihood with an offset.
     """
     total = pair_log_likelihoods(curve, data, young_modulus_factor, measure).sum(axis=0)
     k = curve.stiffness(np.atleast_1d(young_modulus_factor))
     variance = residual_variance(data, k)
-    shared = (k * zero_offset_standard_deviation) ** 2
+    offset_variance = (k * zero_offset_standard_deviation) ** 2  # as a load
+    # The covariance of a run is variance * I + offset_variance * 1 1'. Its inverse follows from the
+    # formula of Sherman and Morrison, its determinant from the eigenvalue along 1.
     for run in data.run_indices:
-        of_run = data.run == run
-        whole = variance + of_run.sum() * shared  # Sherman and Morrison
-        residual = data.load[of_run].sum() - k * data.displacement[of_run].sum()
-        total += 0.5 * (shared * residual**2 / (variance * whole) - np.log(whole / variance))
+        is_in_run = data.run == run
+        eigenvalue = variance + is_in_run.sum() * offset_variance
+        residual_sum = data.load[is_in_run].sum() - k * data.displacement[is_in_run].sum()
+        explained = offset_variance * residual_sum**2 / (variance * eigenvalue)
+        total += 0.5 * (explained - np.log(eigenvalue / variance))
     return np.asarray(total)
 
 
@@ -140,15 +163,15 @@ def exact_posterior(
 ) -> ScalarPosterior:
     """Return p(e | measured pairs) by quadrature on a grid that follows the posterior.
 
-    The grid begins wide enough for the prior and for each pair alone, and is narrowed until it spans ten
-    standard deviations of the posterior on either side.
+    The first grid contains the prior and the estimate of each pair alone. It is narrowed until it
+    spans ten standard deviations of the posterior on either side.
 
     Parameters
     ----------
     data, curve, measure, zero_offset_standard_deviation
         As in `log_likelihood`.
     prior : GaussianPrior, optional
-        Prior of e; the paper's by default.
+        The prior of e; the paper's by default.
 
     Raises
     ------
@@ -156,32 +179,57 @@ def exact_posterior(
         If more than 1e-4 of the posterior lies beyond the range of `curve`.
     """
     prior = prior or GaussianPrior()
-    # the first window holds the prior and the estimate of each pair alone, where k(e) > 0
-    ratio = data.load / data.displacement
-    relative = data.load_standard_deviation / data.load
-    relative = 6.0 * (relative + data.displacement_standard_deviation / data.displacement)
-    ends = np.concatenate([ratio * np.maximum(1.0 - relative, 0.01), ratio * (1.0 + relative)])
-    alone = curve.young_modulus_factor(ends)
-    beyond = _REACH * prior.standard_deviation
-    lower, upper = min(prior.mean - beyond, alone.min()), max(prior.mean + beyond, alone.max())
-    floor = lower = max(lower, curve.young_modulus_factor(1e-3 * ratio.min()))
-    for _ in range(60):
+    lower, upper = _first_grid_limits(data, curve, prior)
+    lowest = lower
+    for _ in range(_MOST_REFINEMENTS):
         grid = np.linspace(lower, upper, GRID_SIZE)
         log_density = prior.log_density(grid) + log_likelihood(
-            curve, data, grid, measure=measure, zero_offset_standard_deviation=zero_offset_standard_deviation
+            curve,
+            data,
+            grid,
+            measure=measure,
+            zero_offset_standard_deviation=zero_offset_standard_deviation,
         )
         posterior = ScalarPosterior(grid, np.exp(log_density - log_density.max()))
         spacing = (upper - lower) / (GRID_SIZE - 1)
-        reach = _REACH * max(posterior.standard_deviation, spacing)
-        narrower = max(posterior.mean - reach, floor), posterior.mean + reach
-        if narrower[1] - narrower[0] > 0.99 * (upper - lower):
+        half_width = _REACH * max(posterior.standard_deviation, spacing)
+        narrower_lower = max(posterior.mean - half_width, lowest)
+        narrower_upper = posterior.mean + half_width
+        if narrower_upper - narrower_lower > 0.99 * (upper - lower):
             break
-        lower, upper = narrower
-    outside = 1.0 - float(np.diff(posterior.cumulative([curve.lower, curve.upper]))[0])
-    if outside > _LARGEST_PROBABILITY_OUTSIDE:
-        shown = said("load_test.outside", posterior=posterior, outside=outside, curve=curve)
-        raise OutsideValidityError(shown)
+        lower, upper = narrower_lower, narrower_upper
+    _refuse_posterior_outside(posterior, curve)
     return posterior
+
+
+def _first_grid_limits(
+    data: LoadDisplacementData, curve: StiffnessCurve, prior: GaussianPrior
+) -> tuple[float, float]:
+    """Return limits of e around the prior and the estimate of each pair, where k(e) > 0."""
+    ratio = data.load / data.displacement
+    relative_deviation = data.load_standard_deviation / data.load
+    relative_deviation = 6.0 * (
+        relative_deviation + data.displacement_standard_deviation / data.displacement
+    )
+    lower_stiffness = ratio * np.maximum(1.0 - relative_deviation, 0.01)
+    upper_stiffness = ratio * (1.0 + relative_deviation)
+    estimates = curve.young_modulus_factor(np.concatenate([lower_stiffness, upper_stiffness]))
+    prior_reach = _REACH * prior.standard_deviation
+    lower = min(prior.mean - prior_reach, estimates.min())
+    upper = max(prior.mean + prior_reach, estimates.max())
+    return max(lower, curve.young_modulus_factor(1e-3 * ratio.min())), upper
+
+
+def _refuse_posterior_outside(posterior: ScalarPosterior, curve: StiffnessCurve) -> None:
+    """Refuse a posterior that reaches beyond the range of the stiffness curve."""
+    below_lower, below_upper = posterior.cumulative([curve.lower, curve.upper])
+    outside = 1.0 - float(below_upper - below_lower)
+    if outside > _LARGEST_PROBABILITY_OUTSIDE:
+        raise OutsideValidityError(
+            f"the posterior e = {posterior.mean:.4g} +- {posterior.standard_deviation:.2g} lies to "
+            f"{outside:.2%} outside [{curve.lower:g}, {curve.upper:g}], where {curve.name} may be "
+            "trusted; build the model for a wider range of e, or check units and prior."
+        )
 
 
 class FitQuality(NamedTuple):
@@ -199,23 +247,59 @@ class FitQuality(NamedTuple):
     remarks: tuple[str, ...]
 
 
+class _RunOffset(NamedTuple):
+    """Mean residual displacement of a loading run and its standard error [m]."""
+
+    number: int
+    mean: float
+    standard_error: float
+
+
 def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
-    """Judge the measured pairs, run by run, at one stiffness [N/m]."""
-    scatter = math.sqrt(float(residual_variance(data, stiffness)))
+    """Return the residuals of the measured pairs at one stiffness, with remarks on what disagrees.
+
+    Parameters
+    ----------
+    data : LoadDisplacementData
+        The measured pairs.
+    stiffness : float
+        The tip stiffness [N/m].
+    """
+    load_deviation = math.sqrt(float(residual_variance(data, stiffness)))
     residual = data.displacement - data.load / stiffness
-    standardised = residual * stiffness / scatter
-    runs = []
+    standardised = residual * stiffness / load_deviation
+    offsets = []
     for index in data.run_indices:
         of_run = residual[data.run == index]
-        runs.append((index + 1, float(of_run.mean()), scatter / stiffness / math.sqrt(of_run.size)))
-    remarks = []
-    for (first, offset, error), (second, other, other_error) in pairwise(runs):
-        difference, deviation = abs(offset - other), math.hypot(error, other_error)
-        if difference > NOTICEABLE_SCORE * deviation:
-            apart = difference * 1e3, difference / deviation, offset * 1e3, other * 1e3
-            told = said("disagreements.runs", runs=(first, second), apart=apart)
-            remarks.append(told.replace("-", "−"))
-    for pair in np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE):
-        read = pair + 1, data.load[pair], data.displacement[pair] * 1e3
-        remarks.append(said("disagreements.pair", read=read, off=abs(standardised[pair])))
+        error = load_deviation / stiffness / math.sqrt(of_run.size)
+        offsets.append(_RunOffset(index + 1, float(of_run.mean()), error))
+    remarks = [*_run_remarks(offsets), *_pair_remarks(data, standardised)]
     return FitQuality(standardised, tuple(remarks))
+
+
+def _run_remarks(offsets: Sequence[_RunOffset]) -> list[str]:
+    """Return remarks on consecutive runs whose mean residuals differ significantly."""
+    remarks = []
+    for run, next_run in pairwise(offsets):
+        difference = abs(run.mean - next_run.mean)
+        deviation = math.hypot(run.standard_error, next_run.standard_error)
+        if difference > NOTICEABLE_SCORE * deviation:
+            remark = (
+                f"Loading runs {run.number} and {next_run.number} differ by {difference * 1e3:.2f} "
+                f"mm ({difference / deviation:.1f} standard deviations): their offsets are "
+                f"{run.mean * 1e3:+.2f} mm and {next_run.mean * 1e3:+.2f} mm, as if the zero of "
+                "the displacement had moved between them."
+            )
+            remarks.append(remark.replace("-", "−"))
+    return remarks
+
+
+def _pair_remarks(data: LoadDisplacementData, standardised: Float) -> list[str]:
+    """Return remarks on pairs whose standardised residuals (N,) are significant."""
+    remarks = []
+    for index in np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE):
+        remarks.append(
+            f"Pair {index + 1} ({data.load[index]:.3g} N, {data.displacement[index] * 1e3:.3g} mm) "
+            f"lies {abs(standardised[index]):.1f} standard deviations from the calibrated line."
+        )
+    return remarks

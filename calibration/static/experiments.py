@@ -1,45 +1,58 @@
-"""The static load experiment: tip loads and tip displacements, published or read from the authors' folder."""
+"""The static load experiment: tip loads and displacements, published or read from a folder."""
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import ExperimentDataError, said
+from calibration.errors import ExperimentDataError
 from calibration.lab_folder import lab_table
 from reporting.arrays import Float
 from reporting.files import hash_record
 
 STANDARD_GRAVITY = 9.81
-"""Gravity by which the authors turn a mass on the scale into a load [m/s^2]."""
+"""Gravity by which the authors convert a mass on the scale to a load [m/s^2]."""
 
 HALF_WIDTH_95 = 1.96
 """Half-width of a 95 % interval of a Gaussian, in standard deviations, as rounded in the paper."""
 
 DISPLACEMENT_STANDARD_DEVIATION = 0.5e-3 / HALF_WIDTH_95
-"""Standard deviation of a displacement reading: +-0.5 mm as the half-width of a 95 % interval [m]."""
+"""Standard deviation of a displacement: +-0.5 mm as the half-width of a 95 % interval [m]."""
 
 LOAD_STANDARD_DEVIATION = 0.010 * STANDARD_GRAVITY / HALF_WIDTH_95
 """Standard deviation of a load: +-10 g as the half-width of a 95 % interval [N]."""
 
 EXPECTED_TIP_STIFFNESS = 677.0
-"""Tip stiffness of the wing before calibration, k(1) of eq. (14) [N/m]; used to recognise wrong units."""
+"""Tip stiffness of the wing before calibration, k(1) of eq. (14); reveals wrong units [N/m]."""
 
 MEASUREMENTS_FILE = Path("step2") / "load_displacement_measurements.csv"
-"""Where the authors' calibration folder keeps the pairs of step 2."""
+"""The file of the pairs of step 2 in the authors' calibration folder."""
 
-# Factors by which load over displacement changes when a column is in another unit than N and mm.
-_UNIT_SLIPS = (
-    (1.0 / 9.80665, "the load looks like kgf: give it in N"),
-    (1000.0 / 9.80665, "the load looks like grams, or like kgf beside a displacement in m: give N and mm"),
-    (1.0 / 4.44822, "the load looks like lbf: give it in N"),
-    (1e-3, "the load looks like kN: give it in N"),
-    (1000.0, "the displacement looks like m: give it in mm"),
-    (10.0, "the displacement looks like cm: give it in mm"),
-    (25.4, "the displacement looks like inches: give it in mm"),
+
+class _UnitError(NamedTuple):
+    """A unit other than N or mm, by which load over displacement changes by a factor."""
+
+    factor: float
+    remedy: str
+
+
+_UNIT_ERRORS = (
+    _UnitError(1.0 / 9.80665, "the load looks like kgf: give it in N"),
+    _UnitError(
+        1000.0 / 9.80665,
+        "the load looks like grams, or like kgf beside a displacement in m: give N and mm",
+    ),
+    _UnitError(1.0 / 4.44822, "the load looks like lbf: give it in N"),
+    _UnitError(1e-3, "the load looks like kN: give it in N"),
+    _UnitError(1000.0, "the displacement looks like m: give it in mm"),
+    _UnitError(10.0, "the displacement looks like cm: give it in mm"),
+    _UnitError(25.4, "the displacement looks like inches: give it in mm"),
 )
+_PLAUSIBLE_FACTOR = 2.0  # between the stiffness of a wing and the expected one
+_UNIT_TOLERANCE = 1.25  # factor between the stiffness and that of a recognised unit error
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +62,15 @@ class LoadDisplacementData:
     Attributes
     ----------
     load : (N,) array
-        Load at the test point, 5 cm from the tip [N].
+        The load at the test point, 5 cm from the tip [N].
     displacement : (N,) array
-        Displacement there [m].
+        The displacement there [m].
     run : (N,) integer array
-        Index of the loading run to which a pair belongs, from 0.
+        The index of the loading run of each pair, from 0.
     load_standard_deviation, displacement_standard_deviation : float
-        Standard deviations of the independent Gaussian errors of the readings [N], [m].
+        The standard deviations of the independent Gaussian errors of the readings [N], [m].
     source : str
-        Where the figures come from.
+        Where the measurements are from.
 
     Raises
     ------
@@ -74,10 +87,14 @@ class LoadDisplacementData:
 
     def __post_init__(self) -> None:
         for name in ("load", "displacement"):
-            column = getattr(self, name)
-            for wrong in np.flatnonzero(column <= 0.0):
-                found = wrong + 1, column[wrong]
-                raise ExperimentDataError(said("load_test.positive", self=self, name=name, found=found))
+            values = getattr(self, name)
+            not_positive = np.flatnonzero(values <= 0.0)
+            if not_positive.size:
+                index = not_positive[0]
+                raise ExperimentDataError(
+                    f"{self.source}: {name} of reading {index + 1} is {values[index]:g}, "
+                    f"but every {name} must be positive; leave out zero readings."
+                )
 
     @property
     def count(self) -> int:
@@ -91,10 +108,16 @@ class LoadDisplacementData:
 
     @property
     def sha256(self) -> str:
-        """Hash of the figures and their uncertainty (not of `source`), the same on every platform."""
-        deviations = self.load_standard_deviation, self.displacement_standard_deviation
-        columns = self.load, self.displacement, self.run
-        return hash_record([*map(float, deviations), *(column.tolist() for column in columns)])
+        """Hash of the values and their uncertainty (not of `source`), equal on every platform."""
+        return hash_record(
+            [
+                float(self.load_standard_deviation),
+                float(self.displacement_standard_deviation),
+                self.load.tolist(),
+                self.displacement.tolist(),
+                self.run.tolist(),
+            ]
+        )
 
 
 def published_measurements() -> LoadDisplacementData:
@@ -114,48 +137,54 @@ def published_measurements() -> LoadDisplacementData:
 
 
 def read_measurements(path: Path) -> LoadDisplacementData:
-    """Read the pairs of step 2 from the authors' calibration folder, or from one CSV file.
+    """Return the pairs of step 2 in the authors' calibration folder, or in one CSV file.
 
     Parameters
     ----------
     path : Path
-        The folder that holds `step2/load_displacement_measurements.csv` (also the folder above it in the
-        authors' repository), or the CSV file itself: a header with the columns `load` [N] and
-        `displacement` [mm]; further columns are ignored. A new loading run begins where the load falls.
+        The folder that holds `step2/load_displacement_measurements.csv` (also the folder above it
+        in the authors' repository), or the CSV file itself: a header with the columns `load` [N]
+        and `displacement` [mm]; further columns are ignored. A new loading run begins where the
+        load falls.
 
     Raises
     ------
     ExperimentFileError
-        If the file is missing, empty, lacks a column, has a row with another number of cells than its header
-        or a cell that is no number, or holds one row twice in a loading run.
+        If the file is missing, empty, lacks a column, has a row whose number of cells is not that
+        of its header or a cell that is no number, or repeats a row in a loading run.
     ExperimentDataError
         If a value is not positive and finite, or load over displacement shows other units.
     """
     table = lab_table(path, MEASUREMENTS_FILE)
-    load, displacement = (
-        table.numbers(name, "a load test", positive=True) for name in ("load", "displacement")
-    )
-    _refuse_other_units(table.name, load, displacement)
-    run = np.concatenate([[0], np.cumsum(np.diff(load) < 0.0)])
-    rest = [table.columns[name] for name in table.columns if name not in ("load", "displacement")]
+    load = table.numbers("load", "a load test", positive=True)
+    displacement_mm = table.numbers("displacement", "a load test", positive=True)
+    _refuse_other_units(table.name, load, displacement_mm)
+    load_falls = np.diff(load) < 0.0
+    run = np.concatenate([[0], np.cumsum(load_falls)])
+    further_columns = [
+        cells for name, cells in table.columns.items() if name not in ("load", "displacement")
+    ]
+    rows = zip(run.tolist(), load.tolist(), displacement_mm.tolist(), *further_columns, strict=True)
     table.refuse_repeated(
-        [*zip(run.tolist(), load.tolist(), displacement.tolist(), *rest, strict=True)],
-        "row",
-        "leave one out, or number repeated readings in a further column",
+        list(rows), "row", "leave one out, or number repeated readings in a further column"
     )
     return LoadDisplacementData(
-        load=load, displacement=displacement * 1e-3, run=run, source=Path(table.name).name
+        load=load, displacement=displacement_mm * 1e-3, run=run, source=Path(table.name).name
     )
 
 
 def _refuse_other_units(file: str, load: Float, displacement_mm: Float) -> None:
+    """Refuse loads (N,) [N] and displacements (N,) [mm] whose ratio shows other units."""
     stiffness = float(np.median(load / displacement_mm))  # N/mm
     expected = EXPECTED_TIP_STIFFNESS * 1e-3
     ratio = stiffness / expected
-    if 0.5 <= ratio <= 2.0:
+    if 1.0 / _PLAUSIBLE_FACTOR <= ratio <= _PLAUSIBLE_FACTOR:
         return
-    factor, remedy = min(_UNIT_SLIPS, key=lambda slip: abs(math.log(ratio / slip[0])))
-    if abs(math.log(ratio / factor)) > math.log(1.25):
+    nearest = min(_UNIT_ERRORS, key=lambda error: abs(math.log(ratio / error.factor)))
+    remedy = nearest.remedy
+    if abs(math.log(ratio / nearest.factor)) > math.log(_UNIT_TOLERANCE):
         remedy = "check the columns, their units (N and mm) and the wing"
-    found = stiffness, ratio, expected
-    raise ExperimentDataError(said("load_test.stiffness", file=file, found=found, remedy=remedy))
+    raise ExperimentDataError(
+        f"{file}: load over displacement is {stiffness:.3g} N/mm, {ratio:.3g} times the "
+        f"{expected:.3g} N/mm expected before calibration; {remedy}."
+    )

@@ -9,23 +9,34 @@ from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from calibration.errors import PosteriorError, said
+from calibration.errors import PosteriorError
 from reporting.arrays import Float
 
 Seed = int | np.random.SeedSequence
-"""A seed: a whole number, or a SeedSequence spawned for the purpose."""
+"""A seed: a whole number, or a SeedSequence for one purpose."""
 
 PRIOR_DEVIATION = 0.05 / 1.96
 """Half-width of the prior's 95 % interval of e (Kapteyn et al. 2021, calibration step 2)."""
 
 
 def stratified(generator: np.random.Generator, count: int) -> Float:
-    """Return a number from each of `count` equal parts of 0 to 1, in shuffled order (count,)."""
-    return generator.permutation((np.arange(count) + generator.random(count)) / count)
+    """Return one uniform number from each of `count` equal parts of 0 to 1, shuffled, (count,)."""
+    strata = (np.arange(count) + generator.random(count)) / count
+    return generator.permutation(strata)
 
 
 def child_seed(seed: Seed, purpose: int) -> np.random.SeedSequence:
-    """Return the seed of one purpose, always the same for the same `seed` (spawning would count calls)."""
+    """Return the seed of one purpose.
+
+    It is the same at every call, while `SeedSequence.spawn` counts its calls.
+
+    Parameters
+    ----------
+    seed : int or SeedSequence
+        The seed of all purposes.
+    purpose : int
+        The number of the purpose.
+    """
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, purpose))
 
@@ -37,7 +48,7 @@ class GaussianPrior:
     Attributes
     ----------
     mean, standard_deviation : float
-        Of the Young's modulus factor [1].
+        The mean and the standard deviation of the Young's modulus factor [1].
     """
 
     mean: float = 1.0
@@ -45,26 +56,31 @@ class GaussianPrior:
 
     def log_density(self, value: ArrayLike) -> Float:
         """Return the logarithm of the density, elementwise."""
-        standard = (np.asarray(value, dtype=float) - self.mean) / self.standard_deviation
-        return np.asarray(-0.5 * standard**2 - math.log(self.standard_deviation * math.sqrt(2.0 * math.pi)))
+        standardised = (np.asarray(value, dtype=float) - self.mean) / self.standard_deviation
+        log_scale = math.log(self.standard_deviation * math.sqrt(2.0 * math.pi))
+        return np.asarray(-0.5 * standardised**2 - log_scale)
 
     def quantile(self, probability: ArrayLike) -> Float:
         """Return quantiles, elementwise."""
-        return np.asarray(self.mean + self.standard_deviation * ndtri(np.asarray(probability, dtype=float)))
+        standardised = ndtri(np.asarray(probability, dtype=float))
+        return np.asarray(self.mean + self.standard_deviation * standardised)
 
 
 @dataclass(frozen=True, eq=False)
 class ScalarPosterior:
-    """p(value | measurements) on a grid; the density is zero outside, and within a cell its mean.
+    """The density p(value | measurements) on a grid.
+
+    The density is zero outside the grid, and constant within a cell.
 
     Attributes
     ----------
     grid : (N,) array
-        Ascending values of the unknown.
+        The ascending values of the unknown.
     density : (N,) array
-        Density there, not negative; it is scaled to integrate to one.
+        The density there, not negative; it is scaled to integrate to one.
     mean, standard_deviation : float
-        Of this density, unless given (a particle filter gives those of its particles).
+        The moments of this density, unless they are given (a particle filter gives those of its
+        particles).
     """
 
     grid: Float
@@ -74,17 +90,22 @@ class ScalarPosterior:
     _cumulative: Float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        grid, density = self.grid, self.density / np.trapezoid(self.density, self.grid)
-        cumulative = np.r_[0.0, np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))]
-        mean = float(np.trapezoid(density * grid, grid)) if math.isnan(self.mean) else self.mean
-        variance = float(np.trapezoid(density * (grid - mean) ** 2, grid))
-        given = self.standard_deviation
-        found = {
-            "density": density, "_cumulative": cumulative / cumulative[-1], "mean": mean,
-            "standard_deviation": math.sqrt(variance) if math.isnan(given) else given,
-        }  # fmt: skip
-        for name, value in found.items():
-            object.__setattr__(self, name, value)
+        grid = self.grid
+        density = self.density / np.trapezoid(self.density, grid)
+        cell_probability = 0.5 * (density[1:] + density[:-1]) * np.diff(grid)
+        cumulative = np.r_[0.0, np.cumsum(cell_probability)]
+        mean = self.mean
+        if math.isnan(mean):
+            mean = float(np.trapezoid(density * grid, grid))
+        standard_deviation = self.standard_deviation
+        if math.isnan(standard_deviation):
+            variance = float(np.trapezoid(density * (grid - mean) ** 2, grid))
+            standard_deviation = math.sqrt(variance)
+        # A frozen dataclass can only be completed in this way.
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "_cumulative", cumulative / cumulative[-1])
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "standard_deviation", standard_deviation)
 
     def cumulative(self, value: ArrayLike) -> Float:
         """Return the distribution function, elementwise."""
@@ -92,36 +113,39 @@ class ScalarPosterior:
 
     def quantile(self, probability: ArrayLike) -> Float:
         """Return quantiles, elementwise: the inverse of `cumulative`."""
-        return np.asarray(np.interp(np.asarray(probability, dtype=float), self._cumulative, self.grid))
+        return np.asarray(
+            np.interp(np.asarray(probability, dtype=float), self._cumulative, self.grid)
+        )
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the central interval that holds `probability`."""
+        """Return the central interval of a probability."""
         tail = 0.5 * (1.0 - probability)
         lower, upper = self.quantile([tail, 1.0 - tail])
         return float(lower), float(upper)
 
     def samples(self, seed: Seed, count: int) -> Float:
-        """Draw one sample from each of `count` strata of equal probability, in shuffled order.
+        """Return one sample from each of `count` strata of equal probability, in shuffled order.
 
-        Sample means have far less variance than those of independent draws.
+        Their mean has far less variance than that of independent draws.
 
         Parameters
         ----------
         seed : int or SeedSequence
             The same seed gives the same samples, bit for bit.
         count : int
-            Number of samples.
+            The number of samples.
 
         Returns
         -------
-        (count,) array, unit as `grid`
+        (count,) array
+            The samples, in the unit of `grid`.
         """
         generator = np.random.default_rng(child_seed(seed, 0))
         return self.quantile(stratified(generator, count))
 
 
 TABLE_TOLERANCE = 1e-7
-"""Largest relative error of a curve between the nodes at which a model was asked."""
+"""Largest relative error of a curve between the nodes at which the model is evaluated."""
 
 _INVERSE_TABLE_SIZE = 4001
 _DEGREE = 16
@@ -134,10 +158,10 @@ class StiffnessCurve:
     Attributes
     ----------
     polynomial : Chebyshev
-        k(e) [N/m] over the range in which the curve may be trusted; straight lines continue it beyond, so
-        that tails of a sampled density can be mapped, but no posterior may rest there.
+        The stiffness k(e) [N/m] over the range in which the curve may be trusted. Straight lines
+        continue it, so that tails of a sampled density can be mapped; no posterior may lie there.
     name : str
-        What the curve is, for reports.
+        The name of the curve, for reports.
     """
 
     polynomial: Chebyshev
@@ -161,10 +185,12 @@ class StiffnessCurve:
 
     def slope(self, young_modulus_factor: ArrayLike) -> Float:
         """Return dk/de [N/m], elementwise."""
-        return np.asarray(self.polynomial.deriv()(np.clip(young_modulus_factor, self.lower, self.upper)))
+        return np.asarray(
+            self.polynomial.deriv()(np.clip(young_modulus_factor, self.lower, self.upper))
+        )
 
     def young_modulus_factor(self, stiffness: ArrayLike) -> Float:
-        """Return the inverse e(k), elementwise; `stiffness` in N/m."""
+        """Return the inverse e(k) [1], elementwise, of a stiffness [N/m]."""
         value = np.asarray(stiffness, dtype=float)
         factors = np.linspace(self.lower, self.upper, _INVERSE_TABLE_SIZE)
         stiffnesses = self.polynomial(factors)
@@ -176,30 +202,42 @@ class StiffnessCurve:
 def stiffness_line(
     gradient: float, intercept: float, name: str = "line", lower: float = 0.0, upper: float = 10.0
 ) -> StiffnessCurve:
-    """Return the line k(e) = gradient * e + intercept [N/m] between two factors."""
+    """Return the line k(e) = gradient * e + intercept.
+
+    Parameters
+    ----------
+    gradient, intercept : float
+        The coefficients of the line [N/m].
+    name : str
+        The name of the curve, for reports.
+    lower, upper : float
+        The range of e [1].
+    """
     ends = np.array([lower, upper])
     return StiffnessCurve(Chebyshev.fit(ends, gradient * ends + intercept, 1, domain=ends), name)
 
 
 PUBLISHED_LINE = stiffness_line(575.2, 101.8, "published line k(e) = 0.5752 e + 0.1018 N/mm")
-"""Kapteyn et al. 2021, eq. (14): the authors' finite element model at the test point, 5 cm from the tip."""
+"""Kapteyn et al. 2021, eq. (14): the authors' model at the test point, 5 cm from the tip."""
 
 
 def stiffness_curve_of(
-    tip_stiffness: Callable[[float], float], limits: tuple[float, float], name: str = "finite element model"
+    tip_stiffness: Callable[[float], float],
+    limits: tuple[float, float],
+    name: str = "finite element model",
 ) -> StiffnessCurve:
-    """Return the tip stiffness of a structural model over its range of e.
+    """Return the tip stiffness of a structural model as a polynomial of e.
 
-    A polynomial must meet the model between its nodes within `TABLE_TOLERANCE`.
+    Between its nodes the polynomial must agree with the model within `TABLE_TOLERANCE`.
 
     Parameters
     ----------
     tip_stiffness : callable
-        Of a model: e to load over displacement 5 cm from the tip [N/m].
+        Returns load over displacement 5 cm from the tip [N/m] for a value of e.
     limits : (float, float)
-        Range of e in which the model holds.
+        The range of e in which the model holds.
     name : str
-        What the curve is, for reports.
+        The name of the curve, for reports.
 
     Raises
     ------
@@ -211,6 +249,8 @@ def stiffness_curve_of(
     between = np.linspace(*limits, 2 * _DEGREE)
     error = float(np.max(np.abs(polynomial(between) / stiffness(between) - 1.0)))
     if error > TABLE_TOLERANCE:
-        fit = error, _DEGREE
-        raise PosteriorError(said("load_test.rough", name=name, limits=limits, fit=fit))
+        raise PosteriorError(
+            f"the tip stiffness of {name} over e in [{limits[0]:g}, {limits[1]:g}] is too rough "
+            f"for a polynomial: the relative error is {error:.1g} at degree {_DEGREE}."
+        )
     return StiffnessCurve(polynomial, name)

@@ -40,7 +40,7 @@ from fe.runtime.reduced import Modes, ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
 from reporting.arrays import Float
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 from reporting.page import Page, Words
 from reporting.progress import Progress, reporter, stage
 from reporting.provenance import collect_provenance
@@ -162,7 +162,7 @@ class WingCalibration:
 
 def _check_request(procedure: KeptProcedure, seed: int) -> None:
     """Refuse an unknown procedure, and a seed that is no whole number of 63 bits."""
-    one_of(procedure, get_args(KeptProcedure), "procedure")
+    require_one_of(procedure, get_args(KeptProcedure), "procedure")
     if seed not in range(2**63):
         raise CalibrationRecordError(f"`seed` must be a whole number from 0 to 2^63 - 1, and {seed!r} came.")
 
@@ -413,7 +413,7 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
     figure, grid = style.panels(
         rows, 2, 1.5 * rows, 0.015 * rows, 0.0, wspace=0.06, hspace=0.04, left=0.01, right=0.99
     )
-    places = style.first_of(grid, len(titles))
+    places = style.keep_first_panels(grid, len(titles))
     for axes, shape, title in zip(places, np.moveaxis(shapes, -1, 0), titles, strict=False):
         length = np.linalg.norm(shape, axis=1)
         largest = float(length.max())

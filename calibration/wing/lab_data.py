@@ -8,11 +8,18 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from calibration.dynamics.extremes import refine_by_extremes
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_records, read_records
-from calibration.dynamics.trials import Fits, fit_trials, refine_by_extremes
+from calibration.dynamics.trials import Fits, fit_trials
 from calibration.errors import ExperimentDataError, ExperimentFileError, said
-from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths, published_lengths, read_lengths
-from calibration.joint.posterior import PUBLISHED_MODES, measured_modes
+from calibration.geometry import (
+    GEOMETRY_FILE,
+    PUBLISHED_NAMES,
+    Lengths,
+    published_lengths,
+    read_lengths,
+)
+from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed
 from calibration.lab_folder import lab_place, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
@@ -23,7 +30,7 @@ from calibration.static.experiments import (
     published_measurements,
     read_measurements,
 )
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.table_file import table_text
 
@@ -193,7 +200,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         If `targets` is another word.
     """
     if targets is not None:
-        one_of(targets, get_args(Targets), "targets")
+        require_one_of(targets, get_args(Targets), "targets")
     path = Path(path)
     if not path.is_dir():
         what = "no folder" if path.exists() else "not there"

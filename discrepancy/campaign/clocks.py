@@ -17,7 +17,7 @@ from discrepancy.campaign.heads import shared_words, words
 from discrepancy.campaign.records import FloatArray, Hold, TrialKind
 from discrepancy.campaign.sampling import EVEN, as_meant
 from discrepancy.errors import CampaignDataError, CampaignFileError, said
-from reporting.words import be, counted, listing
+from reporting.words import counted, is_or_are, listing
 
 TIME = "time"
 
@@ -188,7 +188,9 @@ def on_one_clock(
         sentence += f"; loads are filled in there as they go between their samples: {listing(filled)}"
     if len(kept) < len(seconds):
         outside = len(seconds) - len(kept)
-        sentence += f"; {counted(outside, 'stamp')} before or after their records {be(outside)} left out"
+        sentence += (
+            f"; {counted(outside, 'stamp')} before or after their records {is_or_are(outside)} left out"
+        )
     lines = _lines(clocks, stamps, places, len(seconds))
     return OneClock(kept_cells, tuple(lines[at] for at in kept), sentence)
 

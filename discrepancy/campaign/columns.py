@@ -14,7 +14,7 @@ from discrepancy.campaign.sampling import as_meant
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError, said
-from reporting.words import be, counted, listing
+from reporting.words import counted, is_or_are, listing
 
 NOISE, LEFT_OUT, INPUT = "noise", "-", "input:"
 """Kind of a file of samples at rest, role of a column that is left out, and how that of an input begins."""
@@ -262,7 +262,7 @@ def origin_of(sheet: Sheet, used: Sequence[Column], scales: Mapping[str, str]) -
         for item in used
     )
     empty = sum(sheet.columns[sheet.heads.index(item.head)].count("") for item in used)
-    left = f"; {counted(empty, 'cell')} {be(empty)} empty" if empty else ""
+    left = f"; {counted(empty, 'cell')} {is_or_are(empty)} empty" if empty else ""
     return f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: {columns}{left}."
 
 
@@ -273,5 +273,5 @@ def missing_answers(questions: Mapping[tuple[str, str], Sequence[str]]) -> str:
         f"--{option} {f'NAME=... for {listing(map(repr, of))}' if of[0] else '...'} ({expected})"
         for (option, expected), of in questions.items()
     ]
-    missing = f"{counted(count, 'answer')} {be(count)} missing, and nothing was written"
+    missing = f"{counted(count, 'answer')} {is_or_are(count)} missing, and nothing was written"
     return f"{missing}: give {'; '.join(options)}."

@@ -31,7 +31,7 @@ from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.files import hash_file, hash_record
 from reporting.table_file import TableErrors, TextTable, read_table
 from reporting.toml_file import read_toml
-from reporting.words import be, counted
+from reporting.words import counted, is_or_are
 
 CAMPAIGN_FILE = "campaign.toml"
 """Name of the file that describes a campaign, in its folder."""
@@ -303,7 +303,7 @@ def _readings(
         rows = np.arange(len(values))
         values[~used] = np.interp(rows[~used], rows[used], values[used])
         count = int((~used).sum())
-        are = f"{be(count)} empty"
+        are = f"{is_or_are(count)} empty"
         remarks.append(said("remarks.left_out", count=count, total=len(values), are=are, **told))
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):

@@ -12,7 +12,7 @@ from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Relea
 from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignFileError, said
 from fe.runtime.patch import EVERY_CHANNEL
-from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, checked
+from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, validate
 
 FORMAT = 1
 """Version of the format."""
@@ -221,4 +221,4 @@ def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
     came = table.get("format", FORMAT)
     if came != FORMAT or isinstance(came, bool):
         raise CampaignFileError(said("campaign.format", source=source, came=came, wanted=FORMAT))
-    return checked(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")
+    return validate(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")

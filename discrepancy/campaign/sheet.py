@@ -23,7 +23,7 @@ from discrepancy.campaign.matlab_file import read_matlab
 from discrepancy.errors import CampaignFileError, said
 from reporting.files import hash_file
 from reporting.text_file import read_text
-from reporting.toml_file import shown
+from reporting.toml_file import short_repr
 from reporting.words import counted, listing, one_line
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
@@ -405,7 +405,7 @@ def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], 
     left = {*range(first, last), *(at for at in torn if 2 * len(values[at] & {*core}) >= len(core))} - {*body}
     for line, row in (rows[at] for at in sorted(left) if rows[at][1] not in (head, rows[first - 1][1])):
         if not row[0].startswith("#"):
-            came = shown(listing(filter(None, row)))
+            came = short_repr(listing(filter(None, row)))
             raise CampaignFileError(
                 said("sheets.no_row", place=f"{where} {line}", name=head[core[0]], came=came)
             )

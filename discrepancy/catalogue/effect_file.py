@@ -66,7 +66,7 @@ from discrepancy.system.scales import PortScale
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import EVERY_CHANNEL, PRIMITIVES, ModelPatch, Primitive, Window
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import read_toml, validate
 
 # ---------------------------------------------------------------- names in arithmetic
 LARGEST_SHARE = 0.9
@@ -211,7 +211,7 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
 
 
 def _effect(row: object, where: str) -> Effect:
-    section = checked(EffectSection, row, where, CatalogueError, what="an effect")
+    section = validate(EffectSection, row, where, CatalogueError, what="an effect")
     names = frozenset([*(item.name for item in section.parameters), *(item.name for item in section.shape)])
     moments = frozenset(word for name in section.events for word in (name, f"{name}_until"))
     _check_words(section, names, where)

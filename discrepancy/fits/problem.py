@@ -19,7 +19,7 @@ from discrepancy.errors import CampaignDataError, DiscrepancyError, said
 from discrepancy.system.interface import Model
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
-from reporting.memory import Memory
+from reporting.memory import ResultCache
 
 from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, moved
 from .trial_data import TrialData, global_unknowns, stand_in
@@ -91,7 +91,7 @@ class Problem:
         self.counts = np.zeros(len(self.channel_names))
         for data in self.trials:
             np.add.at(self.counts, data.groups, data.weight.sum(axis=0))
-        self._responses = Memory(KEPT)
+        self._responses = ResultCache(KEPT)
 
     def refused(self, candidate: Candidate, cause: DiscrepancyError) -> None:
         """Keep why an effect could not be evaluated or fitted alone; of several, any may be to blame."""

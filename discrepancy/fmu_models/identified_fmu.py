@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from fmu_asset.door.runs import FmuRuns, Run, State, StateSpace, realised
-from fmu_asset.errors import FmuError
-from reporting.memory import Memory
 from scipy.optimize import root_scalar
 from scipy.signal import periodogram
 
@@ -21,6 +18,9 @@ from discrepancy.fmu_models.system_motion import MOST_SYSTEMS, system_motion
 from discrepancy.fmu_models.variables import FmuVariables
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.time_history import RecordedHistory, equivalent_ramps
+from fmu_asset.door.runs import FmuRuns, Run, State, StateSpace, realised
+from fmu_asset.errors import FmuError
+from reporting.memory import ResultCache
 
 LINEAR = 1e-6
 """Largest deviation from superposition of a linear FMU, as a share of the motion."""
@@ -100,8 +100,8 @@ class IdentifiedFmu(FmuRuns):
         self.release_variables = self._find_release_variables()
         self._is_linear: dict[tuple[Hashable, ...], bool] = {}
         self._release_sizes: dict[str, float] = {}
-        self._systems = Memory(MOST_SYSTEMS)
-        self._paces = Memory()
+        self._systems = ResultCache(MOST_SYSTEMS)
+        self._paces = ResultCache()
 
     def _check_parameters(self) -> None:
         """Refuse what the FMU cannot be set to: beyond its range a posterior would be cut."""

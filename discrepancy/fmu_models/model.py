@@ -5,12 +5,9 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from fe.runtime.motion import Laws, laws_of
-from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
-from fmu_asset.door.runs import State, StateSpace
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
-from discrepancy.errors import ModelError, name_list
+from discrepancy.errors import ModelError
 from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.fmu_models.fmu_excitation import FmuExcitation
 from discrepancy.fmu_models.fmu_motion import FmuSimulator
@@ -27,6 +24,10 @@ from discrepancy.system.model_file import DescribedModel
 from discrepancy.system.response import Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.time_history import RecordedHistory, subdivide
+from fe.runtime.motion import Laws, laws_of
+from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
+from fmu_asset.door.runs import State, StateSpace
+from reporting.words import comma_list
 
 LATEST = 100.0
 """Lengths of a record after which its stamps count from elsewhere than the trial's start."""
@@ -290,7 +291,7 @@ class FmuModel(DescribedModel):
             if recorded.name not in self._held_inputs:
                 raise ModelError(
                     f"The trial {trial.name!r} holds the input {recorded.name!r}, which the FMU "
-                    f"model {self.name!r} does not have; it has {name_list(self._held_inputs)}: "
+                    f"model {self.name!r} does not have; it has {comma_list(self._held_inputs)}: "
                     "name it in [[input]]."
                 )
             variable = self._held_inputs[recorded.name]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import block_diag
 
-from calibration.dynamics.damped_cosine import DampedCosines, Solution
+from calibration.dynamics.damped_cosine import DampedCosineFit, DampedCosines
 from discrepancy.campaign.noise_tests import periodogram
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, said
@@ -373,7 +373,9 @@ def backbones(
     )
 
 
-def _points(time: FloatArray, solution: Solution, noise_deviation: float | None) -> list[tuple[float, ...]]:
+def _points(
+    time: FloatArray, solution: DampedCosineFit, noise_deviation: float | None
+) -> list[tuple[float, ...]]:
     """Return time, amplitude, frequency and damping ratio of each mode, each with its error but the time."""
     own = float(solution.deviation[0])
     deviation = own if noise_deviation is None else noise_deviation

@@ -38,7 +38,7 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     if not scores:
         return None
     figure, grid = residual_figures.panels(1, 2, 1.9)
-    cells = zip(style.first_of(grid, len(scores)), scores.items(), strict=True)
+    cells = zip(style.keep_first_panels(grid, len(scores)), scores.items(), strict=True)
     top = max(max(item.pit) for item in scores.values())
     for number, (axes, (title, item)) in enumerate(cells):
         count = len(item.pit)

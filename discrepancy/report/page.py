@@ -21,7 +21,8 @@ from discrepancy.report.text import WORDS, group_lines, neighbours, seen_of
 from discrepancy.self_calibration import SelfCalibration, Share, outcomes
 from discrepancy.verdict import Gate, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.page import Page, ReportFigure, filled
+from reporting.page import Page, ReportFigure
+from reporting.templates import fill_template
 from reporting.words import listing, plus_minus
 
 SHOWN_HYPOTHESES = 8
@@ -82,7 +83,7 @@ def score_rows(investigation: Investigation) -> tuple[list[str], list[list[str]]
         "fitted, before": proof.fitted_before, "fitted, after": proof.fitted_after,
     }  # fmt: skip
     scores = {title: item for title, item in scored.items() if item is not None}
-    shown = partial(filled, number=words.number, p_value_text=words.p_value_text)
+    shown = partial(fill_template, number=words.number, p_value_text=words.p_value_text)
     rows = [
         [title, *(shown(cell, score=item) for item in scores.values())]
         for title, cell in WORDS.content["scores"].items()

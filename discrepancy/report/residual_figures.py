@@ -236,7 +236,7 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
     columns = min(len(found), 2)
     rows = (len(found) + columns - 1) // columns
     figure, grid = panels(rows, columns, 2.25 * rows + 0.3)
-    cells = style.first_of(grid, len(found))
+    cells = style.keep_first_panels(grid, len(found))
     for number, (axes, (kind, label, quantity, names)) in enumerate(zip(cells, found, strict=True)):
         factor, unit = UNITS[quantity].drawn
         noise, *_ = [_draw_loads(axes, item, kind, names, factor) for item in models(before, after)]

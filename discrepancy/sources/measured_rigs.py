@@ -20,7 +20,7 @@ from discrepancy.errors import CampaignDataError, CampaignFileError, said
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
 from reporting.toml_file import toml_text
-from reporting.words import be, counted
+from reporting.words import counted, is_or_are
 
 FALLING = 3.0
 """While the reading of the sensor's z is below this share of a rest's, it falls [m/s^2]."""
@@ -263,7 +263,7 @@ def _windowed(
     inside = np.flatnonzero(known & (record.time >= begin))
     count = len(inside) // columns
     if count < 60:
-        left = f"{counted(count, 'sample')} {be(count)} left"
+        left = f"{counted(count, 'sample')} {is_or_are(count)} left"
         raise CampaignDataError(f"{record.source}: {left} after {begin:g} s; 60 are needed.")
     kept = inside[: count * columns].reshape(count, columns)
     time = record.time[kept].mean(axis=1)

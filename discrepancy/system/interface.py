@@ -8,17 +8,17 @@ from types import MappingProxyType
 from typing import ClassVar, Self
 
 import numpy as np
+
 from calibration.result.record import ParameterPrior
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
+from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
-from reporting.memory import Memory
-from reporting.words import brief, capital, counted
-
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
-from discrepancy.errors import ModelError, name_list
-from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
-from discrepancy.system.scales import Scales
+from reporting.memory import ResultCache
+from reporting.words import brief, capital, comma_list, counted
 
 MOST_RESPONSES = 400
 """Number of responses that a model keeps; the oldest goes first."""
@@ -78,7 +78,7 @@ class Model(ABC):
     shows_ports: ClassVar[bool] = True
     linear: bool = False
     _unpatched_parameters: tuple[ParameterPrior, ...] | None = None
-    _responses: Memory | None = None
+    _responses: ResultCache | None = None
 
     def __repr__(self) -> str:
         parameters = [parameter.name for parameter in self.parameters]
@@ -251,7 +251,7 @@ class Model(ABC):
             elif np.any(column):
                 raise ModelError(
                     f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
-                    f"{self.what} has {name_list(self.regions)}."
+                    f"{self.what} has {comma_list(self.regions)}."
                 )
         return [tuple(row) for row in losses.tolist()]
 
@@ -369,7 +369,7 @@ class Model(ABC):
         """Return the model as one that keeps responses: many sensors are tried on one motion."""
         if self._responses is not None:
             return self
-        return self._copy_with(_responses=Memory(MOST_RESPONSES))
+        return self._copy_with(_responses=ResultCache(MOST_RESPONSES))
 
     def patched(
         self,

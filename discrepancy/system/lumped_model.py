@@ -6,14 +6,10 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from fe.runtime import patch as changes
-from fe.runtime.laws import LAWS
-from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
-from fe.runtime.state import Losses
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
-from discrepancy.errors import ModelError, name_list
+from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.linear_system import LinearSystem
@@ -27,6 +23,11 @@ from discrepancy.system.rig import OffsetInput, Rig, build_rig
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import LoadsAndMotions, PatchedTrial, SystemState
 from discrepancy.system.time_history import FormulaHistory, RecordedHistory
+from fe.runtime import patch as changes
+from fe.runtime.laws import LAWS
+from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
+from fe.runtime.state import Losses
+from reporting.words import comma_list
 
 MOST_MODES = 8
 """Modes with inertia of a structure on springs; the others follow without inertia."""
@@ -164,7 +165,7 @@ class LumpedModel(DescribedModel, SystemModel):
         if primitive.port not in self.law_directions:
             raise ModelError(
                 f"A force acts at the port {primitive.port!r}, which {self.name!r} does not have; "
-                f"it has {name_list(self.law_directions)}."
+                f"it has {comma_list(self.law_directions)}."
             )
         spans = tuple(window.span for window in primitive.windows)
         history = FormulaHistory(course_of(primitive.force, primitive.kind), spans)
@@ -195,7 +196,7 @@ class LumpedModel(DescribedModel, SystemModel):
         if section is None:
             raise ModelError(
                 f"The trial {trial.name!r} records the input {recorded.name!r}, which {self.what} "
-                f"does not have; it has {name_list(self._inputs)}."
+                f"does not have; it has {comma_list(self._inputs)}."
             )
         moving = section.quantity.moving
         if recorded.quantity is not section.quantity and recorded.quantity not in moving:

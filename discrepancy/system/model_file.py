@@ -4,14 +4,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
-from calibration.result.record import ParameterPrior
 from pydantic import ConfigDict
-from reporting import toml_file
-from reporting.toml_file import Fault, Name, NotNegative, Number, checked, read_toml
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.system.interface import Model
+from reporting import toml_file
+from reporting.toml_file import Fault, Name, NotNegative, Number, read_toml, validate
 
 
 class Section(toml_file.Section):
@@ -63,7 +63,7 @@ class ModelDescription(Section):
         ModelError
             One sentence that names `source`, the place, what came and what was expected.
         """
-        return checked(cls, content, source, ModelError, what=cls.what)
+        return validate(cls, content, source, ModelError, what=cls.what)
 
     @classmethod
     def read(cls, path: Path | str) -> Self:

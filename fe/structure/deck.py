@@ -22,7 +22,7 @@ from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from fe.sentences import said
 from reporting.text_file import read_text
-from reporting.toml_file import parse_toml, shown
+from reporting.toml_file import parse_toml, short_repr
 
 from .mesh import StructureMesh
 
@@ -97,9 +97,9 @@ def whole(where: str, text: str) -> int:
     try:
         number = int(text)
     except ValueError:
-        fail(where, f"a whole number is expected, but {shown(text)} came.")
+        fail(where, f"a whole number is expected, but {short_repr(text)} came.")
     if abs(number) > _LARGEST_NUMBER:
-        fail(where, f"the number {shown(text)} is too large.")
+        fail(where, f"the number {short_repr(text)} is too large.")
     return number
 
 
@@ -110,7 +110,7 @@ def real(where: str, text: str) -> float:
     except ValueError:
         number = nan
     if not isfinite(number):
-        fail(where, f"a real number is expected, but {shown(text)} came.")
+        fail(where, f"a real number is expected, but {short_repr(text)} came.")
     return number
 
 
@@ -288,7 +288,7 @@ class Deck:
             label, last = face.upper(), len(kind.faces)
             number = int(label[1:]) if re.fullmatch("S[1-6]", label) else 0
             if not 1 <= number <= last:
-                fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {shown(face)} came.")
+                fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {short_repr(face)} came.")
             for element in {*self.named("ELSET", where, member)}:
                 if element not in solid:
                     fail(where, f"the surface names element {element}, which is not a solid element.")

@@ -16,7 +16,7 @@ import numpy as np
 
 from fe.elements.kinds import DECK_KINDS, KINDS
 from fe.runtime.arrays import FloatArray
-from reporting.toml_file import shown
+from reporting.toml_file import short_repr
 
 from .deck import FLAT, GLOBAL, Deck, System, fail, frame, lines_of, real, whole, words_of
 
@@ -68,7 +68,9 @@ def read_abaqus(path: Path) -> Deck:
             deck.word(block.keyword, block.where)
             continue
         for key in (key for key in block.parameters if key not in words.read[block.keyword]):
-            fail(block.where, f"*{block.keyword} with {shown(key)} is not read; write what it makes out.")
+            fail(
+                block.where, f"*{block.keyword} with {short_repr(key)} is not read; write what it makes out."
+            )
         if block.keyword == "NODE":
             _add_nodes(deck, block, system)
         elif block.keyword == "ELEMENT":
@@ -137,7 +139,7 @@ def _plain_type(name: str, where: str) -> str:
         readable = ", ".join(kind.calculix for kind in DECK_KINDS.values())
         variant = _VARIANT.fullmatch(name)
         if variant is None or variant[1] not in _TYPES:
-            fail(where, f"elements of type {shown(name)} cannot be read; {readable} can.")
+            fail(where, f"elements of type {short_repr(name)} cannot be read; {readable} can.")
         why = f"they are {_OTHER_STIFFNESS.get(name, 'other elements')}, not {variant[1]}"
         remedy = f"write {variant[1]} if that is meant"
         if variant[1] == "C3D8":
@@ -174,7 +176,7 @@ def _add_members(deck: Deck, block: _Block) -> None:
             continue
         first, last, step = [*(whole(where, value) for value in given), 1, 0, 0][:3]
         if len(given) not in (2, 3) or first < 1 or step < 1:
-            fail(where, f"first, last and step are expected, but {shown(','.join(given))} came.")
+            fail(where, f"first, last and step are expected, but {short_repr(','.join(given))} came.")
         members.extend(deck.counted(where, range(first, last + 1, step)))
 
 
@@ -364,7 +366,7 @@ def _bulk_lines(path: Path) -> list[_Line]:
 
 
 def _refuse_continuation(line: _Line) -> NoReturn:
-    fail(line.where, f"the continuation {shown(line.head)} stands behind no line that it continues.")
+    fail(line.where, f"the continuation {short_repr(line.head)} stands behind no line that it continues.")
 
 
 def _fields(where: str, text: str) -> list[str]:

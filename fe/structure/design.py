@@ -19,7 +19,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
 from fe.sentences import said
-from reporting.toml_file import Fault, checked, read_toml
+from reporting.toml_file import Fault, read_toml, validate
 
 from . import tables
 
@@ -381,8 +381,8 @@ def parse_structure(content: dict[str, Any], source: str = "the structure") -> M
         One sentence that names `source`, the place, what came and what was expected.
     """
     if "stiffness_matrix" in content:
-        return checked(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
-    return checked(MeshDesign, content, source, InvalidDesignError, what="a structure")
+        return validate(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
+    return validate(MeshDesign, content, source, InvalidDesignError, what="a structure")
 
 
 def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:

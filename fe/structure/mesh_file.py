@@ -28,9 +28,9 @@ from fe.full.factorisation import analyse
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from fe.sentences import said
-from reporting.memory import memory_left
+from reporting.memory import available_memory
 from reporting.text_file import read_text
-from reporting.words import be, counted
+from reporting.words import counted, is_or_are
 
 from .deck import FLAT, Deck, fail
 from .decks import cards, read_abaqus, read_nastran
@@ -127,7 +127,7 @@ def read_by_meshio(path: Path) -> Deck:
     outside = _outside_physical_groups(found)
     left_out = sum(int(rows.sum()) for rows in outside)
     if left_out:
-        what = f"{counted(left_out, 'element')} of no physical group {be(left_out)} left out"
+        what = f"{counted(left_out, 'element')} of no physical group {is_or_are(left_out)} left out"
         deck.remark(f"{path}: {what}; set Mesh.SaveAll = 0 in Gmsh, and it saves none of them.")
     for block, is_outside in zip(found.cells, outside, strict=True):
         known = block.type in KINDS or block.type in FLAT
@@ -291,7 +291,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     MeshError
         If it would take more.
     """
-    allowed = memory_left() if limit is None else limit
+    allowed = available_memory() if limit is None else limit
     entries = 9 * mesh.cells.size * mesh.cells.shape[1]  # four times those that are left of them
     bulky = _PROGRAM + _MATRICES * _ENTRY * entries / 4.0 + _BULKY * mesh.unknowns ** (4.0 / 3.0)
     if bulky > allowed and (needed := memory_estimate(mesh)) > allowed:

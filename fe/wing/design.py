@@ -18,7 +18,7 @@ from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
 from fe.sentences import said
 from fe.structure.tables import Part, StructureDesign
-from reporting.toml_file import Fault, checked, read_toml
+from reporting.toml_file import Fault, read_toml, validate
 from reporting.words import brief
 
 from . import parts
@@ -34,7 +34,7 @@ def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
         "damage": [{"name": name} for name in regions],
         "gauge": [{"name": f"gauge_{number}"} for number in range(1, gauges + 1)],
     }
-    return checked(StructureDesign, content, str(_NAMES), InvalidDesignError, what="a wing's names")
+    return validate(StructureDesign, content, str(_NAMES), InvalidDesignError, what="a wing's names")
 
 
 TAKEN_NAMES = frozenset((*wing_names(()), "skin", "webs", "ribs"))
@@ -218,7 +218,7 @@ def parse_design(content: dict[str, Any], source: str = "the design") -> WingDes
     InvalidDesignError
         One sentence that names `source`, the place, what came and what was expected.
     """
-    return checked(WingDesign, content, source, InvalidDesignError, what="a wing design", first_index=0)
+    return validate(WingDesign, content, source, InvalidDesignError, what="a wing design", first_index=0)
 
 
 def load_design(path: Path | str | None = None) -> WingDesign:

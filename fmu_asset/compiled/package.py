@@ -25,7 +25,7 @@ from fmu_asset.errors import FmuBuildError, said
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import ENUMERATIONS, TRANSIENT, FmuVariable
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 
 MAGIC = b"UAVTWIN\0"
 VERSION = 2
@@ -172,7 +172,7 @@ def find_compiler(platform: Platform = PLATFORM) -> list[str]:
     FmuBuildError
         If there is none.
     """
-    one_of(platform, get_args(Platform), "platform")
+    require_one_of(platform, get_args(Platform), "platform")
     if platform != PLATFORM:
         if program := shutil.which(CROSS_COMPILER):
             return [program]
@@ -206,7 +206,7 @@ def compile_library(sources: Mapping[str, bytes], *, platform: Platform = PLATFO
     FmuBuildError
         If there is no compiler, this is not 64-bit Linux, or the compiler fails.
     """
-    one_of(platform, get_args(Platform), "platform")
+    require_one_of(platform, get_args(Platform), "platform")
     if fmi_platform != PLATFORM:
         raise FmuBuildError(said("compiled.platform", PLATFORM=PLATFORM, fmi_platform=fmi_platform))
     compiler = find_compiler(platform)
@@ -282,8 +282,8 @@ def compiled_members(
     FmuBuildError
         If fmpy's headers are missing.
     """
-    one_of(fmi, get_args(FmiVersion), "fmi")
-    one_of(interface, get_args(Interface), "interface")
+    require_one_of(fmi, get_args(FmiVersion), "fmi")
+    require_one_of(interface, get_args(Interface), "interface")
     sources, table = _sources(fmi), declared.table
     if interface == "model-exchange":
         table = exchange_table(table, model.mode_count, arrays=fmi == 3)
@@ -363,7 +363,7 @@ def fmi_headers(fmi: FmiVersion = 2) -> dict[str, bytes]:
     FmuBuildError
         If they are missing from the installation.
     """
-    one_of(fmi, get_args(FmiVersion), "fmi")
+    require_one_of(fmi, get_args(FmiVersion), "fmi")
     folder = Path(str(distribution("fmpy").locate_file("fmpy"))) / "c-code"
     found = {path.name: path.read_bytes() for path in folder.glob(f"fmi{fmi}*.h")}
     if not found:
@@ -400,9 +400,9 @@ def binaries_of(
     FmuBuildError
         If one cannot be compiled.
     """
-    one_of(fmi, get_args(FmiVersion), "fmi")
+    require_one_of(fmi, get_args(FmiVersion), "fmi")
     for platform in platforms:
-        one_of(platform, get_args(Platform), "platforms")
+        require_one_of(platform, get_args(Platform), "platforms")
     sources = {
         name.removeprefix("sources/"): content
         for name, content in members.items()

@@ -33,8 +33,8 @@ from pydantic import BeforeValidator, Field
 from fmu_asset.errors import BindingError, said
 from fmu_asset.instances.plan import Interface
 from fmu_asset.worker.client import WorkerLimits
-from reporting.choices import one_of
-from reporting.toml_file import Fault, Number, Positive, Section, checked, read_toml
+from reporting.choices import require_one_of
+from reporting.toml_file import Fault, Number, Positive, Section, read_toml, validate
 
 from .units import same_dimension
 
@@ -347,7 +347,7 @@ class Binding(Section):
         """
         for name, allowed in _HEADER_WORDS.items():
             if name in changes:
-                one_of(changes[name], allowed, name)
+                require_one_of(changes[name], allowed, name)
         return self.model_copy(update={"binding": self.binding.model_copy(update=changes)})
 
     def with_regions(self, regions: Sequence[str]) -> "Binding":
@@ -399,7 +399,7 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
 
 def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> Binding:
     """Check a binding that was read from elsewhere; see `load_binding`."""
-    parsed = checked(Binding, dict(content), where, BindingError, what="a binding")
+    parsed = validate(Binding, dict(content), where, BindingError, what="a binding")
     if not parsed.observation:
         raise BindingError(f"In {where}, there is no [observation.<name>] table; say what is measured.")
     taken: dict[str, str] = {}

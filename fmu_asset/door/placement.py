@@ -27,7 +27,7 @@ from fmu_asset.instances.plan import Instance, Plan, Settings
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 from reporting.arrays import Float
-from reporting.toml_file import checked
+from reporting.toml_file import validate
 
 from .binding import Binding
 
@@ -393,4 +393,4 @@ def limits_of(
     """
     given = {"step_time": step_timeout, "load_time": load_timeout, "memory": memory_limit}
     limits = binding.limits.model_dump() | {key: value for key, value in given.items() if value is not None}
-    return checked(WorkerLimits, limits, "the limits of the worker", FmuInputError, what="the limits")
+    return validate(WorkerLimits, limits, "the limits of the worker", FmuInputError, what="the limits")

@@ -19,7 +19,7 @@ from scipy.linalg import logm
 
 from fe.runtime.arrays import FloatArray, IntArray
 from fmu_asset.errors import FmuOutputError, said
-from reporting.memory import Memory
+from reporting.memory import ResultCache
 
 from .binding import Binding
 from .session import FmiAsset
@@ -79,8 +79,8 @@ class FmuRuns:
 
     def __init__(self, path: Path, binding: Binding, isolated: bool, limit: float, tolerance: float) -> None:
         self._of, self._limit, self._tolerance = (path, binding, isolated), limit, tolerance
-        self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
-        self._kept = Memory(KEPT_BYTES, attrgetter("nbytes"))
+        self._assets = ResultCache(MOST_INSTANCES, end=FmiAsset.close)
+        self._kept = ResultCache(KEPT_BYTES, attrgetter("nbytes"))
 
     @cached_property
     def asset(self) -> FmiAsset:

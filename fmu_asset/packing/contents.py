@@ -29,7 +29,7 @@ from fe.runtime.arrays import archive_bytes
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
 from fmu_asset.errors import FmuBuildError, FmuError, said
 from fmu_asset.slaves.variables import FmuVariable
-from reporting.files import atomic_write_bytes, hash_members, members_of
+from reporting.files import atomic_write_bytes, hash_members, read_members
 from reporting.text_file import read_bytes
 from reporting.units import BASE_UNITS
 
@@ -172,7 +172,7 @@ def room_members(room: str, folder: str) -> dict[str, bytes]:
     folder : str
         Where it goes.
     """
-    members = members_of(Path(str(files(room))), [".py"])
+    members = read_members(Path(str(files(room))), [".py"])
     return {
         f"{folder}/{name}": content.replace(b"from fe.runtime", b"from ..fe")
         for name, content in members.items()

@@ -39,7 +39,7 @@ from fmu_asset.instances.plan import Interface
 from fmu_asset.packing import contents
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 from reporting.files import hash_members
 from reporting.progress import Progress
 
@@ -238,11 +238,11 @@ def check_form(
     InvalidChoiceError
         A kind, a version of FMI, an interface or a platform is none of those.
     """
-    one_of(kind, get_args(FmuKind), "kind")
-    one_of(fmi, get_args(FmiVersion), "fmi")
-    one_of(interface, get_args(Interface), "interface")
+    require_one_of(kind, get_args(FmuKind), "kind")
+    require_one_of(fmi, get_args(FmiVersion), "fmi")
+    require_one_of(interface, get_args(Interface), "interface")
     for platform in platforms:
-        one_of(platform, get_args(Platform), "platforms")
+        require_one_of(platform, get_args(Platform), "platforms")
     if kind == "python" and (fmi, interface) != (2, "co-simulation"):
         raise FmuBuildError(said("packing.python_kind", fmi=fmi, interface=interface))
     if patched and kind != "python":

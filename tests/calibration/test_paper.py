@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
 from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
-from calibration.joint.posterior import PUBLISHED_MODES
+from calibration.joint.measured_modes import PUBLISHED_MODES
 from calibration.joint.wing_table import TOTAL_MASS, weighed
 from calibration.paper.load_test import calibrate_static, particle_filter
 from calibration.paper.procedure import fit_masses

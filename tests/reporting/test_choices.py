@@ -14,7 +14,7 @@ from calibration.dynamics.modal_identification import identify_modes
 from calibration.wing.lab_data import read_lab_folder
 from fmu_asset.compiled.package import binaries_of, compile_library, fmi_headers
 from fmu_asset.door.binding import Binding
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 from reporting.errors import InvalidChoiceError
 
 
@@ -22,13 +22,13 @@ def test_a_word_that_is_not_allowed_is_told_beside_the_nearest():
     with pytest.raises(
         InvalidChoiceError, match=r"`kind` must be 'ambient' or 'decay', and 'Decai' came; .*'decay'"
     ):
-        one_of("Decai", ("ambient", "decay"), "kind")
+        require_one_of("Decai", ("ambient", "decay"), "kind")
 
 
 @pytest.mark.parametrize("value", [None, True, 1.0, "2", ["ambient"], np.array(["ambient"])])
 def test_what_only_equals_an_allowed_value_is_refused(value):
     with pytest.raises(InvalidChoiceError, match="must be"):
-        one_of(value, (1, "ambient"), "version")
+        require_one_of(value, (1, "ambient"), "version")
 
 
 def test_an_unknown_kind_of_record_is_not_taken_for_a_decay():

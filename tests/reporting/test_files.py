@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from reporting import files, netcdf, provenance
 from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
 from reporting.json_file import plain
-from reporting.memory import Memory
+from reporting.memory import ResultCache
 from reporting.netcdf import Group, Variable, read_groups, write_groups
 from tests.refusals import refused
 
@@ -208,7 +208,7 @@ def test_no_end_a_crash_and_a_full_memory_are_one_sentence(path, monkeypatch, ca
     monkeypatch.setattr(os, "fork", forked)
     monkeypatch.setattr(netcdf, "SECONDS", 1)
     monkeypatch.setattr(netcdf, "WAITING", 2)
-    monkeypatch.setattr(netcdf, "_groups", reading)
+    monkeypatch.setattr(netcdf, "_read_groups", reading)
     with refused(DamagedFileError, "HDF5 breaks down over it"):
         read_groups(path)
     assert capfd.readouterr() == ("", "")
@@ -254,7 +254,7 @@ def test_what_is_read_is_in_memory_and_no_finalizer_of_this_process_runs_in_the_
 def test_the_fork_holds_no_file_of_this_process(path, monkeypatch):
     """Or the lock of a run folder would outlive a process that is killed while a file is read."""
     monkeypatch.setattr(
-        netcdf, "_groups", lambda path: " ".join(found.name for found in Path("/proc/self/fd").iterdir())
+        netcdf, "_read_groups", lambda path: " ".join(found.name for found in Path("/proc/self/fd").iterdir())
     )
     with path.open("rb") as held:
         with pytest.raises(DamagedFileError) as raised:
@@ -327,7 +327,7 @@ def test_a_record_is_plain_data_of_json():
 
 def test_the_least_recently_used_are_forgotten_where_there_is_no_room():
     ended = list[str]()
-    kept = Memory(6, weight=len, end=ended.append)
+    kept = ResultCache(6, weight=len, end=ended.append)
     for text in ("one", "two", "one", "four"):  # seven letters do not fit
         assert kept.get(text, lambda text=text: text) == text
     assert ended == ["two", "one"]

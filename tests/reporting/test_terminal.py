@@ -1,5 +1,6 @@
 """Tables and progress on a terminal, on a pipe, and not at all."""
 
+import time
 from io import StringIO
 
 import pytest
@@ -83,7 +84,25 @@ def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
         "Checking a wing that has a long name: 4 of 4 checks, check 3, 23 s ...",
         "Checking a wing that has a long name: done, 23.5 s",
     ]
+
+
+def test_a_stage_that_fails_does_not_look_finished():
     told = StringIO()
     with pytest.raises(KeyError), RichProgress(Console(file=told), lines=True).stage("Failing"):
         raise KeyError
     assert told.getvalue() == "Failing ...\n"
+
+
+def test_a_stage_that_reports_nothing_shows_its_last_detail_again(monkeypatch):
+    monkeypatch.setattr("reporting.progress.LONGEST_SILENCE", 0.1)
+    stream = StringIO()
+    with RichProgress(Console(file=stream, width=80)).stage("Searching") as stage:
+        stage.advance(0, "estimating friction")
+        limit = time.monotonic() + 60.0
+        while stream.getvalue().count("estimating friction") < 2 and time.monotonic() < limit:
+            time.sleep(0.01)
+    first, *silent, last = stream.getvalue().splitlines()
+    assert first == "Searching ..."
+    assert len(silent) >= 2
+    assert all(line.startswith("Searching: estimating friction, ") for line in silent)
+    assert last.startswith("Searching: done")

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import read_toml, validate
 from twin_master.assets.asset_source import AssetSource, PairedSource
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
@@ -71,7 +71,7 @@ def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
     if isinstance(given, Overrides):
         return given
     where = "what differs from the scenario"
-    return checked(Overrides, dict(given or {}), where, MissionInputError, what="`Overrides`")
+    return validate(Overrides, dict(given or {}), where, MissionInputError, what="`Overrides`")
 
 
 def resolve_scenario(loaded: LoadedScenario, given: Overrides | Mapping[str, Any] | None = None) -> Scenario:
@@ -241,7 +241,7 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
         The file is none, or is of other controls or another parameter.
     """
     content = read_toml(path, MissionInputError, what="file of what was learnt")
-    found = checked(LearntFile, content, str(path), MissionInputError, what="a file of what was learnt")
+    found = validate(LearntFile, content, str(path), MissionInputError, what="a file of what was learnt")
     learnt = found.group.get(
         group or "", found.model_dump(include={"transition", "observation", "calibration"})
     )

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from reporting.files import (
     atomic_write_text,
+    explained_write_errors,
     hash_record,
-    members_of,
+    read_members,
     write_members,
-    written,
 )
-from reporting.folders import held
+from reporting.folders import closing_lock
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
@@ -176,7 +176,7 @@ def held_fleet(
         raise RunFolderError(said("fleet.another", folder=folder, otherwise=otherwise))
     run_folder.check_versions(folder, found, record["seed"])
     ready()
-    with held(run_folder.lock_run_folder(folder)):
+    with closing_lock(run_folder.lock_run_folder(folder)):
         yield config
 
 
@@ -279,7 +279,7 @@ def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
     if not (folder / KNOWLEDGE_NAME).is_file():
         keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
     wing = getattr(source, "wing", None) if flies_model(scenario) and not real else None
-    packed = scenario.portable().to_dict(), members_of(folder), wing
+    packed = scenario.portable().to_dict(), read_members(folder), wing
     return pickle.dumps(packed, pickle.HIGHEST_PROTOCOL)
 
 
@@ -320,7 +320,7 @@ def _fly(
 
     def keep(number: int, members: Sequence[Member], result: ShardResult) -> None:
         group, first, end = fleet.groups[number], members[0].row, members[-1].row + 1
-        with written(folder / STORE_NAME):
+        with explained_write_errors(folder / STORE_NAME):
             for name, values in result[0].items():
                 arrays(group.name)[name][first:end] = values
         told = {

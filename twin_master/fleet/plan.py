@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from reporting.files import hash_file
-from reporting.toml_file import Fault, NotNegative, Number, checked, read_toml
+from reporting.toml_file import Fault, NotNegative, Number, read_toml, validate
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError, said
 from twin_master.mission.journal import JOURNAL_NAME
@@ -197,7 +197,7 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
         in one list.
     """
     path = Path(path)
-    found = checked(
+    found = validate(
         FleetFile, read_toml(path, FleetError, what="fleet"), str(path), FleetError, what="a fleet"
     )
     head = found.fleet if seed is None else found.fleet.model_copy(update={"seed": seed})

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from reporting.files import written
+from reporting.files import explained_write_errors
 from twin_master.errors import FleetError, said
 from twin_master.fleet.plan import Fleet, Group, Member
 from twin_master.mission.preparation import Knowledge
@@ -186,7 +186,7 @@ def create_store(folder: Path, fleet: Fleet) -> None:
     """Make the arrays of a fleet, in which nothing has flown."""
     import zarr
 
-    with written(folder / STORE_NAME):
+    with explained_write_errors(folder / STORE_NAME):
         root = zarr.open_group(folder / STORE_NAME, mode="a", zarr_format=3)
         for group in fleet.groups:
             _create_group(root.require_group(group.name), group, fleet)

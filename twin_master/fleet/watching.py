@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from reporting.errors import DiskFullError
-from reporting.files import atomic_write_text, written
+from reporting.files import atomic_write_text, explained_write_errors
 from reporting.json_file import read_json
 from reporting.progress import SilentProgress
 from twin_master.errors import FleetError, said
@@ -283,7 +283,7 @@ class FleetWatch:
         like = self._like.get(group.name)
         opened = resumed_watch(folder, None, SilentProgress(), like)
         if not (folder / CONFIG_NAME).is_file():
-            with written(folder):
+            with explained_write_errors(folder):
                 folder.parent.mkdir(exist_ok=True)
             opened = begun_watch(group.scenarios[0], group.file, folder, SilentProgress(), like=like)
         with ExitStack() as closing:

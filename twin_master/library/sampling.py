@@ -21,8 +21,8 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
 from reporting.arrays import Float
-from reporting.files import atomic_write_bytes, atomic_write_text, hash_file, written
-from reporting.folders import held, lock_folder
+from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors, hash_file
+from reporting.folders import closing_lock, lock_folder
 from reporting.json_file import parse_json
 from reporting.progress import Stage, stage
 from twin_master.assets.library_source import (
@@ -119,7 +119,7 @@ def sample_library(
     lock = lock_folder(folder)
     if lock is None:
         raise MissionInputError(said("library.locked", folder=folder))
-    with held(lock):
+    with closing_lock(lock):
         rows = _kept_rows(folder, (grid.size, sensors))
         todo = [(first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()]
         kept, begin = len(grid.blocks) - len(todo), time.perf_counter()
@@ -232,7 +232,7 @@ def _kept_rows(folder: Path, shape: tuple[int, int]) -> Float:
         content = io.BytesIO()
         np.save(content, np.full(shape, np.nan))
         atomic_write_bytes(path, content.getvalue())
-    with written(path):
+    with explained_write_errors(path):
         rows: Float = np.load(path, mmap_mode="r+")
     return rows
 

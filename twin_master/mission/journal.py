@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.files import synchronise, write_error, written
+from reporting.files import explained_write_errors, synchronise, write_error
 from reporting.json_file import plain
 from twin_master.errors import NotResumableError, said
 from twin_master.mission.turns import Happened, Reading, Turn
@@ -108,7 +108,7 @@ class JournalFile:
     def __init__(self, folder: Path, config_hash: str, flush_seconds: float = 0.0) -> None:
         self.path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
         self._flushed = time.monotonic()
-        with written(self.path):
+        with explained_write_errors(self.path):
             check_header(self.path, config_hash)
             self.size = next((end for _, _, end in records_backwards(self.path)), 0)
             self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)

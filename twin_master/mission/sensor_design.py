@@ -23,7 +23,7 @@ from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from reporting.arrays import Float, Index
 from reporting.files import write_members
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import read_toml, validate
 from twin_master.assets.asset_source import read_files
 from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
 from twin_master.errors import MissionInputError, said
@@ -270,7 +270,7 @@ def _gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
         spread = spread_rosettes(mesh, int(candidates))
         return tuple(gauge for one in spread for gauge in one.gauges())
     content = read_toml(candidates, InvalidDesignError)
-    found = checked(Gauged, content, candidates, InvalidDesignError, what="a file of gauges").gauge
+    found = validate(Gauged, content, candidates, InvalidDesignError, what="a file of gauges").gauge
     if not found:
         raise InvalidDesignError(f"{candidates}: a table [[gauge]] or [[rosette]] is expected.")
     return found

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import rel_entr
 
 from reporting.arrays import Float, Index
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError, said
 from twin_master.network.kernels import LOG_ROOT_TWO_PI, log_densities, separated
@@ -106,7 +106,7 @@ class GaussianSensorModel(QuantityModel):
         model_error: ArrayLike = 0.0,
         interval: ArrayLike | None = None,
     ) -> None:
-        one_of(average, get_args(Averaging), "average")
+        require_one_of(average, get_args(Averaging), "average")
         super().__init__(strain_per_draw, draw_weight)
         for what, given, positive in (
             ("positive noise standard deviation", standard_deviation, True),

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
-from reporting.memory import memory_left
+from reporting.memory import available_memory
 from twin_master.errors import InvalidModelError, TwinMasterError, said
 from twin_master.network.kernels import Lists
 
@@ -121,7 +121,7 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     InvalidModelError
         They do not; the sentence has all sizes.
     """
-    needed, there = sum(parts.values()), memory_left()
+    needed, there = sum(parts.values()), available_memory()
     if needed > there:
         listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
         sizes = [f"{size / 1e9:.3g} GB" for size in (needed, there)]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
 from reporting.arrays import Float
-from reporting.choices import one_of
+from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError, said
 from twin_master.network import graphical_model
@@ -180,7 +180,7 @@ class Twin:
         safest: int | str | None = None,
         on_belief: BeliefPolicy | None = None,
     ) -> None:
-        one_of(decide_on, get_args(DecisionBasis), "decide_on")
+        require_one_of(decide_on, get_args(DecisionBasis), "decide_on")
         if lag is not None and lag < 0:
             raise InvalidModelError(f"expected a lag of 0 or more turns, or None for all, got {lag}")
         self.name = name

@@ -274,7 +274,7 @@ def _joint_figure(run: Run) -> Figure:
     figure, grid = style.panels(
         rows, columns, 0.95 + 1.62 * rows, 0.52, 0.43, left=0.075, right=right, wspace=0.12, hspace=0.30
     )
-    for axes, turn in zip(style.first_of(grid, len(turns)), turns, strict=True):
+    for axes, turn in zip(style.keep_first_panels(grid, len(turns)), turns, strict=True):
         image = _map(axes, run, run["filtered/probability"][turn], **_PROBABILITY)
         axes.set_title(f"{run.step} {run.first_step + turn}", fontweight="normal", pad=3.0)
         x, y = run.scales * run["filtered/mean"][turn]

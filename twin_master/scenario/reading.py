@@ -7,7 +7,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from reporting.toml_file import checked, read_toml
+from reporting.toml_file import read_toml, validate
 from reporting.words import brief
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, said
@@ -142,4 +142,4 @@ def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
     """
     if table.get("format") == 1 and table["format"] is not True and "belief" not in table:
         table = from_format_1(table)
-    return checked(Scenario, table, source, ScenarioError, what="a scenario")
+    return validate(Scenario, table, source, ScenarioError, what="a scenario")

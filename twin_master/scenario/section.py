@@ -19,7 +19,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandle
 
 from reporting import toml_file
 from reporting.arrays import Float, Index
-from reporting.toml_file import Fault, NotNegative, Positive, missing_keys, shown
+from reporting.toml_file import Fault, NotNegative, Positive, missing_keys, short_repr
 from scenarios import asset_scripts, binding_files, recording_files, structure_files
 from twin_master.errors import said
 
@@ -34,7 +34,7 @@ LARGEST_SEED = 2**63 - 1
 def _at_most(limit: int, why: str) -> AfterValidator:
     def check(value: int) -> int:
         if value > limit:
-            raise ValueError(f"a number of at most {limit} is expected, {why}, and {shown(value)} came")
+            raise ValueError(f"a number of at most {limit} is expected, {why}, and {short_repr(value)} came")
         return value
 
     return AfterValidator(check)
@@ -95,7 +95,7 @@ class Section(toml_file.Section):
             for item in value if isinstance(value, list | tuple) else [value]:
                 number = isinstance(item, int | float) and not isinstance(item, bool)
                 if unit == "percent" and number and not -100 <= item <= 100:
-                    raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
+                    raise ValueError(f"`{key}` is in percent, at most 100, and {short_repr(item)} came")
             converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
         required = [name for name, field in cls.model_fields.items() if field.is_required()]
         missing = [known[name] for name in required if name not in converted]
@@ -402,7 +402,7 @@ class KindSection(FileSection):
             expected = f"`kind` must be one of {short(sorted(kinds))}"
             if "kind" not in table:
                 raise missing_keys(["kind"], f"{expected}, and it is missing")
-            raise ValueError(f"{expected}, and {shown(kind)} came")
+            raise ValueError(f"{expected}, and {short_repr(kind)} came")
         return kinds[kind].model_validate(table)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.files import atomic_write_text, written
+from reporting.files import atomic_write_text, explained_write_errors
 from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError, said
 from twin_master.mission.journal import state_text, turn_record
@@ -351,7 +351,7 @@ class Intake:
             return
         self._kept += 1
         record = {"message": self.counts.received, "reason": reason, "text": self._text[:_TEXT_KEPT]}
-        with written(self._rejected), self._rejected.open("a", encoding="utf-8") as file:
+        with explained_write_errors(self._rejected), self._rejected.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, ensure_ascii=True) + "\n")
 
     def _turn_of(self, twin: Twin, message: Message) -> int:

@@ -16,7 +16,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from reporting.files import atomic_write_text, written
+from reporting.files import atomic_write_text, explained_write_errors
 from twin_master.errors import MissionInputError, said
 from twin_master.mission.journal import JOURNAL_NAME, last_turn, records
 from twin_master.scenario.schema import Scenario
@@ -352,7 +352,7 @@ class Topic(Feed):
             self.not_before = time.monotonic() + _RETRY_SECONDS[1]
             self.go_back()
         if self._waiting.pop(mid, None) is not None:
-            with self._alone(), written(self._path), self._path.open("r+b") as file:
+            with self._alone(), explained_write_errors(self._path), self._path.open("r+b") as file:
                 self._done = next(iter(self._waiting.values()), self._at)
                 file.write(b"%020d\n" % self._done)  # in place: whole, or as it was
 

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
+from calibration.dynamics.extremes import refine_by_extremes
 from calibration.dynamics.modal_identification import identify_modes
 from calibration.dynamics.records import RingDownRecord, read_records
-from calibration.dynamics.trials import average, fit_ring_down, fit_trials, prepare, refine_by_extremes
+from calibration.dynamics.trials import average, fit_ring_down, fit_trials, prepare
 from calibration.errors import ExperimentDataError
 from tests.calibration.decays import free_decay
 

@@ -10,7 +10,8 @@ from scipy import stats
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import amplitude_dependence, fit_trials
 from calibration.errors import ExperimentDataError, OutsideValidityError
-from calibration.joint.posterior import PUBLISHED_MODES, joint_posterior, measured_modes, modal_readings
+from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes, modal_readings
+from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, weighed, wing_priors
 from calibration.result.record import STATE
 from calibration.static.experiments import published_measurements

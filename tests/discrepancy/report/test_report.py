@@ -171,7 +171,9 @@ def test_what_can_be_decided(drag, able):
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
     told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
-    said = list(WORDS.told(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told))
+    said = list(
+        WORDS.rendered_blocks(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told)
+    )
     assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
     confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
     assert len(confused) == sum(bool(neighbours(able, name)) for name in able.identifiers)

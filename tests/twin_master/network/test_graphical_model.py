@@ -99,7 +99,7 @@ def test_a_model_from_tables(monkeypatch, most):
 
 def test_too_many_states_or_draws_are_refused_before_anything_is_built(monkeypatch):
     """Of 5^6 = 15,625 states, on a machine of 8 GB."""
-    monkeypatch.setattr(transition_file, "memory_left", lambda: 8e9)
+    monkeypatch.setattr(transition_file, "available_memory", lambda: 8e9)
     table = table_of("level_turns")
     table["state"] = [table["state"][0] | {"name": f"z{number}"} for number in range(1, 7)]
     table["mission"]["steps"] = 60
