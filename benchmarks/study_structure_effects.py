@@ -152,7 +152,9 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             moved = motion_of(system, excitation, laws)
             values = moved.response([OutputEquation.of_row(row) for row in rows]).values
         else:
-            values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws)[0] @ rows.T
+            values = (
+                system.static_path(np.outer(hidden.force * force + hidden.tare, end), laws).values @ rows.T
+            )
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):
             values[:, column] = hidden.readings(name, time, values[:, column])
             values[:, column] += NOISE[quantity] * random.standard_normal(len(time))

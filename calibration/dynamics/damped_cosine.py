@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from reporting.arrays import Float
 from scipy.optimize import least_squares
+
+from reporting.arrays import Float
 
 ComplexArray = NDArray[np.complex128]
 

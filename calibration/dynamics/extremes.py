@@ -11,10 +11,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from reporting.arrays import Float
 from scipy.optimize import least_squares
 
 from calibration.errors import ExperimentDataError
+from reporting.arrays import Float
 
 from .damped_cosine import ComplexArray, RingDownMode
 from .trials import Fits, RingDownFit, refuse_growing

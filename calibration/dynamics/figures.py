@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
 from reporting import figures as style
 
 from .damped_cosine import RingDownMode

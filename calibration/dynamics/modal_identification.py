@@ -14,10 +14,10 @@ from typing import Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from reporting.arrays import Float
-from reporting.choices import require_one_of
 
 from calibration.errors import ExperimentDataError
+from reporting.arrays import Float
+from reporting.choices import require_one_of
 
 from .damped_cosine import ComplexArray, DampedCosineFit, DampedCosines, modal_gradients
 from .subspace import IdentifiedPoles, Subspace

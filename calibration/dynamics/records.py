@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.lab_folder import LAB_ERRORS, places_of
 from reporting.arrays import Float
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
 from reporting.words import comma_list, counted
-
-from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.lab_folder import LAB_ERRORS, places_of
 
 STEP_FOLDER = Path("step3")
 """Folder of step 3 in the authors' calibration folder."""

@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from reporting.arrays import Float
 from scipy.special import chdtri
+
+from reporting.arrays import Float
 
 from .damped_cosine import ComplexArray
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from reporting.arrays import Float
 from scipy.signal import decimate, detrend, find_peaks
 
 from calibration.errors import ExperimentDataError
+from reporting.arrays import Float
 
 from .damped_cosine import DampedCosines, RingDownMode
 from .records import MINIMUM_COUNT, RingDownRecord

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from reporting.arrays import Float
 from scipy.special import chdtri
 
 from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode
@@ -18,6 +17,7 @@ from calibration.dynamics.trials import (
 )
 from calibration.errors import ExperimentDataError
 from calibration.result.record import Reading
+from reporting.arrays import Float
 
 MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
 """Names of the readings that a ring-down gives."""

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from reporting.arrays import Float
 from scipy.optimize import least_squares
 from scipy.special import softmax
 from scipy.stats import multivariate_t
@@ -29,6 +28,7 @@ from calibration.result.record import ParameterPrior, Reading
 from calibration.static.errors_in_variables import exact_posterior, residual_variance
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior, Seed, child_seed
+from reporting.arrays import Float
 
 
 class Comparison(NamedTuple):

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from fe.runtime.modal_system import rayleigh_damping_ratio
-from fe.runtime.reduced import ReducedModel
 from numpy.polynomial.chebyshev import chebval3d, chebvander3d
 from numpy.typing import ArrayLike
-from reporting.arrays import Float
 
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
 from calibration.static.posterior import PRIOR_DEVIATION, StiffnessCurve, stiffness_curve_of
+from fe.runtime.modal_system import rayleigh_damping_ratio
+from fe.runtime.reduced import ReducedModel
+from reporting.arrays import Float
 
 TOTAL_MASS = 0.472
 """Weighed mass of two servos and the pitot tube [kg] (Kapteyn et al. 2021, eqs. (19) and (20))."""

@@ -37,10 +37,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from reporting.arrays import Float
 from scipy.special import erf
 
 from calibration.errors import OutsideValidityError
+from reporting.arrays import Float
 
 from .experiments import LoadDisplacementData
 from .posterior import PUBLISHED_LINE, GaussianPrior, ScalarPosterior, StiffnessCurve

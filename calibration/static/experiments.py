@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from reporting.arrays import Float
-from reporting.files import hash_record
 
 from calibration.errors import ExperimentDataError
 from calibration.lab_folder import lab_table
+from reporting.arrays import Float
+from reporting.files import hash_record
 
 STANDARD_GRAVITY = 9.81
 """Gravity by which the authors convert a mass on the scale to a load [m/s^2]."""

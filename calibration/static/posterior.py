@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike
-from reporting.arrays import Float
 from scipy.special import ndtri
 
 from calibration.errors import PosteriorError
+from reporting.arrays import Float
 
 Seed = int | np.random.SeedSequence
 """A seed: a whole number, or a SeedSequence for one purpose."""

@@ -270,7 +270,7 @@ class FmuSimulator(FmuAtRest):
 
     def _settled_with_laws(self, run: Run, laws: Laws, trial: str) -> "SettledRun":
         """Return a run that has settled with laws under its first loads."""
-        outputs = self.begun(run)[1][None]
+        outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
         if not run.courses or not np.any(outputs[:, columns]):
             return SettledRun(run, None)
@@ -281,10 +281,15 @@ class FmuSimulator(FmuAtRest):
             return run._replace(begin={name: float(values[0]) for name, values in begin.items()})
 
         def outputs_under(forces: FloatArray) -> FloatArray:
-            return self.begun(run_under(forces))[1][None]
+            return self._outputs_at_begin(run_under(forces))
 
         _, solution = self.rest_with_laws(laws, outputs_under, outputs, run.state, trial)
         return SettledRun(run_under(solution.forces), solution.memory)
+
+    def _outputs_at_begin(self, run: Run) -> FloatArray:
+        """Return the outputs (1, C) at the begin of a run."""
+        _, outputs, _ = self.begun(run)
+        return outputs[None]
 
     def _outputs_with_laws(self, run: Run, laws: Laws, trial: str) -> FloatArray:
         """Return the outputs (K, C) of a run with laws; NaN if the coupling is unstable."""

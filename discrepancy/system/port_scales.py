@@ -59,6 +59,11 @@ def moving_scales(
     return GlobalScales(stiffness, mass, frequency)
 
 
+def larger(largest: float, values: FloatArray) -> float:
+    """Return the larger of a number and the largest absolute value of an array."""
+    return float(np.maximum(largest, np.max(np.abs(values), initial=0.0)))
+
+
 def largest_measured_force(campaign: Campaign, trial: Trial) -> float:
     """Return the largest force or moment that a channel measured in a trial [N or N m]."""
     is_force = [

@@ -1,62 +1,85 @@
-"""A structure as a model by its modes: any from a mesh or matrices, and the wing with its patches."""
+"""A structure as a model: any from a mesh or matrices, and the wing with its patches."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-
 from calibration.errors import CalibrationError
 from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
-from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
-from discrepancy.errors import ModelError, said
-from discrepancy.system.excitation import Excitation, Load
-from discrepancy.system.interface import NO_PATCH
-from discrepancy.system.linear_system import LinearSystem
-from discrepancy.system.load_change import choose_load_place
-from discrepancy.system.output_equation import OutputEquation
-from discrepancy.system.response import MOVES, TURNS, Outputs, Place
-from discrepancy.system.scales import ForceShare, PortScale
-from discrepancy.system.system_model import SystemModel
-from discrepancy.system.system_state import PatchedTrial
-from discrepancy.system.system_state import SystemState as State
-from discrepancy.system.time_history import RecordedHistory
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import PLANFORM, STATION_PORTS
 from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, Primitive
-from fe.runtime.patched_wing import PatchedState, PatchedWing
-from fe.runtime.reduced import ReducedModel, ReducedState
+from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import wing_names
 from fe.runtime.wing_rows import LOAD_PLACE, PORTS, PatchArrays, strain_gauge
 from fe.structure.affine import PORT_PREFIX
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
+from scipy.linalg import cho_factor, cho_solve
+
+from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.system.excitation import Excitation, Load
+from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.linear_system import LinearSystem, SolvedStructure
+from discrepancy.system.load_change import choose_load_place
+from discrepancy.system.output_equation import OutputEquation
+from discrepancy.system.response import MOVES, TURNS, Outputs, Place
+from discrepancy.system.scales import ForceShare, PortScale
+from discrepancy.system.system_model import SystemModel
+from discrepancy.system.system_state import PatchedTrial, SystemState
+from discrepancy.system.time_history import RecordedHistory
 
 LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""
 DEVIATION = 0.25
 """Standard deviation of a parameter whose calibration is not known, as a share of its range."""
-SAME = 1e-9
+ROUNDING = 1e-9
 """Difference of two rows, relative to the largest entry, that is rounding."""
 ROTATING_PORT = "root"
+"""Port of the wing at which a force is a moment and a motion an angle."""
 Prior = Mapping[str, tuple[float, float]]
 """Means and standard deviations of calibrated parameters, by the names of `STATE`."""
-Design = WingDesign | None
+
+
+class StructureInMotion(SolvedStructure, Protocol):
+    """What the workflow asks of a reduced or a patched structure at one state.
+
+    All matrices and rows are in n coordinates of the structure's own.
+    """
+
+    @property
+    def mass(self) -> FloatArray:
+        """Mass matrix (n, n)."""
+
+    @property
+    def stiffness(self) -> FloatArray:
+        """Stiffness matrix (n, n)."""
+
+    @property
+    def mode_count(self) -> int:
+        """Number of modes with inertia."""
+
+    @property
+    def on_modes(self) -> frozenset[str]:
+        """Ports whose position is that of these modes alone."""
 
 
 class StructureModel(SystemModel):
     """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
 
-    A control in N is a force, and where a load of it acts along a displacement output, in either direction,
-    there is a port, which has the name and the sign of that output. Ports of the file come behind these.
-    Other controls are nominal but for the load factor, which is zero where none is recorded; constant loads
-    always act.
+    A control in N is a force, and where a load of it acts along a displacement output, in either
+    direction, there is a port, which has the name and the sign of that output. Ports of the file
+    come behind these. Other controls are nominal but for the load factor, which is zero where none
+    is recorded; constant loads always act.
 
     Parameters
     ----------
@@ -70,22 +93,26 @@ class StructureModel(SystemModel):
     """
 
     def __init__(self, model: ReducedModel) -> None:
-        nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
-        self.model, self.name, self.regions = model, model.name, model.regions
-        self.parameters = tuple(
-            ParameterPrior(name, unit, nominal[name], DEVIATION * (high - low), low, high)
-            for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
-            for name in names
-            for low, high in [model.validity[name]]
-        )
+        self.model = model
+        self.name = model.name
+        self.regions = model.regions
+        self.parameters = _parameter_priors(model)
+        # loads
         units = zip(model.controls, model.control_units, strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N" and not _is_at_port(name))
         if not self.forces and LOAD_FACTOR not in model.controls:
-            raise ModelError(said("models.no_load", model=model))
+            raise ModelError(
+                f"The structure {model.name} has no control in N and no load_factor, and a "
+                'campaign needs a load that is recorded: give a [[control]] with unit = "N" and a '
+                "[[load]] of 1 N tied to it, or a [[control]] load_factor."
+            )
         if LOAD_FACTOR not in model.controls:
             self.kinds -= {TrialKind.FLIGHT}
-        self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
-        self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
+        self.reference = self.forces[0] if self.forces else LOAD_FACTOR
+        self.load_places = self.forces
+        limits = [model.validity[name][1] for name in self.forces]
+        self.largest_force = 0.5 * min(limits, default=np.inf)
+        # outputs
         _, outputs, accelerations = model.rows
         names = (*model.gauges, *model.displacements, *model.accelerations)
         self._rows = dict(zip(names, (*outputs, *accelerations), strict=True))
@@ -95,6 +122,7 @@ class StructureModel(SystemModel):
             **dict.fromkeys(displacements, Quantity.DISPLACEMENT),
             **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
         }
+        # ports
         self.port_rows = self._ports_of_loads(displacements)
         for port, row in self._ports_of_file().items():
             self._check_moves_otherwise(port, row)
@@ -103,14 +131,14 @@ class StructureModel(SystemModel):
 
     def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
         """Return the rows of the displacements along which a force acts, by name."""
-        mean = State(tuple(self.prior_mean().tolist()))
-        pushes = [self._load(mean, force) for force in self.forces]
-        return {
-            name: self._rows[name]
-            for push in pushes
-            for name in displacements
-            if _acts_along(push, self._rows[name])
-        }
+        mean = SystemState(tuple(self.prior_mean().tolist()))
+        pushes = [self._unit_load(mean, force) for force in self.forces]
+        rows: dict[str, FloatArray] = {}
+        for push in pushes:
+            for name in displacements:
+                if _acts_along(push, self._rows[name]):
+                    rows[name] = self._rows[name]
+        return rows
 
     def _ports_of_file(self) -> dict[str, FloatArray]:
         """Return the rows of the ports that the structure file declares, by name."""
@@ -125,38 +153,51 @@ class StructureModel(SystemModel):
         for other, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
-                    f"The port {port!r} of the structure {self.name} moves as its port {other!r} does, so "
-                    "that no reading tells their forces apart: take this [[port]] out of the file."
+                    f"The port {port!r} of the structure {self.name} moves as its port {other!r} "
+                    "does, so that no reading tells their forces apart: take this [[port]] out of "
+                    "the file."
                 )
 
-    def _at(self, state: State, controls: Mapping[str, float]) -> FloatArray:
-        """Return the values that the structure is made at; controls that are left out are nominal."""
+    def _values(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
+        """Return the vector of all that can be chosen; controls that are left out are nominal."""
         names = (*self.model.parameters, *self.model.masses)
-        return self.model.vector(
-            {**dict(zip(names, state.parameters, strict=True)), **controls}, state.losses
-        )
+        parameters = dict(zip(names, state.parameters, strict=True))
+        return self.model.vector({**parameters, **controls}, state.losses)
 
-    def _pull(self, state: State, controls: Mapping[str, float]) -> FloatArray:
+    def _load_under(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the load (n,) under controls."""
-        return np.asarray(self.model.rows[0] @ self.model.load_coefficients(self._at(state, controls)))
+        coefficients = self.model.load_coefficients(self._values(state, controls))
+        return np.asarray(self.model.rows[0] @ coefficients)
 
-    def _load(self, state: State, control: str) -> FloatArray:
-        """Return what one of a control adds to the load (n,)."""
-        none = dict.fromkeys(self.model.controls, 0.0)
-        return self._pull(state, none | {control: 1.0}) - self._pull(state, none)
+    def _unit_load(self, state: SystemState, control: str) -> FloatArray:
+        """Return what a value of one of a control adds to the load (n,)."""
+        no_controls = dict.fromkeys(self.model.controls, 0.0)
+        unit_control = no_controls | {control: 1.0}
+        return self._load_under(state, unit_control) - self._load_under(state, no_controls)
 
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return what outputs show."""
-        return [OutputEquation.of_row(self._rows[output], quantity.order) for output, quantity in outputs]
+        """Return what outputs show: rows of the reduced model."""
+        return [
+            OutputEquation.of_row(self._rows[output], quantity.order)
+            for output, quantity in outputs
+        ]
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
-        forces = primitive is changes.LoadGain and bool(self.forces)
-        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.ports))
+        """Return whether the structure can carry a primitive.
 
-    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
+        It carries sensors, laws at its ports, and errors of its forces.
+        """
+        if primitive in INTERNAL_FORCES:
+            return bool(self.ports)
+        if primitive is changes.LoadGain:
+            return bool(self.forces)
+        return primitive in SENSORS
+
+    def force_row(
+        self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
+    ) -> FloatArray:
         """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
 
         Raises
@@ -164,22 +205,24 @@ class StructureModel(SystemModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        return self._load(state, choose_load_place(self.forces or (LOAD_FACTOR,), place, self.what))
+        places = self.forces or (LOAD_FACTOR,)
+        return self._unit_load(state, choose_load_place(places, place, self.what))
 
-    def lift_loads(self, state: State, change: ModelPatch) -> FloatArray:
+    def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
         """Return the load (1, n) of the load factor."""
-        return self._load(state, LOAD_FACTOR)[None]
+        return self._unit_load(state, LOAD_FACTOR)[None]
 
     def excitation(self, case: PatchedTrial) -> Excitation:
         """Return what acts in a trial, with constant loads and controls that no trial records."""
-        recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
-        excitation, always = super().excitation(case), self._pull(case.state, recorded)
-        if not always.any():
+        excitation = super().excitation(case)
+        recorded = [name for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls]
+        constant_load = self._load_under(case.state, dict.fromkeys(recorded, 0.0))
+        if not constant_load.any():
             return excitation
-        steady = Load(always, RecordedHistory(excitation.time, np.ones(len(excitation.time))))
-        return replace(excitation, loads=(*excitation.loads, steady))
+        always = RecordedHistory(excitation.time, np.ones(len(excitation.time)))
+        return replace(excitation, loads=(*excitation.loads, Load(constant_load, always)))
 
-    def build_system(self, state: State) -> LinearSystem:
+    def build_system(self, state: SystemState) -> LinearSystem:
         """Return the structure in a state, in the coordinates of `ReducedModel.at`.
 
         Raises
@@ -187,7 +230,20 @@ class StructureModel(SystemModel):
         OutsideModelError
             If a value lies outside the validity box of the reduced model.
         """
-        return _system(self.model.at(self._at(state, {})), self.model.damping, self.port_rows)
+        structure = self.model.at(self._values(state, {}))
+        return _linear_system(structure, self.model.damping, self.port_rows)
+
+
+def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
+    """Return the priors of a structure's parameters and free masses: nominal, with `DEVIATION`."""
+    nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
+    units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")
+    priors = []
+    for name, unit in units.items():
+        low, high = model.validity[name]
+        deviation = DEVIATION * (high - low)
+        priors.append(ParameterPrior(name, unit, nominal[name], deviation, low, high))
+    return tuple(priors)
 
 
 def _is_at_port(name: str) -> bool:
@@ -199,21 +255,40 @@ def _acts_along(push: FloatArray, row: FloatArray) -> bool:
     """Return whether a load (n,) acts along the row (n,) of a displacement, or against it."""
     largest = float(np.abs(push).max())
     amount = float(push @ row) / (float(row @ row) or 1.0)
-    return largest > 0.0 and float(np.abs(push - amount * row).max()) <= SAME * largest
+    return largest > 0.0 and float(np.abs(push - amount * row).max()) <= ROUNDING * largest
 
 
-def _system(
-    structure: ReducedState | PatchedState, rayleigh: Iterable[float], ports: Mapping[str, FloatArray]
+def _linear_system(
+    structure: StructureInMotion,
+    rayleigh: Iterable[float],
+    ports: Mapping[str, FloatArray],
 ) -> LinearSystem:
-    """Return a structure with Rayleigh damping [1/s], [s] and rows of its ports."""
+    """Return a structure as a linear system.
+
+    Parameters
+    ----------
+    structure : StructureInMotion
+        The structure at one state.
+    rayleigh : iterable of float
+        Rayleigh damping: alpha [1/s] and beta [s].
+    ports : mapping of str to (n,) array
+        Rows of its ports.
+    """
     alpha, beta = rayleigh
     return LinearSystem(
-        structure.mass, alpha * structure.mass + beta * structure.stiffness, structure.stiffness, ports,
-        structure.mode_count, beta, structure.on_modes, solved=structure,
-    )  # fmt: skip
+        structure.mass,
+        alpha * structure.mass + beta * structure.stiffness,
+        structure.stiffness,
+        ports,
+        mode_count=structure.mode_count,
+        relaxation=beta,
+        on_modes=structure.on_modes,
+        solved=structure,
+    )
 
 
-def _by_cholesky(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
+def _solver_of(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the function that solves K x = b by a Cholesky factor of K."""
     return partial(cho_solve, cho_factor(stiffness, check_finite=False), check_finite=False)
 
 
@@ -234,31 +309,43 @@ class WingModel(SystemModel):
 
     Notes
     -----
-    Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k], strain[k].transverse and
-    strain[k].shear across it, tip_displacement, load_point_displacement and displacement[y, x].
+    Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k],
+    strain[k].transverse and strain[k].shear across it, tip_displacement, load_point_displacement
+    and displacement[y, x].
     """
 
     reference = LOAD_PLACE
 
     def __init__(
-        self, arrays: PatchArrays, name: str = "wing", prior: Prior = SHIPPED_PRIOR, design: Design = None
+        self,
+        arrays: PatchArrays,
+        name: str = "wing",
+        prior: Prior = SHIPPED_PRIOR,
+        design: WingDesign | None = None,
     ) -> None:
+        self.name = name
         self.design = design
-        self.wing = wing = PatchedWing(arrays)
-        wing.factorised = _by_cholesky
-        box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
-        self.name, self.parameters = name, wing_priors(box, **prior)
-        self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
-        self.stations = 0.0, wing.span
+        self.wing = PatchedWing(arrays)
+        self.wing.factorised = _solver_of
+        names = wing_names(arrays.regions)
+        validity = dict(zip(names, arrays.validity_box.tolist(), strict=True))
+        self.parameters = wing_priors(validity, **prior)
+        self.regions = arrays.regions
+        self.length = self.wing.span
+        self.stations = (0.0, self.wing.span)
+        self.port_rows = self.wing.port_rows
         self.ports = tuple(PORTS)
 
     @cached_property
-    def _row(self) -> Callable[[str], FloatArray | None]:
+    def _output_row(self) -> Callable[[str], FloatArray | None]:
+        """The function that returns the row (n,) of an output, with a cache."""
         return cache(self.wing.output_row)
 
     @classmethod
-    def of_design(cls, path: Path | str | None = None, progress: Progress | None = None) -> "WingModel":
-        """Return the wing of a design file, or the shipped one, calibrated as the documentation states.
+    def of_design(
+        cls, path: Path | str | None = None, progress: Progress | None = None
+    ) -> "WingModel":
+        """Return the wing of a design file, or the shipped wing, with the shipped calibration.
 
         Raises
         ------
@@ -280,68 +367,82 @@ class WingModel(SystemModel):
         """
         unusable = f"The calibration {path} cannot be used: "
         with ModelError.instead_of(FiniteElementError, CalibrationError, OSError, before=unusable):
-            result = load_calibration(path)
-            prior = {name: (result.mean(name), float(np.std(result.draws_of(name)))) for name in STATE}
-            design = result.wing_design
-            return cls(patch_arrays(design, progress), result.asset, prior, design)
+            calibration = load_calibration(path)
+            prior = {}
+            for name in STATE:
+                deviation = float(np.std(calibration.draws_of(name)))
+                prior[name] = (calibration.mean(name), deviation)
+            design = calibration.wing_design
+            return cls(patch_arrays(design, progress), calibration.asset, prior, design)
 
     # ------------------------------------------------------------ outputs, ports and loads
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if there is no such output."""
-        if self._row(output) is None:
+        if self._output_row(output) is None:
             return None
         return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
 
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return what outputs show."""
-        rows = np.array([self._row(output) for output, _ in outputs])
+        """Return what outputs show, with strain factors of the patch."""
+        rows = np.array([self._output_row(output) for output, _ in outputs])
         factors = self.wing.strain_factors(case.patch)
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
-            rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
-        return [OutputEquation.of_row(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
+            is_strain = gauges >= 0
+            rows = rows * np.where(is_strain, factors[gauges], 1.0)[:, None]
+        equations = []
+        for row, (_, quantity) in zip(rows, outputs, strict=True):
+            equations.append(OutputEquation.of_row(row, quantity.order))
+        return equations
 
     @property
     def shown_outputs(self) -> tuple[str, ...]:
-        """Its outputs, for a sentence."""
-        places = f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction"
-        gauges = f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]"
-        return gauges, "tip_displacement", "load_point_displacement", places
+        """The outputs as they are listed in a sentence."""
+        return (
+            f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]",
+            "tip_displacement",
+            "load_point_displacement",
+            f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction",
+        )
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
+        """Return whether the wing can carry a primitive: all but forces by a formula in time."""
         return primitive in PRIMITIVES.values() and primitive is not changes.PortLoad
 
     def port_units(self, port: str) -> tuple[str, str]:
-        """Return the units of force and motion at a port: the root turns, the others move up and down."""
+        """Return the units of force and motion at a port: the root turns, others move."""
         return TURNS if port == ROTATING_PORT else MOVES
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
         return self.wing.internal_forces(forces)
 
-    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
-        """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` if it is off the wing."""
+    def force_row(
+        self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
+    ) -> FloatArray:
+        """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` off the wing."""
         return self.wing.force_row(place, change)
 
-    def lift_loads(self, state: State, change: ModelPatch) -> FloatArray:
+    def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
         """Return the parts (2, n) of the lift."""
         return self.wing.load_parts(change)
 
-    def distributed_scales(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
-        """Return the scales of a force over the planform, from those of its mean and the first mode."""
-        share = self.wing.planform[1]
-        motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
-        ratio = motion / float(share @ motion)
-        by_place = tuple(map(ForceShare, share.tolist(), ratio.tolist()))
-        return {PLANFORM: replace(ports["span"], distribution=by_place)}
+    def distributed_scales(
+        self, ports: Mapping[str, PortScale], shape: FloatArray
+    ) -> dict[str, PortScale]:
+        """Return the scales of a force over the planform, given the shape of the first mode."""
+        weights = self.wing.planform[1]
+        motions = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
+        relative_motions = motions / float(weights @ motions)
+        distribution = tuple(map(ForceShare, weights.tolist(), relative_motions.tolist()))
+        return {PLANFORM: replace(ports["span"], distribution=distribution)}
 
-    def build_system(self, state: State) -> LinearSystem:
+    def build_system(self, state: SystemState) -> LinearSystem:
         """Return the wing in a state."""
-        factor, servo, pitot, alpha, beta = state.parameters
-        vector = np.array((factor, *state.losses, servo, pitot, 0.0, 0.0))
-        structure = self.wing.at(vector, state.structure, state.temperature_rise)
-        return _system(structure, (alpha, beta), self.port_rows)
+        stiffness_factor, servo_mass, pitot_mass, alpha, beta = state.parameters
+        values = np.array((stiffness_factor, *state.losses, servo_mass, pitot_mass, 0.0, 0.0))
+        structure = self.wing.at(values, state.structure, state.temperature_rise)
+        return _linear_system(structure, (alpha, beta), self.port_rows)

@@ -24,6 +24,7 @@ from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.port_scales import (
     GlobalScales,
     PortScaleEstimator,
+    larger,
     largest_measured_force,
     moving_scales,
 )
@@ -101,20 +102,25 @@ class SystemModel(Model):
 
         Of a trial at rest, the values of the histories are those of the trial's rows.
         """
+        if case.trial.kind is TrialKind.FLIGHT:
+            return LoadsAndMotions(self._flight_loads(case), {})
         trial = case.trial
-        load_primitives = case.patch.of(*LOADS)
-        if trial.kind is TrialKind.FLIGHT:
-            # weight acts where a mass has it; other zeros are read with the mass in place
-            directions = self.lift_loads(case.state, case.patch.of(*LOADS, changes.PointMass))
-            values = [trial.load_factor**power for power in range(1, len(directions) + 1)]
-        else:
-            directions = self.force_row(trial.load_place, case.state, load_primitives)[None]
-            values = [LoadChange.of_patch(load_primitives).apply_to(trial.force, trial.force)]
-        loads = [
-            Load(direction, RecordedHistory(trial.time, history, trial.hold))
-            for direction, history in zip(directions, values, strict=True)
-        ]
-        return LoadsAndMotions(loads, {})
+        primitives = case.patch.of(*LOADS)
+        direction = self.force_row(trial.load_place, case.state, primitives)
+        force = LoadChange.of_patch(primitives).apply_to(trial.force, trial.force)
+        load = Load(direction, RecordedHistory(trial.time, force, trial.hold))
+        return LoadsAndMotions([load], {})
+
+    def _flight_loads(self, case: PatchedTrial) -> list[Load]:
+        """Return the loads of the load factor and its powers in a flight."""
+        trial = case.trial
+        # weight acts where a mass has it; other zeros are read with the mass in place
+        primitives = case.patch.of(*LOADS, changes.PointMass)
+        loads = []
+        for power, direction in enumerate(self.lift_loads(case.state, primitives), start=1):
+            history = RecordedHistory(trial.time, trial.load_factor**power, trial.hold)
+            loads.append(Load(direction, history))
+        return loads
 
     @abstractmethod
     def output_equations(
@@ -354,9 +360,9 @@ class SystemModel(Model):
                 measured = largest_measured_force(campaign, trial)
                 loads = estimator.add_motion(motion, measured, fitted=is_fitted)
                 shapes = motion.system.all_shapes[: motion.system.displacement_count].T
-                largest_displacement = _larger(largest_displacement, motion.q @ shapes)
-                largest_speed = _larger(largest_speed, motion.velocity @ shapes)
-                largest_load = _larger(largest_load, loads)
+                largest_displacement = larger(largest_displacement, motion.q @ shapes)
+                largest_speed = larger(largest_speed, motion.velocity @ shapes)
+                largest_load = larger(largest_load, loads)
             else:
                 only_driven = False
                 if is_held:
@@ -440,8 +446,3 @@ def _depends_on_temperature(patch: ModelPatch) -> bool:
 def _begins_at_rest(trial: Trial) -> bool:
     """Return whether only forces move the structure in a trial, from rest."""
     return trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED
-
-
-def _larger(largest: float, values: FloatArray) -> float:
-    """Return the larger of a number and the largest absolute value of an array."""
-    return float(np.maximum(largest, np.max(np.abs(values), initial=0.0)))
