@@ -6,9 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from fe.compilation import compiled_kernel
-from fe.runtime.motion import ALIKE, Laws, static_solution
-from fmu_asset.door.runs import Run, StateSpace
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
@@ -19,6 +16,9 @@ from discrepancy.fmu_models.port_coupling import PortCoupling
 from discrepancy.fmu_models.readout import Readout, SampledOutputs, sample
 from discrepancy.fmu_models.system_motion import LawPorts, system_motion
 from discrepancy.system.excitation import Excitation, Load
+from fe.compilation import compiled_kernel
+from fe.runtime.motion import ALIKE, Laws, static_solution
+from fmu_asset.door.runs import Run, StateSpace
 
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the motion."""

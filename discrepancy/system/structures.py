@@ -7,24 +7,12 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
 from calibration.errors import CalibrationError
 from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
-from fe.reduction.model_cache import patch_arrays
-from fe.runtime import patch as changes
-from fe.runtime.errors import FiniteElementError
-from fe.runtime.motion import PLANFORM, STATION_PORTS
-from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, Primitive
-from fe.runtime.patched_wing import PatchedWing
-from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import wing_names
-from fe.runtime.wing_rows import LOAD_PLACE, PORTS, PatchArrays, strain_gauge
-from fe.structure.affine import PORT_PREFIX
-from fe.wing.design import WingDesign, load_design
-from reporting.progress import Progress
-from scipy.linalg import cho_factor, cho_solve
-
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
@@ -37,6 +25,18 @@ from discrepancy.system.scales import ForceShare, PortScale
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
 from discrepancy.system.time_history import RecordedHistory
+from fe.reduction.model_cache import patch_arrays
+from fe.runtime import patch as changes
+from fe.runtime.errors import FiniteElementError
+from fe.runtime.motion import PLANFORM, STATION_PORTS
+from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, Primitive
+from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import wing_names
+from fe.runtime.wing_rows import LOAD_PLACE, PORTS, PatchArrays, strain_gauge
+from fe.structure.affine import PORT_PREFIX
+from fe.wing.design import WingDesign, load_design
+from reporting.progress import Progress
 
 LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""

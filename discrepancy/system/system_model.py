@@ -7,10 +7,6 @@ from functools import cached_property, lru_cache
 from itertools import groupby
 
 import numpy as np
-from fe.runtime import patch as changes
-from fe.runtime.errors import FiniteElementError
-from fe.runtime.motion import NO_LAWS, Laws, laws_of
-from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 
 from discrepancy.campaign.records import Campaign, FloatArray, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
@@ -39,6 +35,10 @@ from discrepancy.system.system_state import (
     SystemState,
 )
 from discrepancy.system.time_history import RecordedHistory, subdivide
+from fe.runtime import patch as changes
+from fe.runtime.errors import FiniteElementError
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 
 
 class SystemModel(Model):
