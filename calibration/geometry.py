@@ -5,11 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-
-from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.result.record import ParameterPrior, Reading
-from calibration.static.experiments import HALF_WIDTH_95
-from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
 from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
@@ -18,13 +13,18 @@ from reporting.files import hash_record
 from reporting.table_file import TextTable
 from reporting.words import comma_list
 
+from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.result.record import ParameterPrior, Reading
+from calibration.static.experiments import HALF_WIDTH_95
+from calibration.static.posterior import GaussianPrior
+
 from .lab_folder import lab_table
 
 TOLERANCE = 2.54e-3
-"""Design tolerance of a length, half-width of a 95 % interval [m] (Kapteyn et al. 2021, Table 1)."""
+"""Design tolerance of a length, half-width of a 95 % interval [m] (Kapteyn et al. 2021)."""
 
 READING_UNCERTAINTY = 0.2e-3
-"""Uncertainty of a measured length, half-width of a 95 % interval [m] (the authors' script of step 1)."""
+"""Uncertainty of a measured length, half-width of a 95 % interval [m] (the authors' script)."""
 
 GEOMETRY_FILE = Path("step1") / "geometry_data.csv"
 """The file of the lengths of step 1 in the authors' calibration folder."""
@@ -61,8 +61,8 @@ class MeasuredLength:
     def __post_init__(self) -> None:
         if abs(self.measured / self.designed - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
-                f"{self.name} measures {self.measured * 1e3:g} mm where {self.designed * 1e3:g} mm were "
-                "designed, more than 10 % apart: check the units (both in mm) and the wing."
+                f"{self.name} measures {self.measured * 1e3:g} mm where {self.designed * 1e3:g} mm "
+                "were designed, more than 10 % apart: check the units (both in mm) and the wing."
             )
 
     @property
@@ -133,14 +133,14 @@ def read_lengths(path: Path) -> Lengths:
     ----------
     path : Path
         The folder that holds `step1/geometry_data.csv` (also the folder above it in the authors'
-        repository), or the CSV file itself: columns `parameter`, `designed` and `manufactured` [mm], rows
-        `length`, `chord_{root}`, `chord_{tip}`.
+        repository), or the CSV file itself: columns `parameter`, `designed` and `manufactured`
+        [mm], rows `length`, `chord_{root}`, `chord_{tip}`.
 
     Raises
     ------
     ExperimentFileError
-        If the file is missing, empty, lacks a column or a row, names a length twice, has a row whose
-        number of cells is not that of its header, or a cell that is no number.
+        If the file is missing, empty, lacks a column or a row, names a length twice, has a row
+        whose number of cells is not that of its header, or a cell that is no number.
     ExperimentDataError
         If a value is not positive and finite, or the lengths are in another unit.
     """
@@ -150,7 +150,8 @@ def read_lengths(path: Path) -> Lengths:
     missing = [published for published in PUBLISHED_NAMES if published not in names]
     if missing:
         raise ExperimentFileError(
-            f"{table.name} lacks the row {' and '.join(missing)}; {comma_list(PUBLISHED_NAMES)} are needed."
+            f"{table.name} lacks the row {' and '.join(missing)}; "
+            f"{comma_list(PUBLISHED_NAMES)} are needed."
         )
     designed = _lengths_in_millimetres(table, "designed")
     measured = _lengths_in_millimetres(table, "manufactured")
@@ -186,9 +187,9 @@ def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
     """Return the design with the measured planform.
 
     Only the planform is replaced. What the design locates by a fraction moves with it: ribs, point
-    masses and bands of the skin along the span, and everything along the chord. What it locates by a
-    distance stays: gauges and defect regions from the root, the test load from the tip. The net load of
-    a turn, the thicknesses of skin and webs, and the size of the largest cell stay, too.
+    masses and bands of the skin along the span, and everything along the chord. What it locates by
+    a distance stays: gauges and defect regions from the root, the test load from the tip. The net
+    load of a turn, the thicknesses of skin and webs, and the size of the largest cell stay, too.
 
     Parameters
     ----------
@@ -219,5 +220,6 @@ def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
         reason = str(error).removeprefix("the changed design: ")
         dimensions = " x ".join(f"{value * 1e3:.1f}" for value in planform.values())
         raise InvalidDesignError(
-            f"the design {design.name} does not fit the measured planform ({dimensions} mm): {reason}"
+            f"the design {design.name} does not fit the measured planform "
+            f"({dimensions} mm): {reason}"
         ) from None

@@ -2,8 +2,8 @@
 
 `TestBench` is the interface that every experiment needs of a wing. `VirtualWing` implements it by a
 reduced model with a digital state as its truth, and `twin_master.assets.virtual_experiments` by an
-FMU. The functions `measure_...` do the experiments of the paper on a bench, with reading errors and a
-seed.
+FMU. The functions `measure_...` do the experiments of the paper on a bench, with reading errors and
+a seed.
 """
 
 import math
@@ -11,6 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from fe.runtime.modal_system import rayleigh_damping_ratio
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState, Geometry
+from reporting.arrays import Float
 
 from calibration.dynamics.records import RingDownRecord
 from calibration.errors import ExperimentDataError
@@ -22,10 +26,6 @@ from calibration.static.experiments import (
     published_measurements,
 )
 from calibration.static.posterior import Seed, child_seed
-from fe.runtime.modal_system import rayleigh_damping_ratio
-from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import DigitalState, Geometry
-from reporting.arrays import Float
 
 from .geometry import READING_UNCERTAINTY, Lengths, MeasuredLength, published_lengths
 
@@ -34,8 +34,8 @@ SENSITIVITY = 50.0
 
 RECORDED_GAUGE = 23
 """Number of the gauge whose strain is recorded, from 1. After a release of the tip, mode 2 has a
-quarter of the strain of mode 1 there, and higher modes hardly any; nearer to the root mode 2 is small
-beside mode 1."""
+quarter of the strain of mode 1 there, and higher modes hardly any; nearer to the root mode 2 is
+small beside mode 1."""
 
 MOST_SAMPLES = 10_000_000
 """Largest number of samples of all records; more need gigabytes and improve nothing."""
@@ -119,7 +119,8 @@ class VirtualWing:
         The true state of the wing; the geometry is that of the model.
     frequency_error : (float, float)
         The relative differences delta between this wing's two flapwise frequencies and its model's
-        [1]: the effect of what the model leaves out. Mode shapes and damping ratios are the model's.
+        [1]: the effect of what the model leaves out. Mode shapes and damping ratios are the
+        model's.
 
     Raises
     ------
@@ -152,7 +153,7 @@ class VirtualWing:
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
-        """Return the strain signal after a release of the tip: the sum of exact decays of all modes.
+        """Return the strain signal after a release of the tip: the exact decays of all modes.
 
         Parameters
         ----------
@@ -238,10 +239,11 @@ def measure_ring_down(
     trials : int
         The number of records.
     initial_tip_displacement : float
-        The nominal displacement of the tip at its release [m]. The true one has a standard deviation
-        of 5 %, as of a hand.
+        The nominal displacement of the tip at its release [m]. The true one has a standard
+        deviation of 5 %, as of a hand.
     duration, sampling_rate : float
-        The duration [s] and sampling rate [Hz] of a record; the published ones last 6.5 s at 100 kHz.
+        The duration [s] and sampling rate [Hz] of a record; the published ones last 6.5 s at 100
+        kHz.
     noise : float
         The standard deviation of a sample [V]; about 1 % of the first mode by default.
     quantisation : float, optional
@@ -258,7 +260,9 @@ def measure_ring_down(
             f"{MOST_SAMPLES:,} samples: take fewer, shorter or slower ones."
         )
     if quantisation is not None and not (math.isfinite(quantisation) and quantisation > 0.0):
-        raise ExperimentDataError(f"the recorder's step must be positive, but {quantisation:g} V was given.")
+        raise ExperimentDataError(
+            f"the recorder's step must be positive, but {quantisation:g} V was given."
+        )
     generator = np.random.default_rng(child_seed(seed, _RING_DOWN))
     records = []
     for trial in range(1, trials + 1):

@@ -181,8 +181,8 @@ def particle_filter(
             raise PosteriorError(
                 f"no particle explains pair {pair + 1} ({data.load[pair]:g} N, "
                 f"{data.displacement[pair] * 1e3:g} mm) of {data.source} and those before it; "
-                f"check the prior N({prior.mean:g}, {prior.standard_deviation:.3g}^2), the units and the "
-                "curve."
+                f"check the prior N({prior.mean:g}, {prior.standard_deviation:.3g}^2), the units "
+                "and the curve."
             )
     weight = np.exp(log_weight - float(log_weight.max()))
     weight /= weight.sum()

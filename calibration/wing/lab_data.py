@@ -24,7 +24,7 @@ from calibration.geometry import (
 )
 from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed
-from calibration.lab_folder import lab_place, lab_table
+from calibration.lab_folder import find_in_lab_folder, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
 from calibration.result.record import Reading
 from calibration.static.experiments import (
@@ -241,7 +241,9 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         raise ExperimentFileError(
             f"{path} is {state}; give the folder that holds step1, step2 and step3."
         )
-    steps = [step for step in (1, 2, 3) if lab_place(path, Path(f"step{step}")) is not None]
+    steps = [
+        step for step in (1, 2, 3) if find_in_lab_folder(path, Path(f"step{step}")) is not None
+    ]
     record_files = find_records(path)
     if not steps and not record_files:
         raise ExperimentFileError(
@@ -262,10 +264,10 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         lab = _with_ring_downs(lab, path, record_files, free=free)
     elif record_files:
         lab = _with_origin(lab, 3, f"records left aside as asked; {_PUBLISHED[3]}", read=False)
-    mass_file = lab_place(path, WEIGHED_MASS_FILE)
+    mass_file = find_in_lab_folder(path, WEIGHED_MASS_FILE)
     if mass_file is not None:
         lab = _with_weighed_mass(lab, mass_file)
-    results_file = lab_place(path, STEP_FOLDER / RESULTS_FILE)
+    results_file = find_in_lab_folder(path, STEP_FOLDER / RESULTS_FILE)
     if results_file is not None:
         lab = replace(lab, authors=read_published_results(results_file))
     return lab
