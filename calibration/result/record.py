@@ -304,14 +304,7 @@ class Calibration:
         """Return minus the mean of |measured - mean| over the readings of an experiment [1].
 
         The unit is the half-width of the 95 % interval of a reading, as in the error reward of
-        Kapteyn et al. 2021.
-
-        Parameters
-        ----------
-        experiment : str
-            The name of the experiment.
-        prior : bool
-            Whether the means are those of the prior.
+        Kapteyn et al. 2021. The means are those of the posterior, or of the `prior`.
         """
         errors = []
         for reading in self.readings:
