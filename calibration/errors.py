@@ -1,25 +1,20 @@
-"""Errors of the calibration, named by cause, and the sentences that say why."""
-
-from reporting.sentences import Sentences
-
-said = Sentences(__file__).said
-"""A sentence by "table.name" with its values."""
+"""Errors of the calibration, one for each cause."""
 
 
 class CalibrationError(Exception):
-    """Any error that the calibration raises on purpose."""
+    """The base of all errors of the calibration."""
 
 
 class ExperimentFileError(CalibrationError, ValueError):
-    """A file of measurements is missing, empty, or not laid out as expected."""
+    """A file of measurements is missing, empty, or has another layout."""
 
 
 class ExperimentDataError(CalibrationError, ValueError):
-    """Measurements hold values that no experiment can give or no model meets, or in another unit."""
+    """Measurements are impossible, in another unit, or do not fit any model."""
 
 
 class PosteriorError(CalibrationError, ValueError):
-    """A density, a prior, a stiffness curve or a request for quantiles or samples makes no sense."""
+    """A density, a prior, a stiffness curve or a request for samples makes no sense."""
 
 
 class OutsideValidityError(CalibrationError, RuntimeError):

@@ -6,31 +6,35 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.errors import ExperimentDataError, ExperimentFileError, said
+from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.result.record import ParameterPrior, Reading
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
 from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
+from reporting.arrays import Float
 from reporting.files import hash_record
+from reporting.table_file import TextTable
+from reporting.words import comma_list
 
 from .lab_folder import lab_table
 
 TOLERANCE = 2.54e-3
-"""Design tolerance of a length, half-width of a 95 % interval [m] (Kapteyn et al. 2021, Table 1)."""
+"""Design tolerance of a length, half-width of a 95 % interval [m] (Kapteyn et al. 2021)."""
 
 READING_UNCERTAINTY = 0.2e-3
-"""Uncertainty of a measured length, half-width of a 95 % interval [m] (the authors' script of step 1)."""
+"""Uncertainty of a measured length, half-width of a 95 % interval [m] (the authors' script)."""
 
 GEOMETRY_FILE = Path("step1") / "geometry_data.csv"
-"""Where the authors' calibration folder keeps the lengths of step 1."""
+"""The file of the lengths of step 1 in the authors' calibration folder."""
 
 PUBLISHED_NAMES = {"length": "semi_span", "chord_{root}": "root_chord", "chord_{tip}": "tip_chord"}
-"""The names that the published file gives to the lengths, beside those of `fe.runtime.state.Geometry`."""
+"""Names of the lengths in the published file, with the fields of `fe.runtime.state.Geometry`."""
 
-_USER = "the measured planform"
-_LARGEST_DEVIATION = 0.10  # of a length from its design; beyond this the units or the wing are others
+_NEEDED_BY = "the measured planform"
+_LARGEST_DEVIATION = 0.10  # of a length from its design; beyond it the units or the wing differ
+_SHORTEST_LENGTH_MM = 10.0  # a smaller number is probably a length in m
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class MeasuredLength:
     Attributes
     ----------
     name : str
-        A field of `Lengths`.
+        The field of `Lengths`.
     designed, measured : float
         The length on the drawing and on the wing [m].
 
@@ -56,19 +60,27 @@ class MeasuredLength:
 
     def __post_init__(self) -> None:
         if abs(self.measured / self.designed - 1.0) > _LARGEST_DEVIATION:
-            lengths = self.measured * 1e3, self.designed * 1e3
-            raise ExperimentDataError(said("geometry.apart", self=self, lengths=lengths))
+            raise ExperimentDataError(
+                f"{self.name} measures {self.measured * 1e3:g} mm where {self.designed * 1e3:g} mm "
+                "were designed, more than 10 % apart: check the units (both in mm) and the wing."
+            )
 
     @property
     def prior(self) -> ParameterPrior:
-        """The design and its tolerance."""
-        low, high = (self.designed * (1.0 + side * _LARGEST_DEVIATION) for side in (-1.0, 1.0))
-        deviation = TOLERANCE / HALF_WIDTH_95
-        return ParameterPrior(self.name, "m", self.designed, deviation, low, high, "design tolerance")
+        """The prior: the designed length with its tolerance."""
+        return ParameterPrior(
+            name=self.name,
+            unit="m",
+            mean=self.designed,
+            deviation=TOLERANCE / HALF_WIDTH_95,
+            low=self.designed * (1.0 - _LARGEST_DEVIATION),
+            high=self.designed * (1.0 + _LARGEST_DEVIATION),
+            stated_by="design tolerance",
+        )
 
     @property
     def reading(self) -> Reading:
-        """What was measured."""
+        """The reading: the measured length with its uncertainty."""
         return Reading(self.name, "planform", self.measured, READING_UNCERTAINTY / HALF_WIDTH_95)
 
     @property
@@ -78,13 +90,18 @@ class MeasuredLength:
         The precisions add, and the mean is weighted by them: 1/s² = 1/s_0² + 1/s_r²,
         m = s² (designed / s_0² + measured / s_r²).
         """
-        prior, reading = self.prior.deviation**-2, self.reading.deviation**-2
-        mean = self.designed + (self.measured - self.designed) * reading / (prior + reading)
-        return GaussianPrior(mean, (prior + reading) ** -0.5)
+        prior_precision = self.prior.deviation**-2
+        reading_precision = self.reading.deviation**-2
+        precision = prior_precision + reading_precision
+        mean = self.designed + (self.measured - self.designed) * reading_precision / precision
+        return GaussianPrior(mean, precision**-0.5)
 
 
 class Lengths(NamedTuple):
-    """The measured lengths of a planform g, as `fe.runtime.state.Geometry` has them; errors independent."""
+    """The measured lengths of a planform, in the order of `fe.runtime.state.Geometry`.
+
+    Their errors are independent.
+    """
 
     semi_span: MeasuredLength
     root_chord: MeasuredLength
@@ -92,8 +109,8 @@ class Lengths(NamedTuple):
 
     @property
     def sha256(self) -> str:
-        """Hash of the figures and their uncertainty, the same on every platform."""
-        return hash_record([[*astuple(item), TOLERANCE, READING_UNCERTAINTY] for item in self])
+        """Hash of the lengths and their uncertainty, equal on every platform."""
+        return hash_record([[*astuple(length), TOLERANCE, READING_UNCERTAINTY] for length in self])
 
 
 def published_lengths() -> Lengths:
@@ -110,74 +127,99 @@ def published_lengths() -> Lengths:
 
 
 def read_lengths(path: Path) -> Lengths:
-    """Read the lengths of step 1 from the authors' calibration folder, or from one CSV file.
+    """Return the lengths of step 1 in the authors' calibration folder, or in one CSV file.
 
     Parameters
     ----------
     path : Path
         The folder that holds `step1/geometry_data.csv` (also the folder above it in the authors'
-        repository), or the CSV file itself: columns `parameter`, `designed` and `manufactured` [mm], rows
-        `length`, `chord_{root}`, `chord_{tip}`.
+        repository), or the CSV file itself: columns `parameter`, `designed` and `manufactured`
+        [mm], rows `length`, `chord_{root}`, `chord_{tip}`.
 
     Raises
     ------
     ExperimentFileError
-        If the file is missing, empty, lacks a column or a row, names a length twice, has a row with another
-        number of cells than its header or a cell that is no number.
+        If the file is missing, empty, lacks a column or a row, names a length twice, has a row
+        whose number of cells is not that of its header, or a cell that is no number.
     ExperimentDataError
         If a value is not positive and finite, or the lengths are in another unit.
     """
     table = lab_table(path, GEOMETRY_FILE)
-    names = table.cells("parameter", _USER)
+    names = table.cells("parameter", _NEEDED_BY)
     table.refuse_repeated(names, "parameter", "keep one of them")
-    lost = [published for published in PUBLISHED_NAMES if published not in names]
-    if lost:
-        lacks = " and ".join(lost)
-        raise ExperimentFileError(said("geometry.no_row", table=table, lacks=lacks, known=PUBLISHED_NAMES))
-    lengths = {column: table.numbers(column, _USER, positive=True) for column in ("designed", "manufactured")}
-    for column, values in lengths.items():
-        for row in np.flatnonzero(values < 10.0):
-            where = f"{table.name}, line {table.lines[row]}: {column}"
-            raise ExperimentDataError(said("geometry.metres", where=where, value=values[row]))
-    rows = {name: names.index(published) for published, name in PUBLISHED_NAMES.items()}
-    return Lengths(
-        *(MeasuredLength(name, *(1e-3 * of[row] for of in lengths.values())) for name, row in rows.items())
-    )
+    missing = [published for published in PUBLISHED_NAMES if published not in names]
+    if missing:
+        raise ExperimentFileError(
+            f"{table.name} lacks the row {' and '.join(missing)}; "
+            f"{comma_list(PUBLISHED_NAMES)} are needed."
+        )
+    designed = _lengths_in_millimetres(table, "designed")
+    measured = _lengths_in_millimetres(table, "manufactured")
+    lengths = {}
+    for published, name in PUBLISHED_NAMES.items():
+        row = names.index(published)
+        lengths[name] = MeasuredLength(name, 1e-3 * designed[row], 1e-3 * measured[row])
+    return Lengths(**lengths)
+
+
+def _lengths_in_millimetres(table: TextTable, column: str) -> Float:
+    """Return a column of lengths [mm]; refuse lengths in m."""
+    values = table.numbers(column, _NEEDED_BY, positive=True)
+    too_short = np.flatnonzero(values < _SHORTEST_LENGTH_MM)
+    if too_short.size:
+        row = too_short[0]
+        raise ExperimentDataError(
+            f"{table.name}, line {table.lines[row]}: {column} is {values[row]:g} mm, "
+            "which looks like m: give it in mm."
+        )
+    return values
 
 
 def tailored_geometry(lengths: Lengths) -> Geometry:
-    """Return the posterior means, rounded to what the measurement leaves uncertain, 0.1 mm [m].
+    """Return the posterior means of the lengths [m], rounded to their standard deviation of 0.1 mm.
 
-    The paper keeps the means and drops their standard deviation, which is 0.1 mm.
+    The paper keeps the means and drops their standard deviation.
     """
     return Geometry(*(round(length.posterior.mean, 4) for length in lengths))
 
 
 def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
-    """Return the design with the measured planform; the mesh follows.
+    """Return the design with the measured planform.
 
-    The planform alone is replaced. What the design places by a fraction moves with it: ribs, point masses
-    and bands of the skin along the span, and everything along the chord. What it places by a distance stays
-    where it is on the wing: gauges and defect regions from the root, the test load from the tip. The
-    net load of a turn, skin and web thicknesses, and the largest cell stay.
+    Only the planform is replaced. What the design locates by a fraction moves with it: ribs, point
+    masses and bands of the skin along the span, and everything along the chord. What it locates by
+    a distance stays: gauges and defect regions from the root, the test load from the tip. The net
+    load of a turn, the thicknesses of skin and webs, and the size of the largest cell stay, too.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing as drawn.
+    lengths : Lengths
+        The measured lengths.
 
     Raises
     ------
     ExperimentDataError
-        If a length differs from that of the design by more than a tenth: it is another wing.
+        If a length differs from that of the design by more than a tenth, as of another wing.
     InvalidDesignError
-        If the tailored wing cannot be built; the sentence names the place.
+        If the tailored wing cannot be built; the message names the part of the design.
     """
     planform = asdict(tailored_geometry(lengths))
     for name, value in planform.items():
         drawn = getattr(design.planform, name)
         if abs(value / drawn - 1.0) > _LARGEST_DEVIATION:
-            both = value * 1e3, drawn * 1e3
-            raise ExperimentDataError(said("geometry.another", name=name, lengths=both, design=design))
+            raise ExperimentDataError(
+                f"{name} measures {value * 1e3:.1f} mm, but the design {design.name} has "
+                f"{drawn * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with "
+                "--design."
+            )
     try:
         return design.changed(planform=planform)
     except InvalidDesignError as error:
         reason = str(error).removeprefix("the changed design: ")
-        shown = " x ".join(f"{value * 1e3:.1f}" for value in planform.values())
-        why = said("geometry.unfit", design=design, shown=shown, reason=reason)
-        raise InvalidDesignError(why) from None
+        dimensions = " x ".join(f"{value * 1e3:.1f}" for value in planform.values())
+        raise InvalidDesignError(
+            f"the design {design.name} does not fit the measured planform "
+            f"({dimensions} mm): {reason}"
+        ) from None

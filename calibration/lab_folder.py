@@ -8,36 +8,55 @@ from reporting.table_file import TableErrors, TextTable, read_table
 from .errors import ExperimentDataError, ExperimentFileError
 
 LAB_ERRORS = TableErrors(layout=ExperimentFileError, value=ExperimentDataError)
-"""What the reader of a laboratory's table raises."""
+"""The exceptions of the reader of a laboratory's tables."""
 
-# Where the folders of the steps lie in the authors' repository, seen from what a user may call its folder.
+# The folders of the steps in the authors' repository, relative to the folder that a user may give
 _FOLDERS_OF_STEPS = (Path(), Path("datafiles"), Path("src") / "datafiles")
 
 
-def places_of(folder: Path, name: Path) -> Iterator[Path]:
-    """Yield where a file or folder such as `step1/geometry_data.csv` may lie, seen from a user's folder."""
-    for above in _FOLDERS_OF_STEPS:
-        yield folder / above / name
+def possible_locations(folder: Path, name: Path) -> Iterator[Path]:
+    """Yield the possible locations of a file or folder below a user's folder.
+
+    Parameters
+    ----------
+    folder : Path
+        The user's folder.
+    name : Path
+        The file or folder in the authors' layout, such as `step1/geometry_data.csv`.
+    """
+    for folder_of_steps in _FOLDERS_OF_STEPS:
+        yield folder / folder_of_steps / name
 
 
-def lab_place(folder: Path, name: Path) -> Path | None:
-    """Return where a file or folder lies in a user's folder, None where it does not."""
-    return next((place for place in places_of(folder, name) if place.exists()), None)
+def find_in_lab_folder(folder: Path, name: Path) -> Path | None:
+    """Return the location of a file or folder below a user's folder, or None if it is missing."""
+    for location in possible_locations(folder, name):
+        if location.exists():
+            return location
+    return None
 
 
 def lab_table(path: Path | str, name: Path) -> TextTable:
-    """Return the table of a file, or of the file `name` in the laboratory's (or its step's) folder `path`.
+    """Return a table of a laboratory.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file of the table, the laboratory's folder, or the folder of the step.
+    name : Path
+        The file of the table in the authors' layout.
 
     Raises
     ------
     ExperimentFileError
-        If there is neither, or it is no table.
+        If there is no such file, or it is no table.
     """
     path = Path(path)
     if not path.exists():
         raise ExperimentFileError(f"{path} does not exist; give the folder that holds {name}.")
-    places = (path,) if path.is_file() else (*places_of(path, name), path / name.name)
-    file = next((place for place in places if place.is_file()), None)
-    if file is None:
-        raise ExperimentFileError(f"{path} does not hold {name}; give the authors' calibration folder.")
-    return read_table(file, LAB_ERRORS)
+    if path.is_file():
+        return read_table(path, LAB_ERRORS)
+    for location in (*possible_locations(path, name), path / name.name):
+        if location.is_file():
+            return read_table(location, LAB_ERRORS)
+    raise ExperimentFileError(f"{path} does not hold {name}; give the authors' calibration folder.")

@@ -1,8 +1,9 @@
-"""A wing that never was on the test bench: experiments of which the truth is known.
+"""Simulated experiments on a wing whose true state is known.
 
-`TestBench` is what every experiment needs of a wing; `VirtualWing` is a reduced model with a digital state as
-its truth, `twin_master.assets.virtual_experiments` has the FMU behind the same interface. The functions
-`measure_...` do the experiments of the paper on a bench, with reading errors and a seed.
+`TestBench` is the interface that every experiment needs of a wing. `VirtualWing` implements it by a
+reduced model with a digital state as its truth, and `twin_master.assets.virtual_experiments` by an
+FMU. The functions `measure_...` do the experiments of the paper on a bench, with reading errors and
+a seed.
 """
 
 import math
@@ -12,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from calibration.dynamics.records import RingDownRecord
-from calibration.errors import ExperimentDataError, said
+from calibration.errors import ExperimentDataError
 from calibration.joint.wing_table import weighed
 from calibration.result.record import Reading
 from calibration.static.experiments import (
@@ -29,32 +30,49 @@ from reporting.arrays import Float
 from .geometry import READING_UNCERTAINTY, Lengths, MeasuredLength, published_lengths
 
 SENSITIVITY = 50.0
-"""Volts per unit strain: a quarter bridge of gauge factor 2 at 5 V, amplified 20 times [V]."""
+"""Signal for a unit strain: a quarter bridge of gauge factor 2 at 5 V, amplified 20 times [V]."""
 
 RECORDED_GAUGE = 23
-"""The gauge whose strain is recorded, counted from 1: a released tip moves mode 2 by a quarter of mode
-1 there, the higher modes hardly; nearer to the root mode 2 is lost behind mode 1."""
+"""Number of the gauge whose strain is recorded, from 1. After a release of the tip, mode 2 has a
+quarter of the strain of mode 1 there, and higher modes hardly any; nearer to the root mode 2 is
+small beside mode 1."""
 
 MOST_SAMPLES = 10_000_000
-"""Most samples of all records: beyond, they need gigabytes and tell nothing more."""
+"""Largest number of samples of all records; more need gigabytes and improve nothing."""
 
-_PURPOSES = {"load": 31, "ring_down": 32, "geometry": 33, "weighing": 34}
+# Numbers of the purposes of a seed
+_LOAD_TEST = 31
+_RING_DOWN = 32
+_GEOMETRY = 33
+_WEIGHING = 34
+
+_RELEASE_DEVIATION = 0.05  # relative standard deviation of the tip displacement at release
 
 
 RingDownSignal = tuple[Float, Float]
-"""What a recorder saw: instants (N,) from the release on [s] and signal (N,) [V]."""
+"""A recorded signal: instants (N,) from the release on [s] and values (N,) [V]."""
 
 
 class TestBench(Protocol):
-    """A wing, real or not, that can be loaded and let go. It reads without error."""
+    """A wing, real or not, that can be loaded and released, and is read without error."""
 
     def tip_displacement(self, load: float) -> float:
-        """Return the displacement [m] of the load point, 5 cm from the tip, under a load there [N]."""
+        """Return the displacement [m] of the point 5 cm from the tip, under a load there [N]."""
 
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
-        """Hold the tip aside [m], let it go, and record for `duration` [s] at `sampling_rate` [Hz]."""
+        """Return the signal after a release of the tip.
+
+        Parameters
+        ----------
+        initial_tip_displacement : float
+            The displacement of the tip at its release [m].
+        duration : float
+            The duration of the record [s].
+        sampling_rate : float
+            The sampling rate [Hz].
+        """
 
 
 def check_recorded(gauges: int) -> None:
@@ -63,10 +81,12 @@ def check_recorded(gauges: int) -> None:
     Raises
     ------
     ExperimentDataError
-        If it has fewer than `RECORDED_GAUGE`.
+        If the number of gauges is smaller than `RECORDED_GAUGE`.
     """
     if gauges < RECORDED_GAUGE:
-        raise ExperimentDataError(said("virtual.gauges", gauges=gauges, recorded=RECORDED_GAUGE))
+        raise ExperimentDataError(
+            f"the wing has {gauges} gauges, but a release is recorded at gauge {RECORDED_GAUGE}."
+        )
 
 
 def sampling_times(duration: float, sampling_rate: float) -> Float:
@@ -75,27 +95,32 @@ def sampling_times(duration: float, sampling_rate: float) -> Float:
     Raises
     ------
     ExperimentDataError
-        If duration or rate is not positive and finite, or no two samples fit.
+        If duration [s] or rate [Hz] is not positive and finite, or the record has no two samples.
     """
-    if not (0.0 < duration < math.inf and 0.0 < sampling_rate < math.inf and duration * sampling_rate >= 1.0):
-        asked = duration, sampling_rate
-        raise ExperimentDataError(said("virtual.duration", asked=asked))
-    return np.arange(int(duration * sampling_rate + 1e-9) + 1) / sampling_rate
+    are_positive = 0.0 < duration < math.inf and 0.0 < sampling_rate < math.inf
+    if not are_positive or duration * sampling_rate < 1.0:
+        raise ExperimentDataError(
+            f"a record needs a positive duration and sampling rate, but {duration:g} s at "
+            f"{sampling_rate:g} Hz were asked for."
+        )
+    intervals = int(duration * sampling_rate + 1e-9)  # a product just below a whole number counts
+    return np.arange(intervals + 1) / sampling_rate
 
 
 @dataclass(frozen=True, eq=False)
 class VirtualWing:
-    """A reduced model with a known digital state, in the manner of `TestBench`.
+    """A reduced model with a known digital state, as a `TestBench`.
 
     Attributes
     ----------
     model : ReducedModel
         The wing.
     truth : DigitalState
-        Its true state; the geometry is that of the model.
+        The true state of the wing; the geometry is that of the model.
     frequency_error : (float, float)
-        Relative differences delta between this wing's two flapwise frequencies and its model's [1]: what
-        the model leaves out. Mode shapes and damping ratios stay the model's.
+        The relative differences delta between this wing's two flapwise frequencies and its model's
+        [1]: the effect of what the model leaves out. Mode shapes and damping ratios are the
+        model's.
 
     Raises
     ------
@@ -112,61 +137,81 @@ class VirtualWing:
     def __post_init__(self) -> None:
         check_recorded(len(self.model.gauges))
         if not all(math.isfinite(error) and error > -1.0 for error in self.frequency_error):
-            given = " and ".join(f"{error:g}" for error in self.frequency_error)
-            raise ExperimentDataError(said("virtual.frequency_error", given=given))
-        self.model.modes(self.truth.values, self.truth.stiffness_loss)  # refuses a truth outside the model
+            errors = " and ".join(f"{error:g}" for error in self.frequency_error)
+            raise ExperimentDataError(
+                f"a relative frequency error must be finite and above -1, but {errors} were given."
+            )
+        # The model refuses a truth outside its range.
+        self.model.modes(self.truth.values, self.truth.stiffness_loss)
 
     def tip_displacement(self, load: float) -> float:
-        """Return the displacement [m] of the load point under a load there [N]."""
-        return load / self.model.tip_stiffness(self.truth.young_modulus_factor, self.truth.stiffness_loss)
+        """Return the displacement [m] of the point 5 cm from the tip, under a load there [N]."""
+        truth = self.truth
+        stiffness = self.model.tip_stiffness(truth.young_modulus_factor, truth.stiffness_loss)
+        return load / stiffness
 
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
-        """Return the strain signal after the tip is let go: each mode's free decay, exactly."""
+        """Return the strain signal after a release of the tip: the exact decays of all modes.
+
+        Parameters
+        ----------
+        initial_tip_displacement : float
+            The displacement of the tip at its release [m].
+        duration : float
+            The duration of the record [s].
+        sampling_rate : float
+            The sampling rate [Hz].
+        """
         time = sampling_times(duration, sampling_rate)
-        truth, model = self.truth, self.model
-        vector = model.vector(truth.values, truth.stiffness_loss)
-        modes, held = model.modes(vector), model.static_response(vector, load=np.array((0.0, 1.0)))
+        truth = self.truth
+        vector = self.model.vector(truth.values, truth.stiffness_loss)
+        modes = self.model.modes(vector)
+        held = self.model.static_response(vector, load=np.array((0.0, 1.0)))
+
+        # Modal coordinates at the release, for a unit displacement of the tip
         omega = 2.0 * math.pi * modes.frequency
-        released = modes.participation[1] / omega**2 / held.displacement[0]  # of each mode, per displacement
+        initial_coordinate = modes.participation[1] / omega**2 / held.displacement[0]
+        initial_strain = modes.output[RECORDED_GAUGE - 1] * initial_coordinate
+
         for mode, error in zip(modes.followed, self.frequency_error, strict=True):
             omega[mode] *= 1.0 + error
         zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
-        signal = np.zeros_like(time)
-        for mode, strain in enumerate(modes.output[RECORDED_GAUGE - 1] * released):
-            signal += strain * _free_decay(float(omega[mode]), float(zeta[mode]), time)
-        return time, SENSITIVITY * initial_tip_displacement * signal
+        strain = np.zeros_like(time)
+        for mode, amplitude in enumerate(initial_strain):
+            strain += amplitude * _free_decay(float(omega[mode]), float(zeta[mode]), time)
+        return time, SENSITIVITY * initial_tip_displacement * strain
 
 
 def _free_decay(omega: float, zeta: float, time: Float) -> Float:
     """Return q(t) of q'' + 2 zeta omega q' + omega^2 q = 0 with q(0) = 1, q'(0) = 0."""
     root = np.sqrt(complex(zeta**2 - 1.0))
-    if abs(root) < 1e-8:
+    if abs(root) < 1e-8:  # critical damping, where both poles are equal
         return np.asarray((1.0 + omega * time) * np.exp(-omega * time))
-    slow, fast = omega * (-zeta + root), omega * (-zeta - root)
-    decay = (slow * np.exp(fast * time) - fast * np.exp(slow * time)) / (slow - fast)
+    slow_pole = omega * (-zeta + root)
+    fast_pole = omega * (-zeta - root)
+    slow_term = fast_pole * np.exp(slow_pole * time)
+    fast_term = slow_pole * np.exp(fast_pole * time)
+    decay = (fast_term - slow_term) / (slow_pole - fast_pole)
     return np.asarray(decay.real)
 
 
-# ---------------------------------------------------------------------- the experiments
-
-
 def measure_load_test(bench: TestBench, seed: Seed) -> LoadDisplacementData:
-    """Hang the paper's weights near the tip, in its two runs of 250 to 1000 g, and read the displacement.
+    """Return the readings of a load test as in the paper: two runs of 250 to 1000 g near the tip.
 
-    The true load is the nominal one; load and displacement are then both read with the paper's errors.
+    The true load is the nominal one; load and displacement are both read with the paper's errors.
 
     Parameters
     ----------
     bench : TestBench
         The wing.
     seed : int or SeedSequence
-        Of the reading errors.
+        The seed of the reading errors.
     """
     paper = published_measurements()
-    generator = np.random.default_rng(child_seed(seed, _PURPOSES["load"]))
-    displacement = np.array([bench.tip_displacement(float(value)) for value in paper.load])
+    generator = np.random.default_rng(child_seed(seed, _LOAD_TEST))
+    displacement = np.array([bench.tip_displacement(float(load)) for load in paper.load])
     load = paper.load + generator.normal(0.0, paper.load_standard_deviation, paper.count)
     displacement += generator.normal(0.0, paper.displacement_standard_deviation, paper.count)
     return replace(paper, load=load, displacement=displacement, source="virtual load test")
@@ -183,40 +228,47 @@ def measure_ring_down(
     noise: float = 1e-4,
     quantisation: float | None = None,
 ) -> tuple[RingDownRecord, ...]:
-    """Let the tip go several times and record the strain.
+    """Return records of the strain after several releases of the tip.
 
     Parameters
     ----------
     bench : TestBench
         The wing.
     seed : int or SeedSequence
-        Of noise and releases.
+        The seed of noise and releases.
     trials : int
-        Number of records.
+        The number of records.
     initial_tip_displacement : float
-        How far the tip is held aside [m]; a hand holds it to 5 % (standard deviation).
+        The nominal displacement of the tip at its release [m]. The true one has a standard
+        deviation of 5 %, as of a hand.
     duration, sampling_rate : float
-        Of a record [s], [Hz]; the published ones last 6.5 s at 100 kHz.
+        The duration [s] and sampling rate [Hz] of a record; the published ones last 6.5 s at 100
+        kHz.
     noise : float
-        Standard deviation of a sample [V]; about 1 % of the first mode by default.
+        The standard deviation of a sample [V]; about 1 % of the first mode by default.
     quantisation : float, optional
-        Step of the recorder [V]; none by default.
+        The resolution of the recorder [V]; by default values are not rounded.
 
     Raises
     ------
     ExperimentDataError
-        If the step is not positive, or the records would be too short or too long.
+        If the resolution is not positive, or the records would be too short or too long.
     """
     if MOST_SAMPLES < trials * duration * sampling_rate < math.inf:
-        asked = trials, duration, sampling_rate, MOST_SAMPLES
-        raise ExperimentDataError(said("virtual.samples", asked=asked))
+        raise ExperimentDataError(
+            f"{trials} records of {duration:g} s at {sampling_rate:g} Hz are more than "
+            f"{MOST_SAMPLES:,} samples: take fewer, shorter or slower ones."
+        )
     if quantisation is not None and not (math.isfinite(quantisation) and quantisation > 0.0):
-        raise ExperimentDataError(f"the recorder's step must be positive, but {quantisation:g} V was given.")
-    generator = np.random.default_rng(child_seed(seed, _PURPOSES["ring_down"]))
+        raise ExperimentDataError(
+            f"the recorder's step must be positive, but {quantisation:g} V was given."
+        )
+    generator = np.random.default_rng(child_seed(seed, _RING_DOWN))
     records = []
     for trial in range(1, trials + 1):
-        held = initial_tip_displacement * (1.0 + 0.05 * float(generator.standard_normal()))
-        time, signal = bench.ring_down(held, duration, sampling_rate)
+        relative_error = _RELEASE_DEVIATION * float(generator.standard_normal())
+        released_at = initial_tip_displacement * (1.0 + relative_error)
+        time, signal = bench.ring_down(released_at, duration, sampling_rate)
         signal = signal + generator.normal(0.0, noise, signal.size)
         if quantisation is not None:
             signal = quantisation * np.round(signal / quantisation)
@@ -230,38 +282,41 @@ def measure_lengths(
     *,
     designed: Geometry | None = None,
 ) -> Lengths:
-    """Measure semi-span and chords of a wing.
+    """Return the readings of semi-span and chords of a wing.
 
     Parameters
     ----------
     geometry : Geometry
-        True lengths [m].
+        The true lengths [m].
     seed : int or SeedSequence
-        Of the reading errors.
+        The seed of the reading errors.
     designed : Geometry, optional
-        The drawing that it was built to; the published one by default.
+        The designed lengths [m]; the published ones by default.
     """
-    generator = np.random.default_rng(child_seed(seed, _PURPOSES["geometry"]))
-    measured = []
-    for drawn in published_lengths():
-        length = getattr(geometry, drawn.name) + generator.normal(0.0, READING_UNCERTAINTY / HALF_WIDTH_95)
-        intended = drawn.designed if designed is None else getattr(designed, drawn.name)
-        measured.append(MeasuredLength(drawn.name, intended, length))
-    return Lengths(*measured)
+    generator = np.random.default_rng(child_seed(seed, _GEOMETRY))
+    deviation = READING_UNCERTAINTY / HALF_WIDTH_95
+    lengths = []
+    for published in published_lengths():
+        name = published.name
+        reading = getattr(geometry, name) + generator.normal(0.0, deviation)
+        designed_length = published.designed if designed is None else getattr(designed, name)
+        lengths.append(MeasuredLength(name, designed_length, reading))
+    return Lengths(*lengths)
 
 
 def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> Reading:
-    """Weigh two servos and the pitot tube together.
+    """Return the reading of a weighing of two servos and the pitot tube.
 
     Parameters
     ----------
     truth : DigitalState
-        True masses.
+        The true masses.
     seed : int or SeedSequence
-        Of the reading error.
+        The seed of the reading error.
     standard_deviation : float
-        Of the weighing [kg].
+        The standard deviation of the weighing [kg].
     """
-    generator = np.random.default_rng(child_seed(seed, _PURPOSES["weighing"]))
+    generator = np.random.default_rng(child_seed(seed, _WEIGHING))
     error = float(generator.normal(0.0, standard_deviation))
-    return weighed(2.0 * truth.servo_mass + truth.pitot_mass + error, standard_deviation)
+    total_mass = 2.0 * truth.servo_mass + truth.pitot_mass
+    return weighed(total_mass + error, standard_deviation)

@@ -58,6 +58,9 @@ _WORDS_THAT_ARE_NO_UNITS = {
 }
 """Names that pint takes for lengths and ratios, and measuring software does not."""
 
+_ERRORS_OF_THE_PARSER = (AssertionError, AttributeError, TypeError, ArithmeticError)
+"""What pint raises of texts that are no units, beside errors of its own."""
+
 
 class Meaning(NamedTuple):
     """The conversion of a unit: SI value = `factor` * value + `offset`.
@@ -222,7 +225,7 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
         parsed = registry.parse_units(text)
         factor_to_grams, root_units = registry.get_root_units(parsed)
         offset = registry.Quantity(Fraction(0), parsed).to_root_units().magnitude
-    except (PintError, TokenError, AttributeError, TypeError, ArithmeticError) as cause:
+    except (PintError, TokenError, *_ERRORS_OF_THE_PARSER) as cause:
         raise ValueError(f"{unit!r} is no unit") from cause
     powers: dict[str, Any] = dict(root_units._units)
     exponents = [powers.pop(base_unit, 0) for base_unit in _PINT_BASE_UNITS]

@@ -22,10 +22,10 @@ from calibration.virtual_wing import measure_load_test as measure_load_test
 from calibration.virtual_wing import measure_ring_down as measure_ring_down
 from calibration.virtual_wing import weigh as weigh
 from calibration.wing.calibrate import calibrate as calibrate
-from calibration.wing.calibrate import write_wing_folder as write_wing_folder
 from calibration.wing.lab_data import published_data as published_data
 from calibration.wing.lab_data import read_lab_folder as read_lab_folder
 from calibration.wing.lab_data import write_lab_folder as write_lab_folder
+from calibration.wing.report import write_wing_folder as write_wing_folder
 from discrepancy.application import apply_verdict as apply_verdict
 from discrepancy.application import gives as gives
 from discrepancy.application import packed_beside as packed_beside

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.lab_folder import LAB_ERRORS, places_of
+from calibration.lab_folder import LAB_ERRORS, possible_locations
 from reporting.arrays import Float
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
@@ -176,7 +176,7 @@ def find_records(path: Path) -> tuple[Path, ...]:
             f"{path} does not exist; give a folder of ring-down records or one file."
         )
     for pattern in FILE_PATTERNS:
-        for folder in (*places_of(path, STEP_FOLDER), path):
+        for folder in (*possible_locations(path, STEP_FOLDER), path):
             files = sorted(folder.glob(pattern))
             if files:
                 return tuple(files)

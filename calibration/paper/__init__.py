@@ -1,1 +1,1 @@
-"""The procedure and the figures of the paper: particle filter, masses step after step, Fig. 5 and Table 1."""
+"""The procedure of the paper step after step, its Fig. 5 and its Table 1."""

@@ -1,7 +1,8 @@
-"""Table 1 and Fig. 5 of the paper with our figures: the whole digital state, and calibration step 2."""
+"""Table 1 (the digital state) and Fig. 5 (calibration step 2) of the paper, with our results."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,19 +19,27 @@ from reporting.table_file import table_text
 
 WORDS = Words("calibration.paper", "table_1.toml")
 
-_CSV_COLUMNS = (
-    "figure", "prior_mean", "prior_standard_deviation", "mean", "standard_deviation",
-    "paper_procedure_mean", "paper_procedure_standard_deviation", "paper_mean", "paper_standard_deviation",
-    "difference", "paper_procedure_difference", "source_of_the_papers",
-)  # fmt: skip
-
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """How a figure is printed, and what the authors found on their wing.
+    """The authors' value of a quantity, and how it is printed.
 
-    Title, factor from SI, unit and digits behind the point; posterior mean, standard deviation where it is
-    given [SI], and the source.
+    Attributes
+    ----------
+    title : str
+        The title of the quantity.
+    scale : float
+        The factor from SI to `unit`.
+    unit : str
+        The printed unit.
+    digits : int
+        The number of printed decimals.
+    mean : float
+        The posterior mean [SI].
+    source : str
+        Where the value is published.
+    standard_deviation : float or None
+        The posterior standard deviation, if it is published [SI].
     """
 
     title: str
@@ -42,64 +51,92 @@ class PaperFigure:
     standard_deviation: float | None = None
 
     def printed(self, mean: float, deviation: float | None = None, *, sign: str = "") -> str:
-        """Return a figure as printed, without its unit."""
+        """Return a value as printed, without its unit.
+
+        Parameters
+        ----------
+        mean, deviation : float
+            The value and its standard deviation [SI].
+        sign : str
+            "+" to print the sign of a positive value, too.
+        """
         text = f"{mean * self.scale:{sign}.{self.digits}f}"
         if deviation is not None:
             text += f" ± {deviation * self.scale:.{self.digits}f}"
         return text.replace("-", "−")
 
 
-PAPER = {name: PaperFigure(**told) for name, told in WORDS.content["paper"].items()}
+PAPER = {name: PaperFigure(**entry) for name, entry in WORDS.content["paper"].items()}
+"""The quantities of Table 1 by name."""
+
+
+class Moments(NamedTuple):
+    """Mean and standard deviation [SI]."""
+
+    mean: float
+    standard_deviation: float
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """One figure of Table 1, SI.
+    """One quantity of Table 1.
 
     Attributes
     ----------
     name : str
-        Figure.
-    prior, found : (float, float)
-        Mean and standard deviation before, and in the samples that are kept.
-    paper_way : (float, float)
-        The same by the paper's own procedure: the particle filter on its stiffness line for e, its eqs.
-        (19), (20) and (25) on our model for masses and damping.
+        The name of the quantity.
+    prior, posterior : Moments
+        The prior, and the posterior of the calibration.
+    paper_procedure : Moments
+        The result of the paper's procedure: for e the particle filter on the paper's stiffness
+        line, for masses and damping eqs. (19), (20) and (25) on our model.
     paper : PaperFigure
-        What the authors found.
+        The authors' value.
     """
 
     name: str
-    prior: tuple[float, float]
-    found: tuple[float, float]
-    paper_way: tuple[float, float]
+    prior: Moments
+    posterior: Moments
+    paper_procedure: Moments
     paper: PaperFigure
 
     @property
-    def differences(self) -> tuple[float, float]:
-        """The means of the kept samples and by the paper's own procedure, less the paper's."""
-        return self.found[0] - self.paper.mean, self.paper_way[0] - self.paper.mean
+    def difference(self) -> float:
+        """The posterior mean minus the authors' [SI]."""
+        return self.posterior.mean - self.paper.mean
+
+    @property
+    def paper_procedure_difference(self) -> float:
+        """The mean by the paper's procedure minus the authors' [SI]."""
+        return self.paper_procedure.mean - self.paper.mean
 
 
-def table_1(result: Calibration, procedure: Calibration, particle: ParticlePosterior) -> tuple[TableRow, ...]:
+def table_1(
+    result: Calibration, procedure: Calibration, particle: ParticlePosterior
+) -> tuple[TableRow, ...]:
     """Return the rows of Table 1.
 
     Parameters
     ----------
     result, procedure : Calibration
-        What is kept, and what the paper's procedure finds on our model.
+        The calibration that is kept, and that by the paper's procedure on our model.
     particle : ParticlePosterior
-        e by the paper's particle filter on its own stiffness line.
+        The posterior of e by the paper's particle filter on its stiffness line.
     """
-    stated = {prior.name: (prior.mean, prior.deviation) for prior in result.priors}
+    priors = {prior.name: prior for prior in result.priors}
     rows = []
     for name, paper in PAPER.items():
-        way = procedure.mean(name), procedure.standard_deviation(name)
         if name == "young_modulus_factor":
-            way = particle.mean, particle.standard_deviation
-        half = name.startswith("damping")  # a normal distribution cut off at its mean
-        prior = result.prior_moments(name) if half else stated[name]
-        rows.append(TableRow(name, prior, (result.mean(name), result.standard_deviation(name)), way, paper))
+            paper_procedure = Moments(particle.mean, particle.standard_deviation)
+        else:
+            paper_procedure = Moments(procedure.mean(name), procedure.standard_deviation(name))
+        if name.startswith("damping"):
+            # A Gaussian truncated at its mean has other moments than stated.
+            prior = Moments(*result.prior_moments(name))
+        else:
+            prior = Moments(priors[name].mean, priors[name].deviation)
+        posterior = Moments(result.mean(name), result.standard_deviation(name))
+        rows.append(TableRow(name, prior, posterior, paper_procedure, paper))
     return tuple(rows)
 
 
@@ -111,13 +148,25 @@ def write_table_1(rows: tuple[TableRow, ...], path: Path) -> Path:
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
-    lines = []
-    for row in rows:
-        found = row.paper.mean, row.paper.standard_deviation
-        values = (*row.prior, *row.found, *row.paper_way, *found, *row.differences)
-        numbers = ["" if value is None else f"{value:.10g}" for value in values]
-        lines.append((row.name, *numbers, row.paper.source))
-    return atomic_write_text(path, table_text(dict(zip(_CSV_COLUMNS, zip(*lines, strict=True), strict=True))))
+    numbers: dict[str, list[float | None]] = {
+        "prior_mean": [row.prior.mean for row in rows],
+        "prior_standard_deviation": [row.prior.standard_deviation for row in rows],
+        "mean": [row.posterior.mean for row in rows],
+        "standard_deviation": [row.posterior.standard_deviation for row in rows],
+        "paper_procedure_mean": [row.paper_procedure.mean for row in rows],
+        "paper_procedure_standard_deviation": [
+            row.paper_procedure.standard_deviation for row in rows
+        ],
+        "paper_mean": [row.paper.mean for row in rows],
+        "paper_standard_deviation": [row.paper.standard_deviation for row in rows],
+        "difference": [row.difference for row in rows],
+        "paper_procedure_difference": [row.paper_procedure_difference for row in rows],
+    }
+    columns = {"figure": [row.name for row in rows]}
+    for name, values in numbers.items():
+        columns[name] = ["" if value is None else f"{value:.10g}" for value in values]
+    columns["source_of_the_papers"] = [row.paper.source for row in rows]
+    return atomic_write_text(path, table_text(columns))
 
 
 _MARKERS = ("o", "s", "^", "D", "v", "P")
@@ -126,61 +175,97 @@ _RUN_LINES = ("-", "--", "-.", ":")
 
 @style.publication_style()
 def calibration_figure(result: StaticCalibration) -> Figure:
-    """Draw the three panels of Fig. 5: measurements and bands, densities of e, densities of the stiffness."""
+    """Return Fig. 5 of the paper: measurements and bands, densities of e and of the stiffness."""
     figure = style.new_figure(height=4.4)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0), wspace=0.22, hspace=0.48)
     figure.subplots_adjust(left=0.062, right=0.985, bottom=0.095, top=0.94)
     _draw_loads(figure.add_subplot(grid[:, 0]), result)
-    factor, stiffness = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
-    for pair, run in enumerate(np.searchsorted(result.data.run_indices, result.data.run).tolist()):
-        factor.plot(
-            result.particle.likelihood_grid, result.particle.likelihood[pair], color=style.OBSERVED, lw=0.7,
-            ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
-        )  # fmt: skip
-    _draw_densities(factor, result.before, result.exact, result.particle)
-    factor.axvline(
-        PAPER["young_modulus_factor"].mean, color=style.REFERENCE, lw=0.7, ls=":", label="mean in the paper"
-    )
-    factor.set_xlabel("Young's modulus factor $e$", parse_math=True)
-    factor.set_ylabel("probability density")
-    style.panel_label(factor, "b", "Prior, likelihoods, posterior")
-    after = result.tip_stiffness_exact
-    _draw_densities(stiffness, result.tip_stiffness_prior, after, result.particle.stiffness, 1e-3)
-    stiffness.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
-    stiffness.set_ylabel("probability density (mm/N)")
-    told = f"{after.mean * 1e-3:.4f} ± {after.standard_deviation * 1e-3:.4f} N/mm"
-    stiffness.text(
-        0.99, 0.60, told, transform=stiffness.transAxes, color=style.PAST, ha="right", fontsize=6.8
-    )
-    style.panel_label(stiffness, "c", "Quantity of interest")
-    for axes in (factor, stiffness):
-        axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
+    _draw_factor(figure.add_subplot(grid[0, 1]), result)
+    _draw_stiffness(figure.add_subplot(grid[1, 1]), result)
     return figure
 
 
+def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
+    """Draw the densities of e."""
+    particle = result.particle
+    run_numbers = np.searchsorted(result.data.run_indices, result.data.run).tolist()
+    for pair, run in enumerate(run_numbers):
+        axes.plot(
+            particle.likelihood_grid,
+            particle.likelihood[pair],
+            color=style.OBSERVED,
+            lw=0.7,
+            ls=_RUN_LINES[run % len(_RUN_LINES)],
+            label="likelihood of one pair" if pair == 0 else None,
+        )
+    _draw_densities(axes, result.before, result.exact, particle)
+    paper_mean = PAPER["young_modulus_factor"].mean
+    axes.axvline(paper_mean, color=style.REFERENCE, lw=0.7, ls=":", label="mean in the paper")
+    axes.set_xlabel("Young's modulus factor $e$", parse_math=True)
+    axes.set_ylabel("probability density")
+    style.panel_label(axes, "b", "Prior, likelihoods, posterior")
+    _draw_legend_of_densities(axes)
+
+
+def _draw_stiffness(axes: Axes, result: StaticCalibration) -> None:
+    """Draw the densities of the tip stiffness."""
+    posterior = result.tip_stiffness_exact
+    particle = result.particle.stiffness
+    _draw_densities(axes, result.tip_stiffness_prior, posterior, particle, 1e-3)
+    axes.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
+    axes.set_ylabel("probability density (mm/N)")
+    text = f"{posterior.mean * 1e-3:.4f} ± {posterior.standard_deviation * 1e-3:.4f} N/mm"
+    axes.text(
+        0.99, 0.60, text, transform=axes.transAxes, color=style.PAST, ha="right", fontsize=6.8
+    )
+    style.panel_label(axes, "c", "Quantity of interest")
+    _draw_legend_of_densities(axes)
+
+
+def _draw_legend_of_densities(axes: Axes) -> None:
+    axes.legend(
+        loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35
+    )
+
+
 def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
+    """Draw the measured pairs, and the bands of load over displacement."""
     data = result.data
-    reach = 1.12 * float(data.displacement.max())
-    displacement = np.array([0.0, reach])
-    for posterior, colour, name, line in (
+    largest_displacement = 1.12 * float(data.displacement.max())
+    displacement = np.array([0.0, largest_displacement])
+    for density, colour, name, line in (
         (result.tip_stiffness_prior, style.REFERENCE, "prior", {"lw": 1.0, "ls": "--"}),
         (result.tip_stiffness_exact, style.PAST, "posterior", {"lw": 1.2}),
     ):
-        lower, upper = (end * displacement for end in posterior.interval(0.95))
-        label = f"{name}, 95 % band"
-        axes.fill_between(displacement * 1e3, lower, upper, color=colour, alpha=0.35, lw=0.0, label=label)
-        axes.plot(displacement * 1e3, posterior.mean * displacement, color=colour, **line)
+        lower, upper = density.interval(0.95)
+        axes.fill_between(
+            displacement * 1e3,
+            lower * displacement,
+            upper * displacement,
+            color=colour,
+            alpha=0.35,
+            lw=0.0,
+            label=f"{name}, 95 % band",
+        )
+        axes.plot(displacement * 1e3, density.mean * displacement, color=colour, **line)
     for number, index in enumerate(data.run_indices):
-        of_run = data.run == index
+        is_in_run = data.run == index
         axes.errorbar(
-            data.displacement[of_run] * 1e3, data.load[of_run],
+            data.displacement[is_in_run] * 1e3,
+            data.load[is_in_run],
             xerr=HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3,
             yerr=HALF_WIDTH_95 * data.load_standard_deviation,
-            fmt=_MARKERS[number % len(_MARKERS)], color=style.OBSERVED, ms=3.6, mew=0.9, elinewidth=0.8,
-            mfc="white" if number % 2 else style.OBSERVED, capsize=1.8, zorder=3 + number,
+            fmt=_MARKERS[number % len(_MARKERS)],
+            color=style.OBSERVED,
+            ms=3.6,
+            mew=0.9,
+            elinewidth=0.8,
+            mfc="white" if number % 2 else style.OBSERVED,
+            capsize=1.8,
+            zorder=3 + number,
             label=f"measured, run {index + 1}",
-        )  # fmt: skip
-    axes.set(xlim=(0.0, reach * 1e3), ylim=(0.0, 1.12 * float(data.load.max())))
+        )
+    axes.set(xlim=(0.0, largest_displacement * 1e3), ylim=(0.0, 1.12 * float(data.load.max())))
     axes.set_xlabel("tip displacement $x$ (mm)", parse_math=True)
     axes.set_ylabel("tip load $f$ (N)", parse_math=True)
     axes.legend(loc="upper left", handlelength=1.5)
@@ -188,20 +273,53 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
 
 
 def _draw_densities(
-    axes: Axes, prior: ScalarPosterior, exact: ScalarPosterior, particle: ScalarPosterior, scale: float = 1.0
+    axes: Axes,
+    prior: ScalarPosterior,
+    exact: ScalarPosterior,
+    particle: ScalarPosterior,
+    scale: float = 1.0,
 ) -> None:
-    """Draw prior, exact posterior with its 95 % interval, and the posterior of particles as a histogram."""
+    """Draw prior, exact posterior with its 95 % interval, and the particles as a histogram.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    prior, exact, particle : ScalarPosterior
+        The densities [SI].
+    scale : float
+        The factor from SI to the unit of the panel.
+    """
     lower, upper = exact.interval(0.95)
-    inside = (exact.grid >= lower) & (exact.grid <= upper)
+    is_inside = (exact.grid >= lower) & (exact.grid <= upper)
     axes.fill_between(
-        exact.grid[inside] * scale, exact.density[inside] / scale,
-        color=style.PAST, alpha=style.BAND_OPACITY, lw=0.0, label="95 % interval",
-    )  # fmt: skip
-    axes.plot(prior.grid * scale, prior.density / scale, color=style.REFERENCE, lw=1.8, label="prior")
-    axes.plot(exact.grid * scale, exact.density / scale, color=style.PAST, lw=1.6, label="posterior, exact")
+        exact.grid[is_inside] * scale,
+        exact.density[is_inside] / scale,
+        color=style.PAST,
+        alpha=style.BAND_OPACITY,
+        lw=0.0,
+        label="95 % interval",
+    )
+    axes.plot(
+        prior.grid * scale, prior.density / scale, color=style.REFERENCE, lw=1.8, label="prior"
+    )
+    axes.plot(
+        exact.grid * scale,
+        exact.density / scale,
+        color=style.PAST,
+        lw=1.6,
+        label="posterior, exact",
+    )
     edges = particle.mean + particle.standard_deviation * np.linspace(-4.0, 4.0, 33)
-    density = np.diff(particle.cumulative(edges)) / np.diff(edges)
-    axes.stairs(density / scale, edges * scale, color=style.PRESENT, lw=0.9, label="posterior, particles")
-    reach = 3.6 * prior.standard_deviation
-    ends = (prior.mean - reach) * scale, (prior.mean + reach) * scale
-    axes.set(xlim=ends, ylim=(0.0, 1.12 * float(exact.density.max()) / scale))
+    histogram = np.diff(particle.cumulative(edges)) / np.diff(edges)
+    axes.stairs(
+        histogram / scale,
+        edges * scale,
+        color=style.PRESENT,
+        lw=0.9,
+        label="posterior, particles",
+    )
+    half_width = 3.6 * prior.standard_deviation
+    left = (prior.mean - half_width) * scale
+    right = (prior.mean + half_width) * scale
+    axes.set(xlim=(left, right), ylim=(0.0, 1.12 * float(exact.density.max()) / scale))

@@ -1,13 +1,14 @@
-"""Calibration step 2 alone, as in Fig. 5 of the paper: e and the tip stiffness, exactly and by particles."""
+"""Calibration step 2, as in Fig. 5 of the paper: e and tip stiffness, exactly and by particles."""
 
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from calibration.errors import OutsideValidityError, PosteriorError, said
+from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
 from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import (
@@ -21,33 +22,38 @@ from calibration.static.posterior import (
 from reporting.arrays import Float
 
 DEFAULT_PARTICLE_COUNT = 1_000_000
-"""Particles, and samples of each measured pair, in the authors' script."""
+"""Number of particles, and of samples of each measured pair, in the authors' script."""
 
-CELLS_PER_BANDWIDTH, KEPT = 128, 32
-"""Cells of a kernel density within one bandwidth, so many that few samples are less than 0.1 % off; one of
-so many is kept of a posterior."""
+CELLS_PER_BANDWIDTH = 128
+"""Cells of a kernel density within one bandwidth; the error by binning is then below 0.1 %."""
 
-_KERNEL_REACH = 8.0  # bandwidths; the kernel beyond holds 1e-15
+CELLS_PER_STORED_VALUE = 32
+"""Cells of a kernel density for one value of the stored posterior."""
+
+_KERNEL_REACH = 8.0  # bandwidths; the probability of the kernel beyond is 1e-15
 _MEDIAN_DEVIATION_OF_GAUSSIAN = 0.6745  # of a standard Gaussian, as rounded in the rule
-_PURPOSE_PAIRS, _PURPOSE_PARTICLES = 0, 1
+_PURPOSE_PAIRS = 0  # of the seed
+_PURPOSE_PARTICLES = 1  # of the seed
 _FEWEST_EFFECTIVE_PARTICLES = 10.0
+_LIKELIHOOD_REACH = 8.0  # of the grid of likelihoods, in prior standard deviations
+_LIKELIHOOD_GRID_SIZE = 801
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ParticlePosterior(ScalarPosterior):
-    """p(e | measured pairs) as weighted particles, summarised.
+    """The density p(e | measured pairs) of weighted particles.
 
-    The density is a kernel density of the weighted particles, for plots and samples; `mean` and
-    `standard_deviation` are those of the particles, without the kernel's width.
+    The density is a kernel density of the particles, for plots and samples; `mean` and
+    `standard_deviation` are those of the particles, without the width of the kernel.
 
     Attributes
     ----------
     likelihood_grid : (N,) array
-        Values of e at which the likelihoods are kept.
+        The values of e at which the likelihoods are stored.
     likelihood : (n_pairs, N) array
-        Kernel density of e from each pair alone: the paper's likelihood curves in Fig. 5.
+        The kernel density of e from each pair alone: the paper's likelihood curves in Fig. 5.
     stiffness : ScalarPosterior
-        The particles' tip stiffness k(e) [N/m], in the same way.
+        The density of the particles' tip stiffness k(e) [N/m].
     """
 
     likelihood_grid: Float
@@ -56,18 +62,35 @@ class ParticlePosterior(ScalarPosterior):
 
 
 def reference_bandwidth_factor(count: float) -> float:
-    """Return (4 / (3 n))^(1/5), the bandwidth that is optimal for n standard Gaussian samples."""
+    """Return (4 / (3 n))^(1/5), the optimal bandwidth for n standard Gaussian samples."""
     return math.exp(0.2 * math.log(4.0 / (3.0 * count)))
 
 
 def normal_reference_bandwidth(samples: Float) -> float:
-    """Return the bandwidth that is optimal for Gaussian data: sigma_robust * (4 / (3 n))^(1/5).
+    """Return the optimal bandwidth for Gaussian data: sigma_robust * (4 / (3 n))^(1/5).
 
-    sigma_robust is the median absolute deviation from the median over 0.6745. This is the default of
-    MATLAB's `fitdist(samples, 'kernel')`, which the authors used (Bowman and Azzalini 1997).
+    sigma_robust is the median absolute deviation from the median over 0.6745. This is the default
+    of MATLAB's `fitdist(samples, 'kernel')`, which the authors used (Bowman and Azzalini 1997).
+
+    Parameters
+    ----------
+    samples : (n,) array
+        The samples.
     """
-    sigma = float(np.median(np.abs(samples - np.median(samples)))) / _MEDIAN_DEVIATION_OF_GAUSSIAN
+    absolute_deviations = np.abs(samples - np.median(samples))
+    sigma = float(np.median(absolute_deviations)) / _MEDIAN_DEVIATION_OF_GAUSSIAN
     return sigma * reference_bandwidth_factor(samples.size)
+
+
+class KernelDensity(NamedTuple):
+    """A density (N,) on an even grid (N,)."""
+
+    grid: Float
+    density: Float
+
+    def at(self, values: Float) -> Float:
+        """Return the density at values by linear interpolation, elementwise."""
+        return np.asarray(np.interp(values, self.grid, self.density))
 
 
 def kernel_density(
@@ -75,16 +98,31 @@ def kernel_density(
     bandwidth: float,
     window: tuple[float, float],
     weights: Float | None = None,
-) -> tuple[Float, Float]:
-    """Return grid (N,) and Gaussian kernel density (N,) of samples (n,) over a window."""
-    reach = _KERNEL_REACH * bandwidth
-    ends = window[0] - reach, window[1] + reach
+) -> KernelDensity:
+    """Return the Gaussian kernel density of samples.
+
+    Parameters
+    ----------
+    samples : (n,) array
+        The samples.
+    bandwidth : float
+        The standard deviation of the kernel.
+    window : (float, float)
+        The range of the density.
+    weights : (n,) array, optional
+        The weights of the samples; equal by default.
+    """
+    lower = window[0] - _KERNEL_REACH * bandwidth
+    upper = window[1] + _KERNEL_REACH * bandwidth
     spacing = bandwidth / CELLS_PER_BANDWIDTH
-    mass, edges = np.histogram(samples, math.ceil((ends[1] - ends[0]) / spacing), ends, weights=weights)
-    whole = samples.size if weights is None else weights.sum()
-    density = mass / (whole * (edges[1] - edges[0]))
-    smooth = gaussian_filter1d(density, CELLS_PER_BANDWIDTH, mode="constant", truncate=_KERNEL_REACH)
-    return 0.5 * (edges[1:] + edges[:-1]), smooth
+    cell_count = math.ceil((upper - lower) / spacing)
+    cell_weight, edges = np.histogram(samples, cell_count, (lower, upper), weights=weights)
+    total_weight = samples.size if weights is None else weights.sum()
+    density = cell_weight / (total_weight * (edges[1] - edges[0]))
+    smooth = gaussian_filter1d(
+        density, CELLS_PER_BANDWIDTH, mode="constant", truncate=_KERNEL_REACH
+    )
+    return KernelDensity(grid=0.5 * (edges[1:] + edges[:-1]), density=smooth)
 
 
 def particle_filter(
@@ -95,100 +133,140 @@ def particle_filter(
     prior: GaussianPrior | None = None,
     particle_count: int = DEFAULT_PARTICLE_COUNT,
 ) -> ParticlePosterior:
-    """Weigh particles drawn from the prior by the kernel likelihood of one pair after the other.
+    """Return the posterior of e by the paper's particle filter.
 
-    The likelihood of a pair is the paper's: loads and displacements are drawn from the Gaussians of their
-    readings; each drawn pair is turned into a stiffness and, through the inverse of eq. (14), into a sample
-    of e, whose kernel density it is. As the number of samples grows, it tends to the measure "ratio" of
-    `errors_in_variables`, which is known in closed form. Weights are multiplied in the log domain and
-    normalised; the result repeats bit for bit with the seed.
+    Particles are drawn from the prior and weighted by the likelihood of one pair after the other.
+    The likelihood of a pair is the paper's: loads and displacements are drawn from the Gaussians of
+    their readings; each drawn pair gives a stiffness and, by the inverse of eq. (14), a sample of
+    e; the likelihood is the kernel density of these samples. As their number grows, it tends to the
+    measure "ratio" of `errors_in_variables`, which is known in closed form. Logarithms of weights
+    are added; the result repeats bit for bit with the seed.
 
     Parameters
     ----------
     data : LoadDisplacementData
         The measured pairs.
     seed : int or SeedSequence
-        Seed of all draws.
+        The seed of all draws.
     curve : StiffnessCurve
-        k(e).
+        The stiffness k(e).
     prior : GaussianPrior, optional
-        Prior of e; the paper's by default.
+        The prior of e; the paper's by default.
     particle_count : int
-        Number of particles, and of samples for each pair.
+        The number of particles, and of samples for each pair.
 
     Raises
     ------
     PosteriorError
-        If fewer than ten effective particles remain: prior and measurements contradict each other, or there
-        are too few particles.
+        If fewer than ten effective particles remain, because prior and measurements contradict each
+        other or there are too few particles.
     """
     prior = prior or GaussianPrior()
     generator = np.random.default_rng(child_seed(seed, _PURPOSE_PARTICLES))
-    of_pairs = np.random.default_rng(child_seed(seed, _PURPOSE_PAIRS))
+    pair_generator = np.random.default_rng(child_seed(seed, _PURPOSE_PAIRS))
     particles = prior.mean + prior.standard_deviation * generator.standard_normal(particle_count)
-    kept_at = prior.mean + prior.standard_deviation * np.linspace(-8.0, 8.0, 801)
-    window = float(kept_at[0]), float(kept_at[-1])
-    log_weight, weight = np.zeros(particle_count), np.empty(0)
-    likelihood = np.zeros((data.count, kept_at.size))
-    for pair, (load, displacement) in enumerate(zip(data.load, data.displacement, strict=True)):
-        loads = load + data.load_standard_deviation * of_pairs.standard_normal(particle_count)
-        scatter = data.displacement_standard_deviation * of_pairs.standard_normal(particle_count)
-        factors = curve.young_modulus_factor(loads / (displacement + scatter))
-        known = kernel_density(factors, normal_reference_bandwidth(factors), window)
-        likelihood[pair] = np.interp(kept_at, *known)
+    standardised_grid = np.linspace(-_LIKELIHOOD_REACH, _LIKELIHOOD_REACH, _LIKELIHOOD_GRID_SIZE)
+    likelihood_grid = prior.mean + prior.standard_deviation * standardised_grid
+    window = float(likelihood_grid[0]), float(likelihood_grid[-1])
+
+    # Weights, pair by pair
+    log_weight = np.zeros(particle_count)
+    likelihood = np.zeros((data.count, likelihood_grid.size))
+    for pair in range(data.count):
+        density = _pair_density(data, pair, curve, window, pair_generator, particle_count)
+        likelihood[pair] = density.at(likelihood_grid)
         with np.errstate(divide="ignore"):  # a particle that no sample reaches has weight zero
-            log_weight += np.log(np.interp(particles, *known))
-        largest = float(log_weight.max())
-        if largest == -math.inf:
-            given = pair + 1, load, displacement * 1e3
-            raise PosteriorError(said("particles.unexplained", given=given, data=data, prior=prior))
-        weight = np.exp(log_weight - largest)
-        weight /= weight.sum()
+            log_weight += np.log(density.at(particles))
+        if float(log_weight.max()) == -math.inf:
+            raise PosteriorError(
+                f"no particle explains pair {pair + 1} ({data.load[pair]:g} N, "
+                f"{data.displacement[pair] * 1e3:g} mm) of {data.source} and those before it; "
+                f"check the prior N({prior.mean:g}, {prior.standard_deviation:.3g}^2), the units "
+                "and the curve."
+            )
+    weight = np.exp(log_weight - float(log_weight.max()))
+    weight /= weight.sum()
     effective = 1.0 / float(np.sum(weight**2))
     if effective < _FEWEST_EFFECTIVE_PARTICLES:
-        left = effective, particle_count
-        raise PosteriorError(said("particles.effective", left=left, data=data))
-    mean, standard_deviation = _moments(weight, particles)
-    # The spread of the weighted particles, in the rule's place of the median deviation.
-    bandwidth = standard_deviation * reference_bandwidth_factor(effective)
-    grid, density = kernel_density(particles, bandwidth, window, weight)
-    smooth = ScalarPosterior(grid[::KEPT], density[::KEPT])
-    pushed = push_forward(smooth, curve)
+        raise PosteriorError(
+            f"only {effective:.1f} of {particle_count} particles effectively remain after "
+            f"{data.count} pairs; take more particles, or the exact posterior."
+        )
+
+    # Densities of e and of the stiffness. The standard deviation of the weighted particles replaces
+    # the robust one in the rule of the bandwidth.
+    e = _weighted_moments(weight, particles)
+    stiffness = _weighted_moments(weight, curve.stiffness(particles))
+    bandwidth = e.standard_deviation * reference_bandwidth_factor(effective)
+    grid, grid_density = kernel_density(particles, bandwidth, window, weight)
+    stored = ScalarPosterior(grid[::CELLS_PER_STORED_VALUE], grid_density[::CELLS_PER_STORED_VALUE])
+    stiffness_density = push_forward(stored, curve)
     return ParticlePosterior(
-        grid=smooth.grid,
-        density=smooth.density,
-        mean=mean,
-        standard_deviation=standard_deviation,
-        likelihood_grid=kept_at,
+        grid=stored.grid,
+        density=stored.density,
+        mean=e.mean,
+        standard_deviation=e.standard_deviation,
+        likelihood_grid=likelihood_grid,
         likelihood=likelihood,
-        stiffness=ScalarPosterior(pushed.grid, pushed.density, *_moments(weight, curve.stiffness(particles))),
+        stiffness=ScalarPosterior(
+            stiffness_density.grid,
+            stiffness_density.density,
+            mean=stiffness.mean,
+            standard_deviation=stiffness.standard_deviation,
+        ),
     )
 
 
-def _moments(weight: Float, value: Float) -> tuple[float, float]:
+def _pair_density(
+    data: LoadDisplacementData,
+    pair: int,
+    curve: StiffnessCurve,
+    window: tuple[float, float],
+    generator: np.random.Generator,
+    count: int,
+) -> KernelDensity:
+    """Return the kernel density of e over a window, from samples of one measured pair."""
+    load_error = data.load_standard_deviation * generator.standard_normal(count)
+    displacement_error = data.displacement_standard_deviation * generator.standard_normal(count)
+    load = data.load[pair] + load_error
+    displacement = data.displacement[pair] + displacement_error
+    factors = curve.young_modulus_factor(load / displacement)
+    return kernel_density(factors, normal_reference_bandwidth(factors), window)
+
+
+class _Moments(NamedTuple):
+    """Mean and standard deviation."""
+
+    mean: float
+    standard_deviation: float
+
+
+def _weighted_moments(weight: Float, value: Float) -> _Moments:
+    """Return the moments of values (N,) with weights (N,) whose sum is 1."""
     # Pairwise sums rather than dot products, whose last bits depend on the number of BLAS threads.
     mean = float(np.sum(weight * value))
-    return mean, math.sqrt(float(np.sum(weight * (value - mean) ** 2)))
+    variance = float(np.sum(weight * (value - mean) ** 2))
+    return _Moments(mean, math.sqrt(variance))
 
 
 @dataclass(frozen=True, eq=False)
 class StaticCalibration:
-    """Everything that calibration step 2 found.
+    """All results of calibration step 2.
 
     Attributes
     ----------
     data : LoadDisplacementData
         The measured pairs.
     curve : StiffnessCurve
-        k(e).
+        The stiffness k(e).
     prior : GaussianPrior
-        p(e).
+        The prior p(e).
     particle : ParticlePosterior
-        p(e | pairs) by the paper's particle filter.
+        The posterior p(e | pairs) by the paper's particle filter.
     exact : ScalarPosterior
-        p(e | pairs) with errors in both variables, by quadrature.
+        The posterior p(e | pairs) with errors in both variables, by quadrature.
     alternatives : dict of str to ScalarPosterior
-        The exact posterior under other assumptions; those that leave the range of the curve are missing.
+        The exact posterior under other assumptions, unless it leaves the range of the curve.
     """
 
     data: LoadDisplacementData
@@ -227,45 +305,69 @@ def calibrate_static(
     *,
     particle_count: int = DEFAULT_PARTICLE_COUNT,
 ) -> StaticCalibration:
-    """Find the posterior of e in both ways, and under other assumptions.
+    """Return the posterior of e by both methods, and under other assumptions.
 
     Parameters
     ----------
     curve : StiffnessCurve
-        k(e); the published line by default, `stiffness_curve_of(model)` for a structural model.
+        The stiffness k(e): the published line by default, `stiffness_curve_of` of a structural
+        model.
     data : LoadDisplacementData, optional
-        The measured pairs; the published eight by default.
+        The measured pairs; the eight published ones by default.
     seed : int
-        Seed of the particle filter.
+        The seed of the particle filter.
     particle_count : int
-        Particles of the filter.
+        The number of particles of the filter.
 
     Raises
     ------
     OutsideValidityError, PosteriorError
         See `exact_posterior` and `particle_filter`.
     """
-    data = published_measurements() if data is None else data
+    if data is None:
+        data = published_measurements()
     prior = GaussianPrior()
     exact = exact_posterior(data, curve=curve, prior=prior)
-    particle = particle_filter(data, seed=seed, curve=curve, prior=prior, particle_count=particle_count)
+    particle = particle_filter(
+        data, seed=seed, curve=curve, prior=prior, particle_count=particle_count
+    )
     alternatives = {}
+    # Name, measure, and standard deviation of the zero offset that each loading run shares
     assumptions: tuple[tuple[str, Measure, float], ...] = (
         ("flat in load", "load", 0.0),
-        ("ratio", "ratio", 0.0),  # what the particle filter tends to
-        ("zero offsets", "displacement", data.displacement_standard_deviation),  # that each run shares
+        ("ratio", "ratio", 0.0),  # the limit of the particle filter
+        ("zero offsets", "displacement", data.displacement_standard_deviation),
     )
     for name, measure, offset in assumptions:
         with suppress(OutsideValidityError):
             alternatives[name] = exact_posterior(
-                data, curve=curve, prior=prior, measure=measure, zero_offset_standard_deviation=offset
+                data,
+                curve=curve,
+                prior=prior,
+                measure=measure,
+                zero_offset_standard_deviation=offset,
             )
-    return StaticCalibration(data, curve, prior, particle, exact, alternatives)
+    return StaticCalibration(
+        data=data,
+        curve=curve,
+        prior=prior,
+        particle=particle,
+        exact=exact,
+        alternatives=alternatives,
+    )
 
 
 def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPosterior:
-    """Return the density of k(e), p(e) / (dk/de), over the part of the grid on which k is positive."""
+    """Return the density of k(e), p(e) / (dk/de), where k is positive.
+
+    Parameters
+    ----------
+    posterior : ScalarPosterior
+        The density of e.
+    curve : StiffnessCurve
+        The stiffness k(e).
+    """
     stiffness = curve.stiffness(posterior.grid)
-    positive = stiffness > 0.0
-    density = posterior.density[positive] / curve.slope(posterior.grid[positive])
-    return ScalarPosterior(stiffness[positive], density)
+    is_positive = stiffness > 0.0
+    density = posterior.density[is_positive] / curve.slope(posterior.grid[is_positive])
+    return ScalarPosterior(stiffness[is_positive], density)

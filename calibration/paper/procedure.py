@@ -1,8 +1,8 @@
 """The paper's step 3: point masses and Rayleigh damping for each sample of e.
 
-Kapteyn et al. 2021, eqs. (19) and (20): the masses that bring the first two flapwise frequencies nearest to
-the measured ones, under the weighed total; eq. (25): the Rayleigh coefficients that give the two modes their
-measured damping ratios through eq. (18).
+Kapteyn et al. 2021, eqs. (19) and (20): the masses that bring the first two flapwise frequencies
+nearest to the measured ones, for the weighed total; eq. (25): the Rayleigh coefficients that give
+the two modes their measured damping ratios by eq. (18).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,8 +13,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from calibration.dynamics.records import STEP_FOLDER
-from calibration.errors import ExperimentDataError, said
-from calibration.joint.measured_modes import MODAL
+from calibration.errors import ExperimentDataError
 from calibration.joint.posterior import servo_range
 from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
@@ -24,18 +23,22 @@ from reporting.arrays import Float
 RESULTS_FILE = "massoptimizationresults.csv"
 """The authors' masses and frequencies for each of their samples of e."""
 
-_RESULT_COLUMNS = (
-    "e_sample", "mass_servo_1", "mass_pitot", "freq_1", "freq_2", "zeta_1", "zeta_2",
-    "target_freq_1", "target_freq_2",
-)  # fmt: skip
-
+_AT_LIMIT = 1e-6  # kg between a mass and the end of its range
 
 FrequencyModel = Callable[[Float], Float]
-"""Rows of e, servo and pitot mass [kg] (N, 3) to the frequencies of the two flapwise modes (N, 2) [Hz]."""
+"""Returns the flapwise frequencies (N, 2) [Hz] of rows of e, servo and pitot mass (N, 3) [kg]."""
 
 
 class PaperSamples(NamedTuple):
-    """Samples of e, servo and pitot mass, alpha and beta (N, 5), and the model's frequencies (N, 2)."""
+    """Samples of the state by the paper's procedure.
+
+    Attributes
+    ----------
+    samples : (N, 5) array
+        The samples of e [1], servo and pitot mass [kg], alpha [1/s] and beta [s].
+    frequency : (N, 2) array
+        The model's two flapwise frequencies [Hz].
+    """
 
     samples: Float
     frequency: Float
@@ -47,57 +50,102 @@ def fit_masses(
     validity: Mapping[str, tuple[float, float]],
     readings: Sequence[Reading],
 ) -> PaperSamples:
-    """Find masses under the weighed total, then damping, for each sample of e.
+    """Return masses with the weighed total, and damping coefficients, for each sample of e.
 
-    One mass is free: the pitot tube has what two servos leave of the total. The search, of Brent, ends at
-    1 microgram; the authors', of Nelder and Mead, ends at 1 g.
+    One mass is unknown: the pitot tube has the rest of the total. Brent's search ends at 1
+    microgram; the authors' search, of Nelder and Mead, ends at 1 g.
 
     Parameters
     ----------
     frequencies : callable
-        Of a model, such as `WingTable.frequency`.
+        The flapwise frequencies of a model, such as `WingTable.frequency`.
     young_modulus_factor : (N,) array
-        Samples of e [1].
+        The samples of e [1].
     validity : mapping of str to (float, float)
-        Range of the masses for which the model may be asked [kg].
+        The ranges of the masses in the model [kg].
     readings : sequence of Reading
         The weighed mass and both modes.
 
     Raises
     ------
     ExperimentDataError
-        If no masses within the range keep the total, the best lie at the limit of the range, or the damping
-        ratios need a negative Rayleigh coefficient.
+        If no masses within the range have the total, the best lie at the limit of the range, or the
+        damping ratios need a negative Rayleigh coefficient.
     OutsideValidityError
         If a sample of e lies outside the range of the model.
     """
-    measured = {item.name: item.value for item in readings}
-    total_mass, wanted = measured["weighed_mass"], np.array([measured[name] for name in MODAL[:2]])
-    lower, upper = servo_range(validity, total_mass)
-    samples, pairs = [], []
+    measured = {reading.name: reading.value for reading in readings}
+    total_mass = measured["weighed_mass"]
+    target = np.array([measured["frequency_1"], measured["frequency_2"]])
+    ratios = measured["damping_ratio_1"], measured["damping_ratio_2"]
+    limits = servo_range(validity, total_mass)
+    samples = []
+    fitted_frequencies = []
     for factor in young_modulus_factor.tolist():
+        servo_mass = _nearest_servo_mass(frequencies, factor, total_mass, target, limits)
+        pitot_mass = total_mass - 2.0 * servo_mass
+        fitted = frequencies(np.array([[factor, servo_mass, pitot_mass]]))[0]
+        frequency_1, frequency_2 = fitted.tolist()
+        alpha, beta = damping_coefficients((frequency_1, frequency_2), ratios)
+        samples.append((factor, servo_mass, pitot_mass, alpha, beta))
+        fitted_frequencies.append(fitted)
+    return PaperSamples(np.array(samples), np.array(fitted_frequencies))
 
-        def error(mass: float, factor: float = factor) -> float:
-            found = frequencies(np.array([[factor, mass, total_mass - 2.0 * mass]]))[0]
-            return 0.5 * float(np.abs(found / wanted - 1.0).sum())
 
-        servo = float(
-            minimize_scalar(error, bounds=(lower, upper), method="bounded", options={"xatol": 1e-9}).x
+def _nearest_servo_mass(
+    frequencies: FrequencyModel,
+    factor: float,
+    total_mass: float,
+    target: Float,
+    limits: tuple[float, float],
+) -> float:
+    """Return the servo mass [kg] that brings the model's frequencies nearest to a target.
+
+    Parameters
+    ----------
+    frequencies : callable
+        The flapwise frequencies of the model.
+    factor : float
+        The value of e [1].
+    total_mass : float
+        The weighed mass of two servos and the pitot tube [kg].
+    target : (2,) array
+        The measured frequencies [Hz].
+    limits : (float, float)
+        The range of the servo mass [kg].
+
+    Raises
+    ------
+    ExperimentDataError
+        If the mass lies at an end of its range.
+    """
+
+    def mean_error(servo_mass: float) -> float:
+        state = [factor, servo_mass, total_mass - 2.0 * servo_mass]
+        ratio = frequencies(np.array([state]))[0] / target
+        return 0.5 * float(np.abs(ratio - 1.0).sum())
+
+    search = minimize_scalar(mean_error, bounds=limits, method="bounded", options={"xatol": 1e-9})
+    servo_mass = float(search.x)
+    lower, upper = limits
+    if min(servo_mass - lower, upper - servo_mass) < _AT_LIMIT:
+        raise ExperimentDataError(
+            f"at e = {factor:g} the masses nearest to {target[0]:.4g} and {target[1]:.4g} Hz "
+            f"lie at the limit of the model, {servo_mass:.4g} kg for a servo under a total of "
+            f"{total_mass:g} kg; check the measured frequencies and the total."
         )
-        if min(servo - lower, upper - servo) < 1e-6:
-            found = servo, total_mass
-            raise ExperimentDataError(said("paper.masses", factor=factor, wanted=wanted, masses=found))
-        masses = factor, servo, total_mass - 2.0 * servo
-        pairs.append(frequencies(np.array([masses]))[0])
-        ratios = measured[MODAL[2]], measured[MODAL[3]]
-        samples.append((*masses, *damping_coefficients(tuple(pairs[-1].tolist()), ratios)))
-    return PaperSamples(np.array(samples), np.array(pairs))
+    return servo_mass
 
 
 def damping_coefficients(
     frequency: tuple[float, float], damping_ratio: tuple[float, float]
 ) -> tuple[float, float]:
     """Return alpha [1/s] and beta [s] by eq. (25).
+
+    Parameters
+    ----------
+    frequency, damping_ratio : (float, float)
+        The frequencies [Hz] and damping ratios [1] of the two modes.
 
     Raises
     ------
@@ -106,13 +154,17 @@ def damping_coefficients(
     """
     alpha, beta = rayleigh_coefficients(frequency, damping_ratio)
     if alpha < 0.0 or beta < 0.0:
-        modes = *damping_ratio, *frequency
-        raise ExperimentDataError(said("paper.negative", modes=modes, alpha=alpha, beta=beta))
+        raise ExperimentDataError(
+            f"damping ratios {damping_ratio[0]:g} at {frequency[0]:.4g} Hz and "
+            f"{damping_ratio[1]:g} at {frequency[1]:.4g} Hz need Rayleigh coefficients of "
+            f"{alpha:.3g} 1/s and {beta:.3g} s, but neither may be negative; "
+            "check the ring-down records."
+        )
     return alpha, beta
 
 
 def read_published_results(path: Path) -> PaperSamples:
-    """Read the authors' masses and frequencies, and add alpha and beta by eq. (25).
+    """Return the authors' masses and frequencies, with alpha and beta by eq. (25).
 
     Parameters
     ----------
@@ -127,10 +179,17 @@ def read_published_results(path: Path) -> PaperSamples:
         If a value is not positive and finite.
     """
     table = lab_table(path, STEP_FOLDER / RESULTS_FILE)
-    columns = np.array(
-        [table.numbers(name, "the authors' step 3", positive=True) for name in _RESULT_COLUMNS]
-    )
-    first, second = columns[5:7, 0].tolist()
-    pairs = columns[3:5].T
-    damping = [damping_coefficients((f1, f2), (first, second)) for f1, f2 in pairs.tolist()]
-    return PaperSamples(np.column_stack([columns[:3].T, damping]), pairs)
+
+    def column(name: str) -> Float:
+        return table.numbers(name, "the authors' step 3", positive=True)
+
+    states = np.column_stack([column("e_sample"), column("mass_servo_1"), column("mass_pitot")])
+    frequencies = np.column_stack([column("freq_1"), column("freq_2")])
+    # All rows have the same measured ratios.
+    ratios = float(column("zeta_1")[0]), float(column("zeta_2")[0])
+    for target in ("target_freq_1", "target_freq_2"):
+        column(target)  # not used, but must hold positive numbers
+    damping = []
+    for frequency_1, frequency_2 in frequencies.tolist():
+        damping.append(damping_coefficients((frequency_1, frequency_2), ratios))
+    return PaperSamples(np.column_stack([states, damping]), frequencies)

@@ -1,1 +1,1 @@
-"""What every calibration leaves: samples of named figures, their file, their page and their folder."""
+"""The result of every calibration: samples of named figures, file, page and folder."""

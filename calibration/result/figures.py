@@ -1,5 +1,6 @@
-"""Figures of any calibration: samples pair by pair with their correlations, and readings beside the model."""
+"""Figures of any calibration: samples pair by pair, and readings beside the model."""
 
+import math
 from collections.abc import Sequence
 from textwrap import fill
 
@@ -19,92 +20,146 @@ from reporting.arrays import Float
 _COLOURS = (style.PAST, style.PRESENT, style.REFERENCE)
 _COLUMNS = 3
 _MOST_READINGS = 12
-_TITLE_WIDTH = 14  # letters of a line beside an axis
+_TITLE_WIDTH = 14  # of a line beside an axis, in characters
 
 
 def drawn_parameters(result: Calibration) -> tuple[list[int], list[str]]:
-    """Return which parameters are drawn pair by pair, those that have no reading of their own, and titles."""
+    """Return the columns and titles of the parameters without a reading of their own.
+
+    These parameters are drawn pair by pair.
+    """
     measured = {reading.name for reading in result.readings}
-    drawn = {at: prior.figure for at, prior in enumerate(result.priors) if prior.name not in measured}
-    return list(drawn), [fill(figure.axis_title, _TITLE_WIDTH) for figure in drawn.values()]
+    columns = []
+    titles = []
+    for column, prior in enumerate(result.priors):
+        if prior.name not in measured:
+            columns.append(column)
+            titles.append(fill(prior.figure.axis_title, _TITLE_WIDTH))
+    return columns, titles
 
 
 @style.publication_style()
 def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> Figure:
-    """Draw samples pair by pair, with their correlations, and others beside.
+    """Return the figure of samples pair by pair, with their correlations.
 
     Parameters
     ----------
     titles : sequence of str
-        What each figure is, with its unit.
+        The title of each parameter, with its unit.
     sets : sequence of (str, (N, F) array)
-        Name and samples, in the units of the titles, of up to three distributions; correlations are those of
-        the first, and each histogram has a scale of its own.
+        The names and samples of up to three distributions, in the units of the titles. Correlations
+        are those of the first, and each histogram has a scale of its own.
     """
-    correlation: Float = np.atleast_2d(np.corrcoef(sets[0][1], rowvar=False))
+    samples = [values for _, values in sets]
+    correlation: Float = np.atleast_2d(np.corrcoef(samples[0], rowvar=False))
     size = len(titles)
     height = min(6.6, 1.1 + 1.1 * size)
     bottom = height * (0.075 if size > 3 else 0.16)
     figure, grid = style.panels(
         size, size, height, 0.015 * height, bottom, left=0.105, wspace=0.10, hspace=0.10
     )
-    coloured = list(zip(_COLOURS, sets, strict=False))
-    limits = [_limits([values[:, index] for _, values in sets]) for index in range(size)]
+    limits = [_limits([values[:, column] for values in samples]) for column in range(size)]
     for (row, column), axes in np.ndenumerate(np.array(grid)):
         if column > row:
-            value = float(correlation[row, column])
-            axes.set_axis_off()
-            axes.text(
-                0.5, 0.5, f"{value:+.2f}".replace("-", "−"), ha="center", va="center",
-                transform=axes.transAxes, fontsize=6.5 + 5.0 * abs(value),
-                color=style.PAST if abs(value) > NOTICEABLE_CORRELATION else style.OBSERVED,
-            )  # fmt: skip
+            _write_correlation(axes, float(correlation[row, column]))
             continue
-        axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
-        axes.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
-        axes.ticklabel_format(useOffset=False)
-        axes.tick_params(labelsize=6.5)
-        axes.set(xlim=limits[column], xlabel=titles[column], ylabel=titles[row] if row > column else "")
+        _prepare_corner_axes(axes)
+        axes.set(xlim=limits[column], xlabel=titles[column])
+        axes.set_ylabel(titles[row] if row > column else "")
         axes.label_outer()
         if column == row:
-            axes.set(ylim=(0.0, 1.12), yticks=[])
-            axes.spines["left"].set_visible(False)
+            _draw_histograms(axes, [values[:, row] for values in samples], limits[row])
         else:
             axes.set_ylim(limits[row])
-        for colour, (_, values) in coloured:
-            if column < row:
-                axes.plot(
-                    values[:, column], values[:, row], ".", color=colour, ms=1.6, alpha=0.35, mew=0.0,
-                    rasterized=True,
-                )  # fmt: skip
-                continue
-            counts, edges = np.histogram(values[:, row], bins=np.linspace(*limits[row], 31))
-            first = values is sets[0][1]
-            look = {"fill": True, "alpha": 0.45, "lw": 0.0} if first else {"lw": 0.9}
-            axes.stairs(counts / max(counts.max(), 1), edges, color=colour, **look)
-    handles = [
-        Line2D([], [], linestyle="none", marker="s", color=colour, ms=4.0, label=text)
-        for colour, (text, _) in coloured
-    ]
+            _draw_scatter(axes, samples, column, row)
+    handles = []
+    for colour, (name, _) in zip(_COLOURS, sets, strict=False):
+        handles.append(
+            Line2D([], [], linestyle="none", marker="s", color=colour, ms=4.0, label=name)
+        )
     figure.legend(handles=handles, loc="upper right", bbox_to_anchor=(0.985, 0.99))
     return figure
 
 
-def _limits(sets: Sequence[Float]) -> tuple[float, float]:
-    low, high = np.quantile(sets[0], [0.002, 0.998])
-    low, high = min(low, *map(np.min, sets[1:]), low), max(high, *map(np.max, sets[1:]), high)
-    margin = 0.06 * (high - low) or 1e-3 * abs(high)
+def _write_correlation(axes: Axes, correlation: float) -> None:
+    axes.set_axis_off()
+    is_noticeable = abs(correlation) > NOTICEABLE_CORRELATION
+    axes.text(
+        0.5,
+        0.5,
+        f"{correlation:+.2f}".replace("-", "−"),
+        ha="center",
+        va="center",
+        transform=axes.transAxes,
+        fontsize=6.5 + 5.0 * abs(correlation),
+        color=style.PAST if is_noticeable else style.OBSERVED,
+    )
+
+
+def _prepare_corner_axes(axes: Axes) -> None:
+    axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+    axes.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
+    axes.ticklabel_format(useOffset=False)
+    axes.tick_params(labelsize=6.5)
+
+
+def _draw_histograms(axes: Axes, samples: Sequence[Float], limits: tuple[float, float]) -> None:
+    """Draw the histograms of up to three sets of samples (N,), the first filled."""
+    axes.set(ylim=(0.0, 1.12), yticks=[])
+    axes.spines["left"].set_visible(False)
+    bins = np.linspace(*limits, 31)
+    for number, (colour, values) in enumerate(zip(_COLOURS, samples, strict=False)):
+        counts, edges = np.histogram(values, bins=bins)
+        heights = counts / max(counts.max(), 1)
+        if number == 0:
+            axes.stairs(heights, edges, color=colour, fill=True, alpha=0.45, lw=0.0)
+        else:
+            axes.stairs(heights, edges, color=colour, lw=0.9)
+
+
+def _draw_scatter(axes: Axes, samples: Sequence[Float], column: int, row: int) -> None:
+    """Draw two columns of up to three sets of samples (N, F) against each other."""
+    for colour, values in zip(_COLOURS, samples, strict=False):
+        axes.plot(
+            values[:, column],
+            values[:, row],
+            ".",
+            color=colour,
+            ms=1.6,
+            alpha=0.35,
+            mew=0.0,
+            rasterized=True,
+        )
+
+
+def _limits(samples: Sequence[Float]) -> tuple[float, float]:
+    """Return the limits of an axis for sets of samples (N,), without outliers of the first."""
+    first, *others = samples
+    low, high = np.quantile(first, [0.002, 0.998])
+    for values in others:
+        low = min(low, np.min(values))
+        high = max(high, np.max(values))
+    margin = 0.06 * (high - low)
+    if margin == 0.0:
+        margin = 1e-3 * abs(high)
     return float(low - margin), float(high + margin)
 
 
 @style.publication_style()
 def readings_figure(result: Calibration) -> Figure:
-    """Draw figures before and after, with what was measured of them."""
+    """Return the figure of calibrated quantities before and after, with their readings."""
     readings = result.readings[:_MOST_READINGS]
-    rows = -(-len(readings) // _COLUMNS)
+    rows = math.ceil(len(readings) / _COLUMNS)
     height = 0.5 + 1.55 * rows
     figure, grid = style.panels(
-        rows, _COLUMNS, height, 0.1 * height, 0.28 / rows * height, left=0.02, wspace=0.14, hspace=0.75
+        rows,
+        _COLUMNS,
+        height,
+        0.1 * height,
+        0.28 / rows * height,
+        left=0.02,
+        wspace=0.14,
+        hspace=0.75,
     )
     for axes, reading in zip(style.keep_first_panels(grid, len(readings)), readings, strict=True):
         _draw_reading(axes, result, reading)
@@ -113,15 +168,21 @@ def readings_figure(result: Calibration) -> Figure:
 
 
 def _draw_reading(axes: Axes, result: Calibration, reading: Reading) -> None:
-    prior, posterior = result.draws_of(reading.name, prior=True), result.draws_of(reading.name)
-    value, half = reading.value, HALF_WIDTH_95 * reading.deviation
+    """Draw prior and posterior of a quantity, with its reading."""
+    prior = result.draws_of(reading.name, prior=True)
+    posterior = result.draws_of(reading.name)
+    value = reading.value
+    half_width = HALF_WIDTH_95 * reading.deviation
     mean = float(posterior.mean())
-    spread = max(float(posterior.std()), 1e-6 * abs(mean))
-    low, high = min(mean - 4.5 * spread, value - 1.6 * half), max(mean + 4.5 * spread, value + 1.6 * half)
-    grid = np.linspace(max(low, 0.0) if mean > 0.0 else low, high, 301)
+    deviation = max(float(posterior.std()), 1e-6 * abs(mean))
+    low = min(mean - 4.5 * deviation, value - 1.6 * half_width)
+    high = max(mean + 4.5 * deviation, value + 1.6 * half_width)
+    if mean > 0.0:
+        low = max(low, 0.0)
+    grid = np.linspace(low, high, 301)
     axes.axvspan(
-        value - half,
-        value + half,
+        value - half_width,
+        value + half_width,
         color=style.OBSERVED,
         alpha=style.BAND_OPACITY,
         lw=0.0,
@@ -138,8 +199,9 @@ def _draw_reading(axes: Axes, result: Calibration, reading: Reading) -> None:
     else:
         axes.axvline(mean, color=style.PAST, lw=1.3, label="after the calibration")
     axes.plot(grid, before, color=style.REFERENCE, lw=1.2, ls="--", label="before")
-    title = next(figure.axis_title for figure in result.figures if figure.name == reading.name)
-    axes.set(xlim=(grid[0], grid[-1]), ylim=(0.0, 1.12 * top), yticks=[], xlabel=title)
+    titles = {figure.name: figure.axis_title for figure in result.figures}
+    axes.set(xlim=(grid[0], grid[-1]), ylim=(0.0, 1.12 * top), yticks=[])
+    axes.set_xlabel(titles[reading.name])
     axes.spines["left"].set_visible(False)
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.ticklabel_format(axis="x", useOffset=False)

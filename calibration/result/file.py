@@ -1,8 +1,8 @@
 """The file of a calibration: NetCDF-4 in the layout of ArviZ, sufficient by itself.
 
-Groups `posterior` and `prior` hold samples of each figure by (chain, draw) with its unit, `observed_data`
-readings that are more than one number; the root's attributes hold priors, readings, residuals, findings,
-provenance and, of a wing, its tailored design.
+The groups `posterior` and `prior` hold samples of each figure by (chain, draw) with its unit, and
+`observed_data` the readings that are more than one number. The attributes of the root hold priors,
+readings, residuals, findings, provenance and, for a wing, its tailored design.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
-from calibration.errors import CalibrationError, CalibrationRecordError, said
+from calibration.errors import CalibrationError, CalibrationRecordError
 from calibration.result.record import FROM_CAMPAIGN, FROM_LABORATORY, STATE, Calibration
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError, FileNotWrittenError
@@ -30,21 +30,23 @@ SCHEMA = "uav-twin calibration 2"
 """Value of the attribute `schema` of the root."""
 
 _HASH = "content_sha256"
-_WORDS = ("asset", "model", "model_hash", "design_hash", "procedure", "source", "seed")
-_IN_GROUPS = ("samples", "prior_samples", "measured")
-_AS_JSON = {
-    item.name: TypeAdapter(get_type_hints(Calibration)[item.name])
-    for item in fields(Calibration)
-    if item.name not in (*_WORDS, *_IN_GROUPS)
+_PLAIN_FIELDS = ("asset", "model", "model_hash", "design_hash", "procedure", "source", "seed")
+"""Fields of a calibration that are attributes of the root as they are."""
+_ARRAY_FIELDS = ("samples", "prior_samples", "measured")
+"""Fields of a calibration that stand in groups."""
+_JSON_FIELDS = {
+    field.name: TypeAdapter(get_type_hints(Calibration)[field.name])
+    for field in fields(Calibration)
+    if field.name not in (*_PLAIN_FIELDS, *_ARRAY_FIELDS)
 }
-"""What writes and reads the fields of a calibration that are no words, no seed and no array."""
+"""The other fields with their adapters; they are attributes of the root in JSON."""
 
 Groups = Mapping[str, xr.Dataset]
 Root = Mapping[str, Any]
 
 
 def save_calibration(calibration: Calibration, path: Path | str) -> Path:
-    """Write a calibration, whole or not at all; equal calibrations give equal bytes.
+    """Write a calibration in one step; equal calibrations give equal bytes.
 
     Raises
     ------
@@ -61,15 +63,11 @@ def result_bytes(calibration: Calibration) -> bytes:
         "posterior": _samples(calibration, calibration.samples, "posterior sample"),
         "observed_data": calibration.measured,
     }
-    root = {
-        "schema": SCHEMA,
-        "title": f"Calibration of {calibration.asset}",
-        **{name: getattr(calibration, name) for name in _WORDS},
-        **{
-            name: _json(adapter.dump_python(getattr(calibration, name), mode="json"))
-            for name, adapter in _AS_JSON.items()
-        },
-    }
+    root = {"schema": SCHEMA, "title": f"Calibration of {calibration.asset}"}
+    for name in _PLAIN_FIELDS:
+        root[name] = getattr(calibration, name)
+    for name, adapter in _JSON_FIELDS.items():
+        root[name] = _json(adapter.dump_python(getattr(calibration, name), mode="json"))
     attributes = {**root, _HASH: _content_hash(groups, root)}
     tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
     return bytes(tree.to_netcdf(engine="h5netcdf"))
@@ -89,19 +87,21 @@ def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Read the calibration of a wing, or of the parameters of any model.
+    """Return a stored calibration, of a wing or of the parameters of any model.
 
     Raises
     ------
     CalibrationRecordError
-        If the file is missing, damaged, cut off, of another kind or of another schema; one sentence.
+        If the file is missing, damaged, truncated, of another kind or of another schema.
     """
     path = Path(path)
     groups, root = _read(path)
-    came = root.get("schema")
-    if came != SCHEMA:
-        came = f"of the schema {str(came)!r}" if came else "no calibration file"
-        raise CalibrationRecordError(said("file.version", path=path, came=came, schema=SCHEMA))
+    schema = root.get("schema")
+    if schema != SCHEMA:
+        kind = f"of the schema {str(schema)!r}" if schema else "no calibration file"
+        raise CalibrationRecordError(
+            f"{path} is {kind}, but {SCHEMA!r} is needed; calibrate again with this version."
+        )
     try:
         if root[_HASH] != _content_hash(groups, root):
             raise CalibrationRecordError("its content does not match its hash")
@@ -114,109 +114,157 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
-    """Look at the place where a calibration of `asset` is to be written, before the work begins.
+    """Refuse a folder with another calibration, before the work on a new one begins.
+
+    A file that is no calibration may be replaced.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the new calibration.
+    asset : str
+        The name of the asset.
+    wing : bool
+        Whether the new calibration is that of a wing from its laboratory.
 
     Raises
     ------
     FileNotWrittenError
-        If it is no folder, or holds the calibration of another asset or of another kind. A file that is no
-        calibration of either kind may be replaced.
+        If the path is no folder, or the folder holds the calibration of another asset or of another
+        kind.
     """
     if folder.exists() and not folder.is_dir():
         raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
-    kept = folder / FILE_NAME
+    file = folder / FILE_NAME
     try:
-        found = load_calibration(kept)
+        existing = load_calibration(file)
     except CalibrationRecordError:
-        return  # there is none, or what cannot be read is of no use to anyone
-    if found.asset != asset:
-        raise FileNotWrittenError(said("file.asset", kept=kept, found=found, asset=asset))
-    if (found.design is not None) != wing:
-        kept_one, wanted = (FROM_CAMPAIGN, FROM_LABORATORY) if wing else (FROM_LABORATORY, FROM_CAMPAIGN)
+        return  # there is none, or it cannot be read by anyone
+    if existing.asset != asset:
         raise FileNotWrittenError(
-            said("file.another_kind", kept=kept, asset=asset, kept_one=kept_one, wanted=wanted)
+            f"{file} is the calibration of {existing.asset}, not of {asset}: "
+            "choose another --out, one for each asset."
+        )
+    existing_is_wing = existing.design is not None
+    if existing_is_wing != wing:
+        existing_kind = FROM_LABORATORY if existing_is_wing else FROM_CAMPAIGN
+        new_kind = FROM_LABORATORY if wing else FROM_CAMPAIGN
+        raise FileNotWrittenError(
+            f"{file} is the calibration of {asset} {existing_kind}, and one {new_kind} was asked "
+            "for: choose another --out, one for each kind of calibration."
         )
 
 
 def _calibration(groups: Groups, root: Root) -> Calibration:
-    head: dict[str, Any] = {name: adapter.validate_json(root[name]) for name, adapter in _AS_JSON.items()}
-    names = [item.name for item in (*head["priors"], *head["quantities"])]
-    samples, prior = (
-        np.column_stack([groups[group][name].values[0] for name in names]) for group in ("posterior", "prior")
+    """Return the calibration in the groups and the root's attributes of a file."""
+    values: dict[str, Any] = {}
+    for name, adapter in _JSON_FIELDS.items():
+        values[name] = adapter.validate_json(root[name])
+    for name in _PLAIN_FIELDS:
+        values[name] = root[name]
+    values["seed"] = int(root["seed"])
+    names = [figure.name for figure in (*values["priors"], *values["quantities"])]
+    calibration = Calibration(
+        **values,
+        samples=_sample_columns(groups["posterior"], names),
+        prior_samples=_sample_columns(groups["prior"], names),
+        measured=groups["observed_data"],
     )
-    head |= {name: root[name] for name in _WORDS} | {"seed": int(root["seed"])}
-    found = Calibration(**head, samples=samples, prior_samples=prior, measured=groups["observed_data"])
-    if found.design is not None and found.design.hash != found.design_hash:
+    design = calibration.design
+    if design is not None and design.hash != calibration.design_hash:
         raise CalibrationRecordError("its design does not match its hash")
-    return found
+    return calibration
+
+
+def _sample_columns(group: xr.Dataset, names: list[str]) -> Float:
+    """Return the samples (N, F) of a group, whose variables have one chain."""
+    return np.column_stack([group[name].values[0] for name in names])
 
 
 def _read(path: Path) -> tuple[Groups, Root]:
     if not path.is_file():
-        what = "no file" if path.exists() else "not there"
-        raise CalibrationRecordError(said("file.absent", path=path, what=what, name=FILE_NAME))
+        state = "no file" if path.exists() else "not there"
+        raise CalibrationRecordError(
+            f"{path} is {state}; give the {FILE_NAME} that `uav-twin calibrate --out DIR` leaves."
+        )
     try:
         tree = _tree(path, hashlib.sha256(path.read_bytes()).digest())
     except DamagedFileError as error:
-        raise CalibrationRecordError(said("file.damaged", path=path)) from error
+        raise CalibrationRecordError(
+            f"{path} is damaged or no calibration file: it cannot be read as NetCDF; "
+            "calibrate again."
+        ) from error
     groups = {name: tree[name].to_dataset() for name in tree.children}
     return groups, {str(name): value for name, value in tree.attrs.items()}
 
 
 @lru_cache(maxsize=8)
 def _tree(path: Path, content: bytes) -> xr.DataTree:
-    """Read a file of a content (its hash) once: a run asks for the same calibration some twenty times."""
+    """Return the groups of a file, read once for each hash of its content.
+
+    A run reads the same calibration some twenty times.
+    """
     return read_groups(path)
 
 
 def _json(content: object) -> str:
-    """Return plain data as JSON, the same text for the same data."""
+    """Return plain data as JSON; equal data give equal text."""
     return json.dumps(content, sort_keys=True, ensure_ascii=False)
 
 
 def _content_hash(groups: Groups, root: Root) -> str:
-    """Return a hash of all values and attributes, so that a flipped bit does not pass as a calibration."""
+    """Return a hash of all values and attributes, which reveals a damaged file."""
     digest = hashlib.sha256()
     for name in sorted(set(root) - {_HASH}):
         digest.update(f"{name}\0{root[name]}\0".encode())
     for group in sorted(groups):
-        for label, variable in sorted(groups[group].variables.items(), key=lambda item: str(item[0])):
+        for label, variable in sorted(
+            groups[group].variables.items(), key=lambda item: str(item[0])
+        ):
             values = np.asarray(variable.values)
             kind = "f" if values.dtype.kind == "f" else "i"
             digest.update(f"{group}/{label}\0{values.shape}\0{kind}\0".encode())
             digest.update(np.ascontiguousarray(values, "<f8" if kind == "f" else "<i8").tobytes())
-            digest.update(_json({str(key): str(value) for key, value in variable.attrs.items()}).encode())
+            digest.update(
+                _json({str(key): str(value) for key, value in variable.attrs.items()}).encode()
+            )
     return digest.hexdigest()
 
 
 RESOURCE_NAME = "calibration.json"
-"""The file among the FMU's resources that says what the wing was calibrated with."""
+"""The file among the FMU's resources that describes the calibration of the wing."""
 
 _GRID_POINTS = 401
 
 
 def tailoring(calibration: Calibration) -> dict[str, Any]:
-    """Return what the FMU of a calibrated wing carries, as options of `fmu_asset`'s `pack_wing`.
+    """Return the options of `fmu_asset`'s `pack_wing` for the FMU of a calibrated wing.
 
-    It starts at the means of the samples of e, masses and damping; its description has the name of the wing
-    and the standard deviations, and `RESOURCE_NAME` the figures with intervals and correlations. Equal input
-    gives equal bytes.
+    The FMU starts at the means of e, masses and damping. Its description has the name of the wing
+    and the standard deviations, and its file `RESOURCE_NAME` the figures with intervals and
+    correlations. Equal calibrations give equal bytes.
     """
     text = json.dumps(
         plain_record(calibration), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False
     )
     resources = {RESOURCE_NAME: f"{text}\n".encode()}
-    return {"state": calibration.mean_state(), "note": description(calibration), "resources": resources}
+    return {
+        "state": calibration.mean_state(),
+        "note": description(calibration),
+        "resources": resources,
+    }
 
 
 def description(calibration: Calibration) -> str:
-    """Return one sentence with the name of the wing and its figures, mean and standard deviation."""
-    figures = ", ".join(
-        f"{name} {calibration.mean(name):.6g} +- {calibration.standard_deviation(name):.3g} "
-        f"{figure.shown_unit}".rstrip()
-        for figure in calibration.figures
-        if (name := figure.name) in STATE
-    )
+    """Return one sentence with the name of the wing, and the means and deviations of its state."""
+    texts = []
+    for figure in calibration.figures:
+        if figure.name in STATE:
+            mean = calibration.mean(figure.name)
+            deviation = calibration.standard_deviation(figure.name)
+            text = f"{figure.name} {mean:.6g} +- {deviation:.3g} {figure.shown_unit}"
+            texts.append(text.rstrip())
+    figures = ", ".join(texts)
     return f"Calibrated for the wing '{calibration.asset}' (mean +- standard deviation): {figures}."
 
 
@@ -245,33 +293,51 @@ def plain_record(calibration: Calibration) -> dict[str, Any]:
         "state": {name: figures[name] for name in parameters},
         "quantities": {name: figures[name] for name in quantities},
         "correlation": {"names": parameters, "matrix": calibration.correlation.tolist()},
-        # JSON is written with sorted keys, and pages list the quantities in the order of the calibration
+        # JSON is written with sorted keys; pages list the quantities in the order of the
+        # calibration.
         "names": {"quantities": quantities},
     }
 
 
 def run_record(calibration: Calibration, parameter: str) -> dict[str, Any]:
-    """Return what `calibration.json` of a run folder holds, with the parameter that the twin draws."""
-    mean, deviation = calibration.prior_moments(parameter)
-    prior: dict[str, Any] = {"mean": mean, "standard_deviation": deviation}
-    for item in (item for item in calibration.priors if item.name == parameter):
-        prior = {"mean": item.mean, "standard_deviation": item.deviation, "range": [item.low, item.high]}
+    """Return the content of `calibration.json` of a run folder.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration of the twin.
+    parameter : str
+        The parameter or quantity of which the twin has several values.
+    """
     measured = calibration.measured
     return {
         **plain_record(calibration),
         "parameter": parameter,
-        "prior": prior,
+        "prior": _prior_record(calibration, parameter),
         "posterior": _density(calibration.draws_of(parameter)),
         "data": {str(name): measured[name].values.tolist() for name in measured},
     }
 
 
-def _density(values: Float) -> dict[str, list[float]]:
-    """Return a Gaussian kernel density of samples; nothing if they do not vary."""
-    spread = float(values.std())
-    if spread <= 1e-12 * abs(float(values.mean())):
-        return {}
-    from scipy.stats import gaussian_kde  # takes a second to load
+def _prior_record(calibration: Calibration, name: str) -> dict[str, Any]:
+    """Return the stated prior of a parameter, or the moments of a quantity in the prior samples."""
+    for prior in calibration.priors:
+        if prior.name == name:
+            return {
+                "mean": prior.mean,
+                "standard_deviation": prior.deviation,
+                "range": [prior.low, prior.high],
+            }
+    mean, deviation = calibration.prior_moments(name)
+    return {"mean": mean, "standard_deviation": deviation}
 
-    grid = np.linspace(values.min() - spread, values.max() + spread, _GRID_POINTS)
+
+def _density(values: Float) -> dict[str, list[float]]:
+    """Return a Gaussian kernel density of samples (N,), or nothing if they do not vary."""
+    deviation = float(values.std())
+    if deviation <= 1e-12 * abs(float(values.mean())):
+        return {}
+    from scipy.stats import gaussian_kde  # takes a second to import
+
+    grid = np.linspace(values.min() - deviation, values.max() + deviation, _GRID_POINTS)
     return {"grid": grid.tolist(), "density": gaussian_kde(values)(grid).tolist()}

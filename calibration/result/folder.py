@@ -1,6 +1,6 @@
-"""The folder that a calibration leaves, with its page: complete, or as it was before."""
+"""The folder of a calibration with its page, replaced as a whole or not at all."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,19 +18,21 @@ from reporting.files import atomic_write_bytes, atomic_write_text, explained_wri
 from reporting.page import Page, ReportFigure
 from reporting.progress import stage
 
-FIGURES, REPORT_NAME = "figures", "report.html"
-WING_FIELDS, MODE_FIELDS = "wing.vtu", "modes.vtu"
+FIGURES = "figures"
+REPORT_NAME = "report.html"
+WING_FIELDS = "wing.vtu"
+MODE_FIELDS = "modes.vtu"
 
 _DRAWN = (REPORT_NAME, WING_FIELDS, MODE_FIELDS, f"{FIGURES}/*.svg", f"{FIGURES}/*.png")
-"""What an older calibration drew: beside a newer file it would show other figures."""
+"""Drawings of an older calibration, which would not belong to a newer file."""
 
 
 @contextmanager
 def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
-    """Yield an empty folder; at the end all in it and `calibration.nc` are moved to `folder`.
+    """Return a context with an empty folder; its files and `calibration.nc` are moved to `folder`.
 
-    A full disk leaves `folder` as it was. Older files of the same names are replaced, the calibration last;
-    what an older calibration drew is removed where nothing stands for it.
+    A full disk leaves `folder` as it was. Older files of the same names are replaced,
+    `calibration.nc` last. Drawings of an older calibration are removed unless they are replaced.
 
     Raises
     ------
@@ -46,23 +48,38 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
             files = sorted(path.relative_to(fresh) for path in fresh.rglob("*") if path.is_file())
             atomic_write_bytes(fresh / FILE_NAME, content)
             if (folder / FILE_NAME).exists():
-                for older in [path for pattern in _DRAWN for path in folder.glob(pattern)]:
-                    if older.relative_to(folder) not in files:
-                        older.unlink()
-                with suppress(OSError):  # not there, or not empty
-                    (folder / FIGURES).rmdir()
+                _remove_older_drawings(folder, files)
             for file in (*files, Path(FILE_NAME)):
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 (fresh / file).replace(folder / file)
 
 
+def _remove_older_drawings(folder: Path, new_files: Sequence[Path]) -> None:
+    """Remove the drawings of an older calibration that no new file (relative path) replaces."""
+    for pattern in _DRAWN:
+        for drawing in list(folder.glob(pattern)):
+            if drawing.relative_to(folder) not in new_files:
+                drawing.unlink()
+    with suppress(OSError):  # the folder is missing or not empty
+        (folder / FIGURES).rmdir()
+
+
 def write_calibration_folder(result: Calibration, folder: Path, *, report: bool = True) -> Path:
-    """Write page, figures and `calibration.nc`, or without a report the latter alone; return its path.
+    """Write the folder of a calibration, and return the path of its `calibration.nc`.
+
+    Parameters
+    ----------
+    result : Calibration
+        The calibration.
+    folder : Path
+        The folder.
+    report : bool
+        Whether to write a page and its figures, too.
 
     Raises
     ------
     FileNotWrittenError
-        As `calibration_folder`.
+        If a file cannot be written; the folder is then as it was.
     """
     with calibration_folder(result, folder) as fresh:
         if report:
@@ -72,15 +89,18 @@ def write_calibration_folder(result: Calibration, folder: Path, *, report: bool 
 
 
 def add_figure(page: Page, figure: ReportFigure, folder: Path) -> None:
-    """Add a figure to a page, and leave it in the folder of the page."""
+    """Add a figure to a page, and write its files to the folder of the page."""
     drawing = save_figure(figure.figure, folder / FIGURES, figure.name)
     page.add_figure(drawing, figure.caption, title=figure.title)
 
 
 def begun_page(result: Calibration, folder: Path) -> Page:
-    """Return a page with all that any calibration says; its figures are left in a folder."""
-    title, subtitle, footer = (WORDS.say(name, result=result) for name in ("title", "subtitle", "footer"))
-    page = Page(title, subtitle, (footer,))
+    """Return a page with the sections of any calibration, and write its figures to a folder."""
+    page = Page(
+        title=WORDS.say("title", result=result),
+        subtitle=WORDS.say("subtitle", result=result),
+        footer=(WORDS.say("footer", result=result),),
+    )
     page.add_section("Result")
     highlights = []
     for prior in result.priors[:6]:
@@ -95,10 +115,13 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     WORDS.add_table(page, "parameters", result.priors, result=result, procedure=procedure)
     for line in correlation_lines(result):
         page.add_paragraph(f"{line}.")
-    places, titles = drawn_parameters(result)
-    sets = [("posterior", result.samples[:, places]), ("prior", result.prior_samples[:, places])]
-    for name, shown in (("posterior", sets[:1]), ("prior_and_posterior", sets)):
-        add_figure(page, WORDS.figure(name, corner_figure(titles, shown)), folder)
+    columns, titles = drawn_parameters(result)
+    posterior_set = ("posterior", result.samples[:, columns])
+    prior_set = ("prior", result.prior_samples[:, columns])
+    posterior_figure = corner_figure(titles, [posterior_set])
+    add_figure(page, WORDS.figure("posterior", posterior_figure), folder)
+    both_figure = corner_figure(titles, [posterior_set, prior_set])
+    add_figure(page, WORDS.figure("prior_and_posterior", both_figure), folder)
     page.add_section("What is left of the readings")
     WORDS.add_table(page, "readings", result.readings, result=result)
     if result.readings:
@@ -108,6 +131,6 @@ def begun_page(result: Calibration, folder: Path) -> Page:
 
 
 def end_page(page: Page, result: Calibration, folder: Path) -> None:
-    """Write a page with where the calibration comes from at its end."""
+    """Add the origin of the calibration at the end of its page, and write the page."""
     WORDS.add_table(page, "origin", result=result)
     atomic_write_text(folder / REPORT_NAME, page.render())

@@ -1,6 +1,7 @@
-"""The calibration of an asset as a record: samples of named figures, what they rest on, what has to be said.
+"""The record of a calibration: samples of named figures, with their data, origin and findings.
 
-A wing's from the folder of its laboratory and any model's from a campaign are of this one class.
+A wing's calibration from the folder of its laboratory and any model's from a campaign are of this
+class.
 """
 
 from collections.abc import Mapping
@@ -11,26 +12,27 @@ import numpy as np
 import xarray as xr
 from scipy.special import ndtr, ndtri
 
-from calibration.errors import CalibrationRecordError, said
+from calibration.errors import CalibrationRecordError
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.arrays import Float
-from reporting.words import brief, plus_minus
+from reporting.words import brief, comma_list, plus_minus
 
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
-"""How the samples were made: by quadrature of one parameter and the others given it, from
-the Gaussian at the optimum where the posterior is one, from Gaussians at several optima; of a wing by
-importance sampling, or by the paper's procedure."""
+"""The method of the samples: quadrature of one parameter and the others given it, the Gaussian at
+the optimum where the posterior is one, or Gaussians at several optima; for a wing importance
+sampling, or the paper's procedure."""
 
 FROM_LABORATORY = "from the laboratory of a wing (`uav-twin calibrate`)"
 FROM_CAMPAIGN = "from a campaign (`uav-twin calibrate campaign`)"
 
 LONGEST_NAME = 80
+"""Longest name of an asset, in characters."""
 
 STATE = ("young_modulus_factor", "servo_mass", "pitot_mass", "damping_alpha", "damping_beta")
-"""The parameters of a calibrated wing that are a part of its digital state."""
+"""The parameters of a calibrated wing that belong to its digital state."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +45,16 @@ class CalibratedFigure:
 
     @property
     def shown_unit(self) -> str:
-        """The unit as it is printed: nothing for a plain number."""
+        """The printed unit: nothing for a plain number."""
         return "" if self.unit == "1" else self.unit
 
     @property
     def axis_title(self) -> str:
-        """Name and unit as they stand at an axis."""
-        return self.name.replace("_", " ") + (f" ({self.shown_unit})" if self.shown_unit else "")
+        """Name and unit as the title of an axis."""
+        title = self.name.replace("_", " ")
+        if self.shown_unit:
+            return f"{title} ({self.shown_unit})"
+        return title
 
     def shown(self, mean: float, deviation: float) -> str:
         """Return a mean ± standard deviation with the unit."""
@@ -58,20 +63,20 @@ class CalibratedFigure:
 
 @dataclass(frozen=True)
 class ParameterPrior:
-    """What was stated of a parameter: a normal distribution, cut off at the ends of the model's range.
+    """The prior of a parameter: a Gaussian, truncated to the range of the model.
 
     Attributes
     ----------
     name, unit : str
-        Name of the parameter and its unit.
+        The name of the parameter and its unit.
     mean, deviation : float
-        Mean and standard deviation before the cut [unit].
+        The mean and the standard deviation before the truncation [unit].
     low, high : float
-        Range in which the model holds [unit].
+        The range in which the model holds [unit].
     stated_by : str
-        Where it stands: the model's file or the campaign; empty: the model's.
+        The file that states the prior: of the model or of the campaign; empty for the model's.
     title : str
-        What it is; its name where nothing is said.
+        The title of the parameter; its name if the title is empty.
     """
 
     name: str
@@ -91,17 +96,17 @@ class ParameterPrior:
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """How far model and readings of a channel are apart.
+    """The residuals of a channel before and after the calibration.
 
     Attributes
     ----------
     name, trials : str
-        Channel, and which trials: "fitted" or "held out".
+        The channel, and its trials: "fitted" or "held out".
     readings : int
-        Number of readings.
+        The number of readings.
     before, after : float
-        Rms residual at the prior means and at the optimum, gains, zeros and the like fitted in both, in
-        standard deviations of the noise [1]; NaN where the noise is not known.
+        The rms residual at the prior means and at the optimum, in standard deviations of the noise
+        [1]; NaN where the noise is not known. Gains, zeros and the like are fitted in both.
     """
 
     name: str
@@ -113,16 +118,16 @@ class ChannelFit:
 
 @dataclass(frozen=True)
 class Reading:
-    """A number that an experiment measured of a figure.
+    """A measured value of a figure.
 
     Attributes
     ----------
     name : str
-        The figure.
+        The name of the figure.
     experiment : str
-        What was done.
+        The name of the experiment.
     value, deviation : float
-        Measured, and its standard deviation [unit of the figure].
+        The measured value and its standard deviation [unit of the figure].
     """
 
     name: str
@@ -133,42 +138,43 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The posterior of the parameters of a model, under a campaign or the experiments of a laboratory.
+    """The posterior of the parameters of a model, given a campaign or a laboratory's experiments.
 
     Attributes
     ----------
     asset : str
-        Name of what was measured.
+        The name of the asset that was measured.
     model, model_hash : str
-        Name of the model, and SHA-256 of all that it was read from.
+        The name of the model, and the SHA-256 of all its files.
     procedure : Procedure
-        How the samples were made.
+        The method of the samples.
     priors : tuple of ParameterPrior
-        The calibrated parameters, P of them.
+        The priors of the P calibrated parameters.
     samples, prior_samples : (N, P + Q), (M, P + Q) array
-        Equally weighted samples of posterior and prior, parameters first [units of `figures`].
+        The equally weighted samples of posterior and prior, parameters first [units of `figures`].
     explained : bool or None
-        Whether noise and priors allow what the calibrated model leaves; None where the data cannot tell.
+        Whether noise and priors explain the residuals of the calibrated model; None where the data
+        cannot decide.
     findings : tuple of str
-        What has to be said, a sentence each: what the data do not tell, what disagrees.
+        Sentences on what the data do not determine, and on what disagrees.
     channels : tuple of ChannelFit
-        Residuals before and after.
+        The residuals before and after the calibration.
     source : str
-        Name of the campaign, or where the measurements come from.
+        The name of the campaign, or the origin of the measurements.
     seed : int
-        Of all samples.
+        The seed of all samples.
     provenance : mapping
-        Versions and hashes.
+        The versions and hashes.
     design_hash : str
-        SHA-256 of the design or structure that the model was made of; empty where that is not known.
+        The SHA-256 of the design or structure of the model; empty if it is not known.
     quantities : tuple of CalibratedFigure
-        Q figures of the model that follow from the parameters.
+        The Q figures of the model that follow from the parameters.
     readings : tuple of Reading
-        Numbers measured of parameters and quantities.
+        The measured values of parameters and quantities.
     measured : Dataset
-        Readings that are more than one number, by name, with units.
+        The readings that are more than one number, by name, with units.
     design : WingDesign or None
-        Of a wing, the design with the measured planform.
+        The design with the measured planform, for a wing.
 
     Raises
     ------
@@ -196,17 +202,23 @@ class Calibration:
     design: WingDesign | None = None
 
     def __repr__(self) -> str:
-        facts = {"parameters": [prior.name for prior in self.priors], "samples": len(self.samples)}
-        return brief(self, asset=self.asset, model=self.model, **facts)
+        return brief(
+            self,
+            asset=self.asset,
+            model=self.model,
+            parameters=[prior.name for prior in self.priors],
+            samples=len(self.samples),
+        )
 
     def __post_init__(self) -> None:
         check_name(self.asset)
         for samples in (self.samples, self.prior_samples):
-            whole = len(samples) and samples.shape[1:] == (len(self.figures),)
-            if not (whole and np.isfinite(samples).all()):
-                raise CalibrationRecordError(said("posterior.samples", self=self))
-
-    # ------------------------------------------------------------ figures
+            is_complete = len(samples) > 0 and samples.shape[1:] == (len(self.figures),)
+            if not is_complete or not np.isfinite(samples).all():
+                raise CalibrationRecordError(
+                    f"the calibration of {self.asset} must have samples of posterior and prior, "
+                    "finite ones, of each of its figures."
+                )
 
     @property
     def figures(self) -> tuple[CalibratedFigure, ...]:
@@ -214,7 +226,7 @@ class Calibration:
         return (*(prior.figure for prior in self.priors), *self.quantities)
 
     def draws_of(self, name: str, *, prior: bool = False) -> Float:
-        """Return all samples of one figure; (N,), SI.
+        """Return all samples (N,) of one figure [unit].
 
         Raises
         ------
@@ -223,8 +235,12 @@ class Calibration:
         """
         names = [figure.name for figure in self.figures]
         if name not in names:
-            raise CalibrationRecordError(said("posterior.no_samples", self=self, name=name, known=names))
-        return (self.prior_samples if prior else self.samples)[:, names.index(name)]
+            raise CalibrationRecordError(
+                f"the calibration of {self.asset} has no samples of `{name}`; "
+                f"it has {comma_list(names)}."
+            )
+        samples = self.prior_samples if prior else self.samples
+        return samples[:, names.index(name)]
 
     def mean(self, name: str) -> float:
         """Return the posterior mean of a figure, SI."""
@@ -235,7 +251,7 @@ class Calibration:
         return moments(self.draws_of(name))[1]
 
     def prior_moments(self, name: str) -> tuple[float, float]:
-        """Return mean and standard deviation of a figure before, parameters cut off at their range [unit]."""
+        """Return mean and standard deviation of a figure in the prior samples [unit]."""
         return moments(self.draws_of(name, prior=True))
 
     def kept_share(self, name: str) -> float:
@@ -244,8 +260,9 @@ class Calibration:
 
     def interval(self, name: str, probability: float = 0.9) -> tuple[float, float]:
         """Return the central interval of a figure [unit]."""
-        ends = np.quantile(self.draws_of(name), [0.5 - 0.5 * probability, 0.5 + 0.5 * probability])
-        return float(ends[0]), float(ends[1])
+        probabilities = [0.5 - 0.5 * probability, 0.5 + 0.5 * probability]
+        low, high = np.quantile(self.draws_of(name), probabilities)
+        return float(low), float(high)
 
     @property
     def correlation(self) -> Float:
@@ -254,53 +271,62 @@ class Calibration:
 
     @property
     def information(self) -> float | None:
-        """Information gained [nat]: Kullback-Leibler divergence of Gaussians of these moments.
+        """Information gained [nat]: Kullback-Leibler divergence of Gaussians with these moments.
 
-        None where a parameter follows from the others, as the paper's masses from e.
+        It is None where a parameter follows from the others, as the paper's masses follow from e.
         """
-        prior, posterior = (
-            values[:, : len(self.priors)] / self.prior_samples[:, : len(self.priors)].std(axis=0)
-            for values in (self.prior_samples, self.samples)
-        )
-        before, after = (np.atleast_2d(np.cov(values, rowvar=False)) for values in (prior, posterior))
-        scale = np.sqrt(np.diag(after))
-        if not np.all(scale > 0.0) or np.linalg.cond(after / np.outer(scale, scale)) > _SINGULAR:
+        # Parameters in units of their prior standard deviations
+        parameters = slice(len(self.priors))
+        scale = self.prior_samples[:, parameters].std(axis=0)
+        prior = self.prior_samples[:, parameters] / scale
+        posterior = self.samples[:, parameters] / scale
+        prior_covariance = np.atleast_2d(np.cov(prior, rowvar=False))
+        posterior_covariance = np.atleast_2d(np.cov(posterior, rowvar=False))
+        deviations = np.sqrt(np.diag(posterior_covariance))
+        if not np.all(deviations > 0.0):
+            return None
+        posterior_correlation = posterior_covariance / np.outer(deviations, deviations)
+        if np.linalg.cond(posterior_correlation) > _SINGULAR:
             return None
         shift = posterior.mean(axis=0) - prior.mean(axis=0)
-        inverse = np.linalg.inv(before)
-        logs = np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]
-        return 0.5 * float(np.trace(inverse @ after) + shift @ inverse @ shift - len(shift) + logs)
-
-    # ------------------------------------------------------------ readings
+        precision = np.linalg.inv(prior_covariance)
+        log_prior_volume = np.linalg.slogdet(prior_covariance)[1]
+        log_ratio = log_prior_volume - np.linalg.slogdet(posterior_covariance)[1]
+        trace = np.trace(precision @ posterior_covariance)
+        return 0.5 * float(trace + shift @ precision @ shift - len(shift) + log_ratio)
 
     def score(self, reading: Reading) -> float:
-        """Return how far the model's figure lies from a reading, in standard deviations of both [1]."""
-        spread = np.hypot(reading.deviation, self.standard_deviation(reading.name))
-        return (self.mean(reading.name) - reading.value) / float(spread)
+        """Return the difference of the model from a reading, in standard deviations of both [1]."""
+        deviation = np.hypot(reading.deviation, self.standard_deviation(reading.name))
+        return (self.mean(reading.name) - reading.value) / float(deviation)
 
     def error(self, experiment: str, *, prior: bool = False) -> float:
-        """Return minus the mean of |measured - mean| of an experiment's readings [1].
+        """Return minus the mean of |measured - mean| over the readings of an experiment [1].
 
-        In half-widths of their 95 % intervals: the form of the error reward of Kapteyn et al. 2021.
+        The unit is the half-width of the 95 % interval of a reading, as in the error reward of
+        Kapteyn et al. 2021. The means are those of the posterior, or of the `prior`.
         """
-        return -float(
-            np.mean(
-                [
-                    abs(reading.value - np.mean(self.draws_of(reading.name, prior=prior)))
-                    / (HALF_WIDTH_95 * reading.deviation)
-                    for reading in self.readings
-                    if reading.experiment == experiment
-                ]
-            )
-        )
-
-    # ------------------------------------------------------------ for a twin
+        errors = []
+        for reading in self.readings:
+            if reading.experiment == experiment:
+                mean = np.mean(self.draws_of(reading.name, prior=prior))
+                errors.append(abs(reading.value - mean) / (HALF_WIDTH_95 * reading.deviation))
+        return -float(np.mean(errors))
 
     def stratified_draws(self, name: str, count: int, seed: Seed) -> Float:
-        """Return `count` draws of one figure, one from each of as many strata; (count,) [unit].
+        """Return draws (count,) of one figure, one from each of as many strata [unit].
 
-        Strata are of equal probability and in shuffled order: means of functions of this figure scatter far
-        less than with independent draws.
+        The strata have equal probability and shuffled order: means of functions of this figure have
+        a far smaller variance than those of independent draws.
+
+        Parameters
+        ----------
+        name : str
+            The name of the figure.
+        count : int
+            The number of draws.
+        seed : int or SeedSequence
+            The same seed gives the same draws.
 
         Raises
         ------
@@ -309,24 +335,39 @@ class Calibration:
         """
         values = np.sort(self.draws_of(name))
         generator = np.random.default_rng(child_seed(seed, 0))
-        place = (stratified(generator, count) * len(values)).astype(np.int64)
-        return values[np.minimum(place, len(values) - 1)]
+        ranks = (stratified(generator, count) * len(values)).astype(np.int64)
+        return values[np.minimum(ranks, len(values) - 1)]
 
     def given(self, name: str, values: Float) -> dict[str, Float]:
-        """Return what the other parameters are expected to be where one has these values (n,), [units].
+        """Return the expectations of the other parameters given values of one.
 
-        By linear regression on the samples, and within what these hold: exact for a Gaussian.
+        They follow by linear regression on the samples, which is exact for a Gaussian, and stay
+        within the range of the samples.
+
+        Parameters
+        ----------
+        name : str
+            The parameter whose values are given.
+        values : (n,) array
+            Its values [unit].
+
+        Returns
+        -------
+        dict of str to (n,) array
+            The expectations of the other parameters by name [units].
         """
-        own = self.draws_of(name)
-        variance = float(np.var(own))
-        found: dict[str, Float] = {}
+        draws = self.draws_of(name)
+        variance = float(np.var(draws))
+        expectations: dict[str, Float] = {}
         for prior in self.priors:
-            if prior.name != name:
-                other = self.draws_of(prior.name)
-                shared = float(np.mean((own - own.mean()) * (other - other.mean())))
-                expected = other.mean() + (shared / variance if variance else 0.0) * (values - own.mean())
-                found[prior.name] = np.clip(expected, other.min(), other.max())
-        return found
+            if prior.name == name:
+                continue
+            others = self.draws_of(prior.name)
+            covariance = float(np.mean((draws - draws.mean()) * (others - others.mean())))
+            slope = covariance / variance if variance else 0.0
+            expected = others.mean() + slope * (values - draws.mean())
+            expectations[prior.name] = np.clip(expected, others.min(), others.max())
+        return expectations
 
     @property
     def wing_design(self) -> WingDesign:
@@ -335,47 +376,54 @@ class Calibration:
         Raises
         ------
         CalibrationRecordError
-            If this is the calibration of a model's parameters from a campaign, which has none.
+            If this is the calibration of a model from a campaign, which has no such design.
         """
         if self.design is None:
-            kinds = FROM_CAMPAIGN, FROM_LABORATORY
-            raise CalibrationRecordError(said("posterior.laboratory", self=self, kinds=kinds))
+            raise CalibrationRecordError(
+                f"the calibration of {self.asset} is {FROM_CAMPAIGN}, "
+                f"and one {FROM_LABORATORY} is needed."
+            )
         return self.design
 
     def mean_state(self) -> DigitalState:
-        """Return the digital state of a wing at the posterior mean, healthy."""
+        """Return the digital state of a healthy wing at the posterior mean."""
         return self._state(np.array([self.mean(figure.name) for figure in self.figures]))
 
     def states(self) -> tuple[DigitalState, ...]:
-        """Return one digital state of a wing for each sample, healthy and of the tailored planform."""
+        """Return the digital state of a healthy wing with the tailored planform for each sample."""
         return tuple(self._state(row) for row in self.samples)
 
     def _state(self, row: Float) -> DigitalState:
-        values = dict(zip((figure.name for figure in self.figures), row.tolist(), strict=True))
+        """Return the digital state of a wing from values (P + Q,) of the figures."""
+        names = [figure.name for figure in self.figures]
+        values = dict(zip(names, row.tolist(), strict=True))
         return DigitalState(self.wing_design.geometry, **{name: values[name] for name in STATE})
 
 
-_SINGULAR = 1e10  # condition of a correlation matrix beyond which some figure has no freedom of its own
+_SINGULAR = 1e10  # condition of a correlation matrix in which one figure follows from the others
 
 
 def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> Float:
-    """Return samples (count, P) of priors, cut off at their ranges, one from each of as many strata."""
+    """Return stratified samples (count, P) of truncated priors."""
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     columns = []
     for prior in priors:
-        low, high = ndtr((np.array((prior.low, prior.high)) - prior.mean) / prior.deviation)
-        u = ndtri(low + (high - low) * stratified(generator, count))
-        columns.append(np.clip(prior.mean + prior.deviation * u, prior.low, prior.high))
+        standardised_ends = (np.array((prior.low, prior.high)) - prior.mean) / prior.deviation
+        low, high = ndtr(standardised_ends)
+        standardised = ndtri(low + (high - low) * stratified(generator, count))
+        values = prior.mean + prior.deviation * standardised
+        columns.append(np.clip(values, prior.low, prior.high))
     return np.column_stack(columns)
 
 
 def moments(values: Float) -> tuple[float, float]:
-    """Return mean and standard deviation of samples (N,); the latter is 0 of a single one."""
-    return float(values.mean()), float(values.std(ddof=1)) if values.size > 1 else 0.0
+    """Return mean and standard deviation of samples (N,); the latter is 0 for a single sample."""
+    standard_deviation = float(values.std(ddof=1)) if values.size > 1 else 0.0
+    return float(values.mean()), standard_deviation
 
 
 def correlation(values: Float) -> Float:
-    """Return the correlation matrix of samples (N, F); one that does not vary has 1 with itself alone."""
+    """Return the correlation matrix of samples (N, F); a constant figure correlates with none."""
     centred = values - values.mean(axis=0)
     norm = np.linalg.norm(centred, axis=0)
     scaled = centred / np.where(norm > 0.0, norm, 1.0)
@@ -392,6 +440,10 @@ def check_name(asset: str) -> str:
     CalibrationRecordError
         If it is empty, too long or holds control characters.
     """
-    if not (0 < len(asset) <= LONGEST_NAME and asset.isprintable() and asset.strip()):
-        raise CalibrationRecordError(said("posterior.name", most=LONGEST_NAME, asset=asset))
+    has_good_length = 0 < len(asset) <= LONGEST_NAME
+    if not (has_good_length and asset.isprintable() and asset.strip()):
+        raise CalibrationRecordError(
+            f"the name of the asset must be 1 to {LONGEST_NAME} printable characters, "
+            f"and {asset!r} came."
+        )
     return asset

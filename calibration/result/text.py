@@ -9,7 +9,7 @@ from reporting.page import Words
 
 WORDS = Words("calibration.result", isfinite=isfinite)
 NOTICEABLE_CORRELATION = 0.3
-"""From which a correlation is told, and printed in colour."""
+"""Correlation from which it is reported, and printed in colour."""
 
 PROCEDURES = {
     "quadrature": "by quadrature",
@@ -21,17 +21,18 @@ PROCEDURES = {
 
 
 def correlation_lines(result: Calibration) -> list[str]:
-    """Return the correlations that are worth a word, the largest first."""
+    """Return a text for each noticeable correlation of two parameters, the largest first."""
     names = [prior.name for prior in result.priors]
     matrix = result.correlation
-    pairs = [
-        (abs(matrix[i, j]), f"Correlation of {names[i]} and {names[j]}: {matrix[i, j]:+.2f}")
-        for i, j in zip(*np.triu_indices(len(names), 1), strict=True)
-        if abs(matrix[i, j]) >= NOTICEABLE_CORRELATION
-    ]
-    return [text for _, text in sorted(pairs, key=lambda pair: -pair[0])]
+    rows, columns = np.triu_indices(len(names), 1)
+    by_size = np.argsort(-np.abs(matrix[rows, columns]), kind="stable")
+    lines = []
+    for i, j in zip(rows[by_size], columns[by_size], strict=True):
+        if abs(matrix[i, j]) >= NOTICEABLE_CORRELATION:
+            lines.append(f"Correlation of {names[i]} and {names[j]}: {matrix[i, j]:+.2f}")
+    return lines
 
 
 def headline(result: Calibration) -> str:
-    """Return what was calibrated, and how."""
+    """Return the sentence on the calibrated asset and the procedure."""
     return WORDS.say("headline", result=result, procedure=PROCEDURES[result.procedure])

@@ -1,17 +1,17 @@
-"""What a lab folder holds for the three steps of the calibration, written and read, or published."""
+"""Measurements for the three steps of the calibration: published, or in a laboratory's folder."""
 
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from calibration.dynamics.extremes import refine_by_extremes
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_records, read_records
 from calibration.dynamics.trials import Fits, fit_trials
-from calibration.errors import ExperimentDataError, ExperimentFileError, said
+from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import (
     GEOMETRY_FILE,
     PUBLISHED_NAMES,
@@ -21,7 +21,7 @@ from calibration.geometry import (
 )
 from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed
-from calibration.lab_folder import lab_place, lab_table
+from calibration.lab_folder import find_in_lab_folder, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
 from calibration.result.record import Reading
 from calibration.static.experiments import (
@@ -35,9 +35,10 @@ from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.table_file import table_text
 
 WEIGHED_MASS_FILE = STEP_FOLDER / "weighed_mass.csv"
-"""The weighed total of servos and pitot tube [g]; the authors give theirs in the paper alone."""
+"""The file of the weighed total of servos and pitot tube [g]; the authors have none."""
 
-_WEIGHED_COLUMNS = ("mass", "standard_deviation")
+_LIGHTEST_GRAMS = 10.0  # a smaller mass is probably in kg
+_HEAVIEST_GRAMS = 1e5  # a larger mass is probably in mg
 
 
 def write_lab_folder(
@@ -48,21 +49,22 @@ def write_lab_folder(
     records: Sequence[RingDownRecord],
     total_mass: Reading,
 ) -> tuple[Path, ...]:
-    """Write measurements as the readers of `calibration` take them; every file is whole or not there.
+    """Write measurements into a folder as `read_lab_folder` reads them; each file in one step.
 
     Parameters
     ----------
     folder : Path
-        Where `step1`, `step2` and `step3` are made.
+        The folder, in which `step1`, `step2` and `step3` are made.
     lengths : Lengths
-        Lengths, to `step1/geometry_data.csv` [mm].
+        The lengths, for `step1/geometry_data.csv` [mm].
     load_test : LoadDisplacementData
-        Pairs in the order of their runs, to `step2/load_displacement_measurements.csv` [N], [mm].
+        The pairs in the order of their runs, for `step2/load_displacement_measurements.csv` [N],
+        [mm].
     records : sequence of RingDownRecord
-        Records, to `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a chordwise column
-        of zeros, because the wing model has no chordwise gauge.
+        The records, for `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a
+        chordwise column of zeros, because the wing model has no chordwise gauge.
     total_mass : Reading
-        Weighed total, to `step3/weighed_mass.csv` [g].
+        The weighed total, for `step3/weighed_mass.csv` [g].
 
     Returns
     -------
@@ -74,58 +76,88 @@ def write_lab_folder(
     reporting.errors.FileNotWrittenError
         If a file cannot be written.
     """
-
-    def write(name: Path, **columns: Iterable[float | str]) -> Path:
-        cells = [
-            [item if isinstance(item, str) else f"{item:.10g}" for item in of] for of in columns.values()
-        ]
-        return atomic_write_text(Path(folder) / name, table_text(dict(zip(columns, cells, strict=True))))
-
-    designed, measured = ([1e3 * getattr(item, of) for item in lengths] for of in ("designed", "measured"))
+    folder = Path(folder)
+    geometry_table = {
+        "parameter": list(PUBLISHED_NAMES),
+        "designed": _cells(1e3 * length.designed for length in lengths),
+        "manufactured": _cells(1e3 * length.measured for length in lengths),
+    }
+    load_table = {
+        "load": _cells(load_test.load),
+        "displacement": _cells(load_test.displacement * 1e3),
+    }
+    mass_table = {
+        "mass": _cells([total_mass.value * 1e3]),
+        "standard_deviation": _cells([total_mass.deviation * 1e3]),
+    }
     files = [
-        write(GEOMETRY_FILE, parameter=PUBLISHED_NAMES, designed=designed, manufactured=measured),
-        write(MEASUREMENTS_FILE, load=load_test.load, displacement=load_test.displacement * 1e3),
+        atomic_write_text(folder / GEOMETRY_FILE, table_text(geometry_table)),
+        atomic_write_text(folder / MEASUREMENTS_FILE, table_text(load_table)),
     ]
     for number, record in enumerate(records, start=1):
-        table = np.column_stack([record.time, record.signal, np.zeros(record.count)])
-        lines = io.StringIO()
-        np.savetxt(lines, table, fmt=("%.6f", "%.9e", "%d"), delimiter="\t")
-        file = Path(folder) / STEP_FOLDER / f"initialconditiondata_{number}.DAT"
-        files.append(atomic_write_text(file, lines.getvalue()))
-    grams = [total_mass.value * 1e3], [total_mass.deviation * 1e3]
-    return *files, write(WEIGHED_MASS_FILE, **dict(zip(_WEIGHED_COLUMNS, grams, strict=True)))
+        file = folder / STEP_FOLDER / f"initialconditiondata_{number}.DAT"
+        files.append(atomic_write_text(file, _record_text(record)))
+    files.append(atomic_write_text(folder / WEIGHED_MASS_FILE, table_text(mass_table)))
+    return tuple(files)
+
+
+def _cells(values: Iterable[float]) -> list[str]:
+    return [f"{value:.10g}" for value in values]
+
+
+def _record_text(record: RingDownRecord) -> str:
+    table = np.column_stack([record.time, record.signal, np.zeros(record.count)])
+    stream = io.StringIO()
+    np.savetxt(stream, table, fmt=("%.6f", "%.9e", "%d"), delimiter="\t")
+    return stream.getvalue()
 
 
 def read_weighed_mass(file: Path) -> Reading:
-    """Read the weighed total of a laboratory.
+    """Return the weighed total of a laboratory.
 
     Raises
     ------
     ExperimentFileError
         If the file cannot be read, lacks a column, has not exactly one row, or a cell is no number.
     ExperimentDataError
-        If a figure is not a positive finite number of grams, or looks like kg.
+        If a value is not a positive finite number of grams, or looks like kg or mg.
     """
     table = lab_table(file, WEIGHED_MASS_FILE)
     if len(table) != 1:
-        raise ExperimentFileError(said("readings.mass", file=file, came=len(table)))
-    mass, deviation = (
-        float(table.numbers(name, "a weighing", positive=True)[0]) for name in _WEIGHED_COLUMNS
-    )
-    for wrong, unit in ((mass < 10.0, "kg"), (mass > 1e5, "mg")):
-        if wrong:
-            raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like {unit}: give it in g.")
+        raise ExperimentFileError(
+            f"{file} needs a header `mass,standard_deviation` and one row in grams, "
+            f"and {len(table)} came."
+        )
+    mass = float(table.numbers("mass", "a weighing", positive=True)[0])
+    deviation = float(table.numbers("standard_deviation", "a weighing", positive=True)[0])
+    if mass < _LIGHTEST_GRAMS:
+        raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like kg: give it in g.")
+    if mass > _HEAVIEST_GRAMS:
+        raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like mg: give it in g.")
     if deviation >= mass:
-        raise ExperimentDataError(said("readings.mass_deviation", file=file, given=(deviation, mass)))
+        raise ExperimentDataError(
+            f"{file}: the standard deviation, {deviation:g} g, must be less than the mass, "
+            f"{mass:g} g."
+        )
     return weighed(1e-3 * mass, 1e-3 * deviation)
 
 
 Targets = Literal["measured", "published"]
-"""Whose frequencies and damping ratios step 3 aims at."""
+"""The frequencies and damping ratios to which step 3 calibrates."""
 
 
 class StepOrigin(NamedTuple):
-    """Where the figures of one step come from: its number, whether they were read, and a few words."""
+    """The origin of the measurements of one step.
+
+    Attributes
+    ----------
+    step : int
+        The number of the step.
+    read : bool
+        Whether they were read from a folder; otherwise they are published.
+    text : str
+        A few words about the origin.
+    """
 
     step: int
     read: bool
@@ -139,19 +171,19 @@ class LabData:
     Attributes
     ----------
     lengths : Lengths
-        Step 1.
+        The lengths of step 1.
     pairs : LoadDisplacementData
-        Step 2.
+        The load test of step 2.
     readings : tuple of Reading
-        Weighed mass of two servos and the pitot tube, frequencies and damping ratios.
+        The weighed mass of two servos and the pitot tube, the frequencies and the damping ratios.
+    origins : tuple of StepOrigin
+        The origin of the measurements of each step.
+    input_hashes : dict of str to str
+        The SHA-256 of each input.
     trials : Fits or None
-        Step 3, fitted; None where the published frequencies and damping ratios stand in.
+        The fitted ring-downs of step 3; None if the readings are the published ones.
     authors : PaperSamples or None
         The authors' own results of step 3, to be drawn beside ours.
-    origins : tuple of StepOrigin
-        Where the figures of each step come from.
-    input_hashes : dict
-        Name of an input -> SHA-256 of its content.
     """
 
     lengths: Lengths
@@ -165,37 +197,39 @@ class LabData:
 
 def published_data() -> LabData:
     """Return the published measurements of the wing of Kapteyn et al. 2021."""
-    lengths, pairs = published_lengths(), published_measurements()
+    lengths = published_lengths()
+    pairs = published_measurements()
+    origins = [StepOrigin(step, read=False, text=text) for step, text in _PUBLISHED.items()]
     return LabData(
         lengths=lengths,
         pairs=pairs,
         readings=(weighed(), *PUBLISHED_MODES),
-        origins=tuple(StepOrigin(step, False, text) for step, text in _PUBLISHED.items()),
+        origins=tuple(origins),
         input_hashes={"lengths": lengths.sha256, "load_test": pairs.sha256},
     )
 
 
 def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = False) -> LabData:
-    """Read a lab folder in the authors' layout; a step that is not there is taken as published.
+    """Return the measurements in a lab folder; those of a missing step are the published ones.
 
     Parameters
     ----------
     path : Path
-        The folder that holds `step1`, `step2`, `step3`, or some of them (also the folder above it in the
-        authors' repository). Ring-down records may also lie in the folder itself.
+        The folder that holds `step1`, `step2`, `step3`, or some of them (also the folder above it
+        in the authors' repository). Ring-down records may also lie in the folder itself.
     targets : {"measured", "published"}, optional
-        Whether step 3 aims at the ring-down records; by default where there are any.
+        Whether step 3 uses the ring-down records; by default it does where there are any.
     free : bool
-        Whether the frequencies of a record are fitted; else they are those of its spectrum, as the authors
-        do.
+        Whether the frequencies of a record are fitted; otherwise they are those of its spectrum, as
+        in the authors' procedure.
 
     Raises
     ------
     ExperimentFileError
-        If the folder does not exist, holds no step at all, or a step's folder lacks its file; and where
+        If the folder does not exist or holds no step at all, a step's folder lacks its file, or
         records are asked for and there are none.
     ExperimentDataError
-        If what is there cannot be a measurement; see the readers of the steps.
+        If a file holds impossible measurements; see the readers of the steps.
     InvalidChoiceError
         If `targets` is another word.
     """
@@ -203,45 +237,97 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         require_one_of(targets, get_args(Targets), "targets")
     path = Path(path)
     if not path.is_dir():
-        what = "no folder" if path.exists() else "not there"
-        raise ExperimentFileError(said("readings.no_folder", path=path, what=what))
-    steps = {step for step in (1, 2, 3) if lab_place(path, Path(f"step{step}")) is not None}
-    records = find_records(path)
-    if not steps and not records:
-        raise ExperimentFileError(said("readings.no_steps", path=path))
-    if targets == "measured" and not records:
-        raise ExperimentFileError(said("readings.measured", path=path))
+        state = "no folder" if path.exists() else "not there"
+        raise ExperimentFileError(
+            f"{path} is {state}; give the folder that holds step1, step2 and step3."
+        )
+    steps = [
+        step for step in (1, 2, 3) if find_in_lab_folder(path, Path(f"step{step}")) is not None
+    ]
+    record_files = find_records(path)
+    if not steps and not record_files:
+        raise ExperimentFileError(
+            f"{path} holds none of the folders step1, step2 and step3; give the authors' "
+            "calibration folder or one laid out like it."
+        )
+    if targets == "measured" and not record_files:
+        raise ExperimentFileError(
+            f"{path} holds no ring-down record, and --measured asks for them; "
+            "give --published instead."
+        )
     lab = published_data()
-    hashes, origins = lab.input_hashes, {origin.step: origin for origin in lab.origins}
-    found: dict[str, Any] = {}
-    mass, modes = lab.readings[0], lab.readings[1:]
     if 1 in steps:
-        found["lengths"] = read_lengths(path)
-        hashes["lengths"] = found["lengths"].sha256
-        origins[1] = StepOrigin(1, True, f"{GEOMETRY_FILE.as_posix()} read")
+        lab = _with_lengths(lab, path)
     if 2 in steps:
-        found["pairs"] = pairs = read_measurements(path)
-        hashes["load_test"] = pairs.sha256
-        origins[2] = StepOrigin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
-    if records and targets != "published":
-        trials = fit_trials(read_records(path), free=free)
-        if all(fit.record.lowest is not None for fit in trials):
-            # extremes are averages of the signal; the middle of the ink is none
-            trials = refine_by_extremes(trials)
-        found["trials"] = trials
-        modes = measured_modes(trials)
-        hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
-        names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
-        origins[3] = StepOrigin(3, True, f"{names} read")
-    elif records:
-        origins[3] = StepOrigin(3, False, "records left aside as asked; " + _PUBLISHED[3])
-    if (file := lab_place(path, WEIGHED_MASS_FILE)) is not None:
-        mass = read_weighed_mass(file)
-        hashes["weighed_mass"] = hash_record([mass.value, mass.deviation])
-        origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
-    if (file := lab_place(path, STEP_FOLDER / RESULTS_FILE)) is not None:
-        found["authors"] = read_published_results(file)
-    return replace(lab, readings=(mass, *modes), origins=tuple(origins.values()), **found)
+        lab = _with_load_test(lab, path)
+    if record_files and targets != "published":
+        lab = _with_ring_downs(lab, path, record_files, free=free)
+    elif record_files:
+        lab = _with_origin(lab, 3, f"records left aside as asked; {_PUBLISHED[3]}", read=False)
+    mass_file = find_in_lab_folder(path, WEIGHED_MASS_FILE)
+    if mass_file is not None:
+        lab = _with_weighed_mass(lab, mass_file)
+    results_file = find_in_lab_folder(path, STEP_FOLDER / RESULTS_FILE)
+    if results_file is not None:
+        lab = replace(lab, authors=read_published_results(results_file))
+    return lab
+
+
+def _with_origin(lab: LabData, step: int, text: str, *, read: bool) -> LabData:
+    """Return lab data with another origin of one step."""
+    origins = {origin.step: origin for origin in lab.origins}
+    origins[step] = StepOrigin(step, read, text)
+    return replace(lab, origins=tuple(origins.values()))
+
+
+def _with_hashes(lab: LabData, **hashes: str) -> LabData:
+    return replace(lab, input_hashes=lab.input_hashes | hashes)
+
+
+def _with_lengths(lab: LabData, path: Path) -> LabData:
+    """Return lab data with the lengths of step 1 in a folder."""
+    lengths = read_lengths(path)
+    lab = _with_hashes(replace(lab, lengths=lengths), lengths=lengths.sha256)
+    return _with_origin(lab, 1, f"{GEOMETRY_FILE.as_posix()} read", read=True)
+
+
+def _with_load_test(lab: LabData, path: Path) -> LabData:
+    """Return lab data with the pairs of step 2 in a folder."""
+    pairs = read_measurements(path)
+    lab = _with_hashes(replace(lab, pairs=pairs), load_test=pairs.sha256)
+    text = f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs"
+    return _with_origin(lab, 2, text, read=True)
+
+
+def _with_ring_downs(
+    lab: LabData, path: Path, record_files: Sequence[Path], *, free: bool
+) -> LabData:
+    """Return lab data with the ring-downs of step 3 in a folder, and their modal readings."""
+    trials = fit_trials(read_records(path), free=free)
+    if all(fit.record.lowest is not None for fit in trials):
+        # The extremes are those of the signal; the middle of the ink is not quite its average.
+        trials = refine_by_extremes(trials)
+    mass = lab.readings[0]
+    lab = replace(lab, trials=trials, readings=(mass, *measured_modes(trials)))
+    hashes = {}
+    for number, file in enumerate(record_files, start=1):
+        hashes[f"ring_down_{number}"] = hash_file(file)
+    lab = _with_hashes(lab, **hashes)
+    first_name = record_files[0].name
+    last_name = record_files[-1].name
+    names = first_name if len(record_files) == 1 else f"{first_name} to {last_name}"
+    return _with_origin(lab, 3, f"{names} read", read=True)
+
+
+def _with_weighed_mass(lab: LabData, file: Path) -> LabData:
+    """Return lab data with the weighed mass in a file."""
+    mass = read_weighed_mass(file)
+    _, *modes = lab.readings
+    lab = replace(lab, readings=(mass, *modes))
+    lab = _with_hashes(lab, weighed_mass=hash_record([mass.value, mass.deviation]))
+    origin = next(origin for origin in lab.origins if origin.step == 3)
+    text = f"{origin.text}; {WEIGHED_MASS_FILE.as_posix()} read"
+    return _with_origin(lab, 3, text, read=origin.read)
 
 
 _PUBLISHED = {

@@ -1,0 +1,251 @@
+"""The folder of a calibrated wing: page, figures, table, and the wing for ParaView."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from calibration.dynamics.figures import ring_down_figure
+from calibration.paper.figures import WORDS as TABLE_1
+from calibration.paper.figures import calibration_figure, write_table_1
+from calibration.paper.load_test import StaticCalibration, push_forward
+from calibration.result.figures import corner_figure, drawn_parameters
+from calibration.result.file import FILE_NAME
+from calibration.result.folder import (
+    MODE_FIELDS,
+    WING_FIELDS,
+    add_figure,
+    begun_page,
+    calibration_folder,
+    end_page,
+)
+from calibration.wing.calibrate import WingCalibration
+from calibration.wing.lab_data import StepOrigin
+from fe.reduction.model_cache import WingFields, wing_fields, write_modes_vtu, write_wing_vtu
+from fe.runtime.reduced import Modes
+from reporting import figures as style
+from reporting.arrays import Float
+from reporting.page import Page, Words
+from reporting.progress import stage
+from reporting.words import plus_minus
+
+WORDS = Words("calibration.wing")
+
+LOAD_FACTOR = 3.0
+"""Load factor of the turn in which `wing.vtu` shows the wing."""
+
+TABLE_NAME = "table_1.csv"
+
+
+def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: bool = True) -> Path:
+    """Write the folder of a calibrated wing, and return the path of its `calibration.nc`.
+
+    It holds a page with its figures, a table, and the wing for ParaView.
+
+    Parameters
+    ----------
+    calibration : WingCalibration
+        The calibration.
+    folder : Path
+        The folder of the files.
+    report : bool
+        Whether to write all files; otherwise only the table and `calibration.nc`.
+
+    Raises
+    ------
+    FileNotWrittenError
+        If a file cannot be written; the folder is then as it was.
+    """
+    result = calibration.result
+    fields = wing_fields(result.design) if report else None
+    with calibration_folder(result, folder) as fresh:
+        write_table_1(calibration.table_1, fresh / TABLE_NAME)
+        if fields is not None:
+            state = result.mean_state()
+            vector = fields.model.vector(
+                state.values, state.stiffness_loss, load_factor=LOAD_FACTOR
+            )
+            write_wing_vtu(fresh / WING_FIELDS, fields, vector)
+            write_modes_vtu(fresh / MODE_FIELDS, fields, vector)
+            with stage("Drawing the report"):
+                page = begun_page(result, fresh)
+                _add_sections(page, calibration, fields, fresh)
+                end_page(page, result, fresh)
+    return folder / FILE_NAME
+
+
+def _add_sections(
+    page: Page, calibration: WingCalibration, fields: WingFields, folder: Path
+) -> None:
+    """Add the sections of a wing to its page, and write their figures to a folder."""
+    _add_origins(page, calibration.lab.origins)
+    page.add_section("Beside the paper")
+    _add_comparison_with_paper(page, calibration, folder)
+    page.add_section("Ring-down")
+    trials = calibration.lab.trials
+    if trials is None:
+        page.add_paragraph(WORDS.say("no_record"))
+    else:
+        add_figure(page, WORDS.figure("ring_down", ring_down_figure(trials)), folder)
+    page.add_section("The calibrated wing")
+    state = calibration.result.mean_state()
+    modes = calibration.model.modes(state.values, state.stiffness_loss)
+    figure = modes_figure(fields, modes, _mode_titles(modes))
+    add_figure(page, WORDS.figure("modes", figure), folder)
+
+
+def _add_origins(page: Page, origins: Sequence[StepOrigin]) -> None:
+    """Add the origin of each step; published values beside measured ones are a notice."""
+    has_measurements = any(origin.read for origin in origins)
+    for origin in origins:
+        text = WORDS.say("origin", origin=origin)
+        if has_measurements and not origin.read:
+            page.add_notice(text)
+        else:
+            page.add_paragraph(text)
+
+
+def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder: Path) -> None:
+    TABLE_1.add_table(page, "table_1", calibration.table_1)
+    load_test_figure = calibration_figure(calibration.static)
+    add_figure(page, WORDS.figure("load_test", load_test_figure), folder)
+    rows = [
+        *_posterior_rows("tailored model", calibration.static),
+        *_posterior_rows("line of the paper, eq. (14)", calibration.static_published),
+    ]
+    WORDS.add_table(page, "two_models", rows)
+    columns, names = drawn_parameters(calibration.joint)
+    sets = [
+        ("joint posterior", calibration.joint.samples[:, columns]),
+        ("the paper's procedure", calibration.paper.samples[:, columns]),
+    ]
+    authors = calibration.lab.authors
+    if authors is not None:
+        sets.append(("authors' model", authors.samples))
+    corner = corner_figure(names, sets)
+    figure = WORDS.figure("procedure", corner, authors=authors is not None)
+    add_figure(page, figure, folder)
+
+
+def _posterior_rows(model: str, static: StaticCalibration) -> list[tuple[str, str, str, str]]:
+    """Return model, posterior, e and k for each posterior of a load test."""
+    posteriors = {"exact": static.exact}
+    for name, alternative in static.alternatives.items():
+        posteriors[f"exact, {name}"] = alternative
+    rows = []
+    for name, e in posteriors.items():
+        rows.append((model, name, _moments(e), _moments(push_forward(e, static.curve))))
+    particle = static.particle
+    rows.append((model, "particle filter", _moments(particle), _moments(particle.stiffness)))
+    return rows
+
+
+class _HasMoments(Protocol):
+    """A density with mean and standard deviation."""
+
+    @property
+    def mean(self) -> float: ...
+
+    @property
+    def standard_deviation(self) -> float: ...
+
+
+def _moments(density: _HasMoments) -> str:
+    return plus_minus(density.mean, density.standard_deviation)
+
+
+def _mode_titles(modes: Modes) -> list[str]:
+    """Return the titles of the first six modes: number, frequency, and which are flapwise."""
+    flapwise = dict(zip(modes.followed, ("first flapwise", "second flapwise"), strict=True))
+    titles = []
+    for index, frequency in enumerate(modes.frequency[:6]):
+        title = f"mode {index + 1}, {frequency:.2f} Hz"
+        if index in flapwise:
+            title += f", {flapwise[index]}"
+        titles.append(title)
+    return titles
+
+
+@style.publication_style()
+def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Figure:
+    """Return the figure of the mode shapes of the upper skin, coloured by their displacement.
+
+    Parameters
+    ----------
+    fields : WingFields
+        The bases on the mesh.
+    modes : Modes
+        The modes of the calibrated wing.
+    titles : sequence of str
+        The title of each mode.
+    """
+    # The skin with its damage regions, see `fe.reduction.model_cache.WingFields`
+    skin = fields.cells[fields.region <= len(fields.regions)][:, :8]
+    height = fields.points[skin][:, :, 2].mean(axis=1)
+    upper_nodes = np.unique(skin[height > 0.0])
+    points = fields.points[upper_nodes]
+    # Nodes are connected as seen from above. Triangles at the trailing edge, in front, come last.
+    triangles = Triangulation(points[:, 1], points[:, 0]).triangles
+    triangles = triangles[np.argsort(points[triangles, 0].mean(axis=1))]
+    span = float(np.ptp(points[:, 1]))
+    shapes = (fields.modal_displacement @ modes.shape)[upper_nodes]
+    rows = (len(titles) + 1) // 2
+    figure, grid = style.panels(
+        rows, 2, 1.5 * rows, 0.015 * rows, 0.0, wspace=0.06, hspace=0.04, left=0.01, right=0.99
+    )
+    panels = style.keep_first_panels(grid, len(titles))
+    for axes, shape, title in zip(panels, np.moveaxis(shapes, -1, 0), titles, strict=False):
+        displacement = np.linalg.norm(shape, axis=1)
+        largest = float(displacement.max())
+        deformed = points + shape * (0.14 * span / largest)
+        at_rest_shade = np.broadcast_to(0.1 * largest, displacement.shape)
+        _draw_surface(axes, points, triangles, at_rest_shade, "Greys", largest)
+        _draw_surface(axes, deformed, triangles, displacement, style.LEVELS, largest)
+        axes.set(xlim=(-0.09 * span, 1.10 * span), ylim=(-0.24 * span, 0.27 * span), aspect="equal")
+        axes.set_axis_off()
+        axes.text(
+            0.0, 0.97, title, transform=axes.transAxes, va="top", fontsize=8.0, fontweight="bold"
+        )
+    return figure
+
+
+def _draw_surface(
+    axes: Axes,
+    points: Float,
+    triangles: NDArray[np.int32],
+    shade: Float,
+    colours: str,
+    largest: float,
+) -> None:
+    """Draw a surface in oblique view: span to the right, chord into the page.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    points : (N, 3) array
+        The nodes.
+    triangles : (T, 3) array
+        The nodes of each triangle.
+    shade : (N,) array
+        The value at each node, from 0 to `largest`.
+    colours : str
+        The colour map.
+    largest : float
+        The value of the last colour.
+    """
+    x, y, z = points.T
+    projection = Triangulation(y - 0.45 * x, z - 0.40 * x, triangles)
+    axes.tripcolor(
+        projection,
+        shade,
+        cmap=colours,
+        clim=(0.0, largest),
+        shading="gouraud",
+        rasterized=True,
+    )
