@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.measurement import Measurement
-from fe.verification.calculix_comparison import calculix_program
+from fe.verification.calculix_run import calculix_program
 
 REFINEMENT = 1.2
 REPEATS = 3
@@ -38,7 +38,7 @@ def solved():
     return Factorisation(stiffness).solve(load)
 
 def first():
-    factorisation._analysed.cache_clear()
+    factorisation._analysed_pattern.cache_clear()
     return solved()
 
 def superlu():
@@ -70,8 +70,8 @@ _CALCULIX = """
 import sys
 from pathlib import Path
 from fe.runtime.state import DigitalState
-from fe.verification.calculix_comparison import Step
-from fe.verification.calculix_comparison import wing_deck
+from fe.verification.calculix_deck import Step
+from fe.verification.calculix_deck import wing_deck
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 operators = assemble(load_design().changed(mesh={"refinement": float(sys.argv[1])}))

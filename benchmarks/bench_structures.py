@@ -14,7 +14,7 @@ from math import log
 from pathlib import Path
 
 from benchmarks.measurement import Measurement
-from fe.verification.calculix_comparison import calculix_program
+from fe.verification.calculix_run import calculix_program
 
 DIVISIONS = ((36, 8, 4), (54, 11, 6))
 LARGE = (80, 16, 9)
@@ -72,7 +72,7 @@ from fe.full.factorisation import Factorisation
 from fe.reduction.reduced_basis import reduce_structure
 from fe.elements.kinds import KINDS
 from fe.structure.operators import load_and_assemble
-from fe.verification.calculix_comparison import structure_deck
+from fe.verification.calculix_deck import structure_deck
 
 folder, divisions, with_superlu = Path(sys.argv[1]), json.loads(sys.argv[2]), sys.argv[3] == "superlu"
 mesh = MeshTet.init_tensor(*(np.linspace(0.0, 1.0, count + 1) for count in divisions))

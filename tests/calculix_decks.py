@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fe.runtime.arrays import FloatArray
-from fe.verification.calculix_comparison import calculix_program, read_frequencies, read_tables, run_calculix
+from fe.verification.calculix_run import calculix_program, read_frequencies, read_tables, run_calculix
 from tests.refusals import Inputs
 
 Point = tuple[float, float, float]

@@ -91,12 +91,12 @@ from fe.structure.mesh_file import memory_estimate as memory_estimate
 from fe.structure.operators import Structure as Structure
 from fe.structure.operators import assemble_structure as assemble_structure
 from fe.structure.operators import load_and_assemble as load_and_assemble
-from fe.structure.operators import weighed as weighed
+from fe.structure.operators import mass_and_centre as mass_and_centre
 from fe.structure.operators import write_structure_vtu as write_structure_vtu
 from fe.verification.calculix_comparison import agreement as agreement
-from fe.verification.calculix_comparison import calculix_program as calculix_program
-from fe.verification.calculix_comparison import required_calculix as required_calculix
-from fe.verification.calculix_comparison import structure_deck as structure_deck
+from fe.verification.calculix_deck import structure_deck as structure_deck
+from fe.verification.calculix_run import calculix_program as calculix_program
+from fe.verification.calculix_run import required_calculix as required_calculix
 from fe.verification.wing_checks import Check as Check
 from fe.verification.wing_checks import all_checks as all_checks
 from fe.wing.design import load_design as load_design

@@ -152,7 +152,7 @@ def structure_record(structure: "parts.AffineStructure", modes: int) -> dict[str
 
 def _of_mesh(structure: "parts.Structure") -> dict[str, Any]:
     mesh = structure.mesh
-    mass, centre = parts.weighed(structure)
+    mass, centre = parts.mass_and_centre(structure)
     return {
         "mesh": structure.design.mesh,
         "remarks": list(mesh.remarks),

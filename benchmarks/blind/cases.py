@@ -22,7 +22,7 @@ from benchmarks.blind.plan import CampaignPlan
 from benchmarks.blind.wing_basis import REGION_LINES, WingBasisStore
 from benchmarks.blind.wing_campaign import wing_campaign
 from benchmarks.blind.wing_rig import LOAD_POINT, WingRig
-from fe.wing.mesh import span_lines
+from fe.wing.mesh_lines import span_lines
 
 FloatArray = NDArray[np.float64]
 

@@ -21,11 +21,11 @@ from scipy import linalg, sparse
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.state import STANDARD_GRAVITY
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
+from fe.wing.gauges import gauge_output
 from fe.wing.operators import (
     ROOT_UNKNOWNS,
     AffineOperators,
     assemble,
-    gauge_output,
     point_masses,
     section_displacement,
 )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.full.factorisation import Factorisation, lowest_eigenpairs, most_moved
+from fe.full.factorisation import Factorisation, lowest_eigenpairs, most_compliant_modes
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, assemble, point_masses
@@ -158,7 +158,7 @@ def _bases(
     servo = 0.5 * (MASS_TOTAL - REFERENCE_PITOT)
     stiffness, mass = operators.stiffness(), operators.mass(point_masses(servo, REFERENCE_PITOT))
     eigenvalues, shapes = lowest_eigenpairs(stiffness.tocsc(), mass.tocsc(), MODE_COUNT)
-    places = most_moved(operators.load_tip, eigenvalues, shapes)
+    places = most_compliant_modes(operators.load_tip, eigenvalues, shapes)
     order = int(places[0]), int(places[1])
     bending = shapes[:, list(order)]
     # What the modes become when e or a mass changes a little.

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.elements.cells import mass_blocks, stiffness_blocks
-from fe.structure.mesh import Body
+from fe.structure.body import Body
 from fe.wing.design import WingDesign
+from fe.wing.gauges import gauge_output
 from fe.wing.mesh import WingMesh, build_mesh
-from fe.wing.operators import gauge_output, section_displacement, turn_load, upward, wing_body
+from fe.wing.operators import section_displacement, turn_load, upward, wing_body
 
 from .errors import IdentificationError
 
@@ -241,7 +242,7 @@ def _other_terms(pieces: WingPieces, static: FloatArray, modal: FloatArray) -> R
     stiffness[-1], modal_stiffness[-1] = (basis.T @ (springs @ basis) for basis in (static, modal))
     full_static, full_modal = pieces.expansion @ static, pieces.expansion @ modal
     for kind, masses in enumerate(pieces.body.masses, start=1):
-        for weights in masses.shares:
+        for weights in masses.weights:
             for component in range(3):
                 row = weights @ full_modal[component::3]
                 mass[kind] += np.outer(row, row)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.full.factorisation import Factorisation, lowest_eigenpairs, most_moved
+from fe.full.factorisation import Factorisation, lowest_eigenpairs, most_compliant_modes
 from fe.runtime.state import Losses
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, AffineWing, assemble, point_masses
@@ -198,7 +198,7 @@ def wing_results(model: AffineWing, design: WingDesign) -> WingResults:
     mass = model.mass(point_masses(design.masses.servo, design.masses.pitot))
     values, shapes = lowest_eigenpairs(model.stiffness(), mass, MODES)
     frequency = np.sqrt(values) / (2.0 * np.pi)
-    first, second = frequency[most_moved(model.load_tip, values, shapes)]
+    first, second = frequency[most_compliant_modes(model.load_tip, values, shapes)]
     return WingResults(
         unknowns=model.unknowns,
         tip_stiffness=1.0 / tip,

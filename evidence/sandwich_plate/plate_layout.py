@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from skfem import MeshQuad
 
 from fe.wing.design import WingDesign
-from fe.wing.mesh import chord_lines, rib_cells, span_lines, straight_edged, web_cells
+from fe.wing.mesh import straight_edged
+from fe.wing.mesh_lines import chord_lines, rib_cells, span_lines, web_cells
 from fe.wing.parts import four_digit_half_thickness, four_digit_slope
 
 from .plate import Plate, Surface, tensor_mesh

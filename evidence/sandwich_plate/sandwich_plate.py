@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.runtime.state import STANDARD_GRAVITY
-from fe.structure.affine import StiffnessTerm, designed
+from fe.structure.affine import StiffnessTerm
+from fe.structure.affine_fields import affine_fields
 from fe.wing.design import WingDesign, wing_structure
-from fe.wing.operators import ROOT_UNKNOWNS, AffineWing, outputs, patch_pieces, stiffness_parts
+from fe.wing.gauges import averaging_points
+from fe.wing.operators import ROOT_UNKNOWNS, AffineWing, outputs, stiffness_parts
 from fe.wing.parts import DISTRIBUTIONS
 
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_strain
@@ -88,7 +90,8 @@ def assemble_plate(design: WingDesign, *, straight_section: bool = False) -> Pla
     named = wing_structure(design.regions, len(design.gauges.positions))
     loads, rows = (_lift(layout), load_tip), outputs(_gauge_output(layout), tip)
     return PlateOperators(
-        **designed(named, expansion, mass, point_masses, loads, rows),
+        design=named,
+        **affine_fields(named, expansion, mass, point_masses, loads, rows),
         stiffness_terms=tuple(map(StiffnessTerm, terms, *zip(*stiffness_parts(design.regions), strict=True))),
         design_hash=design.hash,
         kept=kept,
@@ -288,9 +291,9 @@ def _gauge_output(layout: PlateLayout) -> sparse.csr_array:
     for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
         middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
         for y, span_weight in zip(
-            *patch_pieces(distance, gauges.averaging_spanwise, layout.across), strict=True
+            *averaging_points(distance, gauges.averaging_spanwise, layout.across), strict=True
         ):
-            across = patch_pieces(middle, gauges.averaging_chordwise, layout.lines_at(y))
+            across = averaging_points(middle, gauges.averaging_chordwise, layout.lines_at(y))
             for x, chord_weight in zip(*across, strict=True):
                 owner.append(gauge)
                 share.append(span_weight * chord_weight)

@@ -16,7 +16,7 @@ from evidence.verification import known_answers as answers
 from evidence.verification.calculix_examples import DECKS, NAMES, published_difference
 from evidence.verification.ring_down import ring_down_agreement
 from fe.runtime.state import DigitalState
-from fe.verification.calculix_comparison import calculix_program
+from fe.verification.calculix_run import calculix_program
 from fe.verification.wing_checks import Check
 from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble

@@ -4,11 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.elements.cells import CellMesh, hexahedra_20, isotropic_compliance
+from fe.elements.cells import CellMesh, hexahedra_20
+from fe.elements.elasticity import isotropic_compliance
 from fe.elements.kinds import HEXAHEDRA_20
 from fe.full.factorisation import Factorisation
-from fe.structure.location import face_areas
 from fe.structure.mesh import Surface
+from fe.structure.nodal_loads import face_areas
 
 FloatArray = NDArray[np.float64]
 

@@ -9,14 +9,8 @@ from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState
 from fe.runtime.transient import ModalIntegrator
-from fe.verification.calculix_comparison import (
-    TEST_FORCE,
-    Step,
-    number_line,
-    read_tables,
-    run_calculix,
-    wing_deck,
-)
+from fe.verification.calculix_deck import TEST_FORCE, Step, number_line, wing_deck
+from fe.verification.calculix_run import read_tables, run_calculix
 from fe.wing.operators import AffineOperators
 
 FloatArray = NDArray[np.float64]

@@ -1,16 +1,17 @@
-"""The kinds of elements that a structure may be made of: nodes, faces, shape functions, integration.
+"""Kinds of finite elements: nodes, faces, shape functions, integration.
 
-Shape functions are the polynomials of scikit-fem's elements of the same name, made for many places at once;
-nodes stand in the order of the mesh file, which is that of VTK and, for these kinds, of Abaqus and CalculiX.
-All kinds are isoparametric: the mid-edge nodes of a file bend the edges and faces. Stiffness is integrated as
-CalculiX integrates C3D4, C3D8, C3D10 and C3D20; mass is integrated exactly on straight cells, while CalculiX
-takes the points of the stiffness for it.
+Shape functions are the polynomials of scikit-fem's elements of the same name, evaluated at many
+points at once. Nodes stand in the order of the mesh file, which is that of VTK and, for these
+kinds, of Abaqus and CalculiX. All kinds are isoparametric: the mid-edge nodes of a file bend the
+edges and faces. Stiffness is integrated as CalculiX integrates C3D4, C3D8, C3D10 and C3D20. Mass is
+integrated exactly on straight cells, while CalculiX integrates it at the points of the stiffness.
 """
 
 import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from types import ModuleType
+from typing import NamedTuple, cast
 
 import numpy as np
 from skfem.quadrature import get_quadrature
@@ -18,71 +19,132 @@ from skfem.refdom import RefTet, RefTri
 
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 
-Rule = tuple[FloatArray, FloatArray]
+
+class Rule(NamedTuple):
+    """An integration rule of q points on a reference cell or face of d dimensions.
+
+    Attributes
+    ----------
+    points : (q, d) array
+        Local positions of the points.
+    weights : (q,) array
+        Weights of the points.
+    """
+
+    points: FloatArray
+    weights: FloatArray
 
 
-_TET = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
-_TET_EDGES = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))
-_TET_FACES = ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))
-_HEX = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1))
-_HEX_EDGES = (
-    (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
-)  # fmt: skip
-_HEX_FACES = ((0, 1, 2, 3), (4, 7, 6, 5), (0, 4, 5, 1), (1, 5, 6, 2), (2, 6, 7, 3), (3, 7, 4, 0))
-_WEDGE = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
+class FaceFrames(NamedTuple):
+    """Local frames of the f faces of a reference cell.
+
+    A face is the unit triangle or the unit square between its tangents.
+
+    Attributes
+    ----------
+    corner : (f, 3) array
+        The first corner of each face.
+    tangents : (f, 2, 3) array
+        From this corner to its two neighbours; their cross product points outwards.
+    """
+
+    corner: FloatArray
+    tangents: FloatArray
+
+
+_TETRAHEDRON_CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+_TETRAHEDRON_EDGES = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))
+_TETRAHEDRON_FACES = ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))
+_HEXAHEDRON_CORNERS = (
+    (0, 0, 0),
+    (1, 0, 0),
+    (1, 1, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (1, 0, 1),
+    (1, 1, 1),
+    (0, 1, 1),
+)
+_LOWER_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0))
+_UPPER_EDGES = ((4, 5), (5, 6), (6, 7), (7, 4))
+_UPRIGHT_EDGES = ((0, 4), (1, 5), (2, 6), (3, 7))
+_HEXAHEDRON_EDGES = (*_LOWER_EDGES, *_UPPER_EDGES, *_UPRIGHT_EDGES)
+_HEXAHEDRON_FACES = (
+    (0, 1, 2, 3),
+    (4, 7, 6, 5),
+    (0, 4, 5, 1),
+    (1, 5, 6, 2),
+    (2, 6, 7, 3),
+    (3, 7, 4, 0),
+)
+_WEDGE_CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
 _WEDGE_EDGES = ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5))
 _WEDGE_FACES = ((0, 1, 2), (3, 5, 4), (0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0))
+
+# Exponents of the monomials x^i y^j z^k that span the shape functions.
 _POWERS = tuple(itertools.product(range(3), repeat=3))
 _LINEAR = tuple(power for power in _POWERS if sum(power) <= 1)
 _QUADRATIC = tuple(power for power in _POWERS if sum(power) <= 2)
 _TRILINEAR = tuple(power for power in _POWERS if max(power) <= 1)
 # D. N. Arnold and G. Awanou (2011): degree at most two, factors of degree one not counted.
 _SERENDIPITY = tuple(power for power in _POWERS if sum(p for p in power if p > 1) <= 2)
-_PRISMATIC = tuple(power for power in _POWERS if power[0] + power[1] <= 1 and power[2] <= 1)
-# Quadratic in the triangle and linear along it, or the other way round.
-_PRISMATIC_QUADRATIC = tuple(power for power in _POWERS if power[0] + power[1] + power[2] // 2 <= 2)
+_PRISMATIC = tuple((i, j, k) for i, j, k in _POWERS if i + j <= 1 and k <= 1)
+# Quadratic in the triangle and linear along the prism, or the other way round.
+_PRISMATIC_QUADRATIC = tuple((i, j, k) for i, j, k in _POWERS if i + j + k // 2 <= 2)
 
 
 def gauss_points(order: int, dimensions: int = 3) -> Rule:
-    """Tensor Gauss rule on the unit cube: points (q, dimensions), weights (q,)."""
-    line, weight = np.polynomial.legendre.leggauss(order)
-    points, weights = (
-        np.array([*itertools.product(0.5 * values, repeat=dimensions)]) for values in (line + 1.0, weight)
-    )
-    return points, weights.prod(axis=1)
+    """Return the tensor-product Gauss rule on the unit cube.
+
+    Parameters
+    ----------
+    order : int
+        The number of points along each axis.
+    dimensions : int
+        The dimensions of the cube.
+    """
+    roots, root_weights = np.polynomial.legendre.leggauss(order)
+    points = np.array([*itertools.product(0.5 * (roots + 1.0), repeat=dimensions)])
+    weights = np.array([*itertools.product(0.5 * root_weights, repeat=dimensions)])
+    return Rule(points, weights.prod(axis=1))
 
 
 def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
+    """Return scikit-fem's rule on a simplex, exact for polynomials of an order."""
     points, weights = get_quadrature(cell, order)
-    return np.ascontiguousarray(points.T), np.asarray(weights)
+    return Rule(np.ascontiguousarray(points.T), np.asarray(weights))
 
 
-def _wedge_rule(order: int, along: int) -> Rule:
-    flat, line = _simplex_rule(RefTri, order), gauss_points(along, dimensions=1)
-    points = [(*place, height) for height in line[0][:, 0] for place in flat[0]]
-    return np.array(points), np.outer(line[1], flat[1]).ravel()
+def _wedge_rule(triangle_order: int, line_order: int) -> Rule:
+    """Return the product of a rule on the triangle and a Gauss rule along the wedge."""
+    triangle = _simplex_rule(RefTri, triangle_order)
+    line = gauss_points(line_order, dimensions=1)
+    pairs = itertools.product(line.points, triangle.points)
+    points = [(*position, height) for (height,), position in pairs]
+    return Rule(np.array(points), np.outer(line.weights, triangle.weights).ravel())
 
 
 @dataclass(frozen=True)
 class ElementKind:
-    """A kind of element.
+    """A kind of element with k nodes.
 
     Attributes
     ----------
     name : str
-        What it is called in a sentence, in the plural.
+        Its name in sentences, in the plural.
     file_type, calculix : str
         Its names in meshio and in CalculiX.
-    exponents : (k, 3)
-        Monomials that span the shape functions.
-    corners : (c, 3)
-        Local places of the corners, in the order of the file.
+    exponents : (k, 3) tuples
+        Exponents of the monomials that span the shape functions.
+    corners : (c, 3) tuples
+        Local positions of the corners, in the order of the file.
     edges : tuple of pairs
-        Corners of the edges whose middles bear the other nodes, in their order; empty for linear kinds.
+        The two corners of each edge that has a mid-edge node, in the order of these nodes; empty
+        for linear kinds.
     faces : tuple of tuples
-        Corners of each face, in the order and with the numbers of Abaqus.
-    stiffness_rule, mass_rule : points (q, 3) and weights (q,)
-        Integration on the reference cell.
+        The corners of each face, in the order and with the numbers of Abaqus.
+    stiffness_rule, mass_rule : Rule
+        Integration of stiffness and of mass on the reference cell.
     """
 
     name: str
@@ -96,10 +158,10 @@ class ElementKind:
     mass_rule: Rule
 
     @cached_property
-    def places(self) -> FloatArray:
-        """Local places (k, 3) of the nodes in the order of the file."""
+    def node_positions(self) -> FloatArray:
+        """Local positions (k, 3) of the nodes in the order of the file."""
         corners = np.array(self.corners, dtype=np.float64)
-        middles = [0.5 * (corners[a] + corners[b]) for a, b in self.edges]
+        middles = [0.5 * (corners[start] + corners[end]) for start, end in self.edges]
         return np.vstack([corners, *middles])
 
     @property
@@ -108,92 +170,162 @@ class ElementKind:
         return len(self.corners) + len(self.edges)
 
     @cached_property
+    def centre(self) -> FloatArray:
+        """Mean (3,) of the local positions of the corners."""
+        return np.asarray(np.mean(self.corners, axis=0))
+
+    @cached_property
     def _coefficients(self) -> FloatArray:
-        """Coefficients (k, k) of the monomials in the shape functions, each one at its node alone."""
-        at_nodes = np.prod(self.places[:, None, :] ** np.array(self.exponents), axis=2)
-        return np.rint(np.linalg.inv(at_nodes))  # whole numbers on these reference cells
+        """Coefficients (k, k) of the monomials in the shape functions, each one at its own node."""
+        monomials = self.node_positions[:, None, :] ** np.array(self.exponents)
+        # They are whole numbers on these reference cells.
+        return np.rint(np.linalg.inv(np.prod(monomials, axis=2)))
 
     @cached_property
     def face_nodes(self) -> tuple[tuple[int, ...], ...]:
         """Nodes of each face: its corners, then its mid-edge nodes."""
-        sides = [{*edge} for edge in self.edges]
+        return tuple((*face, *self._mid_edge_nodes(face)) for face in self.faces)
+
+    def _mid_edge_nodes(self, face: tuple[int, ...]) -> list[int]:
+        """Return the mid-edge nodes of a face with the given corners."""
         first = len(self.corners)
-        return tuple(
-            (*face, *(first + number for number, side in enumerate(sides) if side <= {*face}))
-            for face in self.faces
-        )
+        return [first + number for number, edge in enumerate(self.edges) if {*edge} <= {*face}]
 
     @property
-    def mirrored(self) -> IntArray:
-        """Places (k,) in the order of MED, whose cells are those of VTK in a mirror, of the nodes."""
-        mirror = self.places[:, [1, 0, 2]]
-        return np.asarray(np.abs(self.places[:, None] - mirror).sum(axis=2).argmin(axis=1))
+    def med_order(self) -> IntArray:
+        """Number (k,) of the node that MED has at each position; its cells are mirrored."""
+        x, y, z = self.node_positions.T
+        mirrored = np.column_stack((y, x, z))
+        distance = np.abs(self.node_positions[:, None] - mirrored).sum(axis=2)
+        return np.asarray(distance.argmin(axis=1))
 
-    def inside(self, local: FloatArray, tolerance: float) -> BoolArray:
-        """Whether local places (p, 3) lie in the reference cell, up to a tolerance."""
-        corner, tangents = self.face_frames
-        outwards = np.cross(tangents[:, 0], tangents[:, 1])
-        return np.asarray((((local[:, None] - corner) * outwards).sum(axis=2) <= tolerance).all(axis=1))
+    def contains(self, local: FloatArray, tolerance: float) -> BoolArray:
+        """Return whether local positions (p, 3) lie in the reference cell, up to a tolerance."""
+        frames = self.face_frames
+        along_first, along_second = np.moveaxis(frames.tangents, 1, 0)
+        outward = np.cross(along_first, along_second)
+        distance = ((local[:, None] - frames.corner) * outward).sum(axis=2)
+        return np.asarray((distance <= tolerance).all(axis=1))
 
     def shape_functions(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Values (q, k) and local gradients (q, k, 3) at local places (q, 3), nodes as in the file."""
+        """Evaluate the shape functions.
+
+        Parameters
+        ----------
+        local : (q, 3) array
+            Local positions.
+
+        Returns
+        -------
+        values : (q, k) array
+            Values of the shape functions.
+        gradients : (q, k, 3) array
+            Their local gradients.
+        """
         exponents = np.array(self.exponents)
+        # powers 0, 1, 2 of each coordinate (q, 3, 3), and their derivatives
         powers = np.stack((np.ones_like(local), local, local**2), axis=2)
         slopes = np.stack((np.zeros_like(local), np.ones_like(local), 2.0 * local), axis=2)
         x, y, z = (powers[:, axis, exponents[:, axis]] for axis in range(3))
         dx, dy, dz = (slopes[:, axis, exponents[:, axis]] for axis in range(3))
-        gradients = [part @ self._coefficients for part in (dx * y * z, x * dy * z, x * y * dz)]
-        return np.asarray(x * y * z @ self._coefficients), np.stack(gradients, axis=2)
+        # monomials and their derivatives, combined
+        values = x * y * z @ self._coefficients
+        derivatives = (dx * y * z, x * dy * z, x * y * dz)
+        gradients = [derivative @ self._coefficients for derivative in derivatives]
+        return np.asarray(values), np.stack(gradients, axis=2)
 
     @cached_property
-    def face_frames(self) -> tuple[FloatArray, FloatArray]:
-        """First corner (f, 3) of each face and its two local tangents (f, 2, 3), to the corners beside it.
+    def face_frames(self) -> FaceFrames:
+        """Local frames of the faces."""
 
-        Faces are the unit triangle or square between these; the tangents' cross product points outwards.
-        """
-        # Seen from outside, the corners of a face turn clockwise in Abaqus: the last one comes second here.
-        corner, last, second = (
-            np.array([self.corners[face[n]] for face in self.faces], dtype=np.float64) for n in (0, -1, 1)
-        )
-        return corner, np.stack((last - corner, second - corner), axis=1)
+        def corner_positions(number_in_face: int) -> FloatArray:
+            return np.array(
+                [self.corners[face[number_in_face]] for face in self.faces], dtype=np.float64
+            )
+
+        # Seen from outside, the corners of a face turn clockwise in Abaqus, so that the tangent to
+        # the last corner is the first one.
+        first, second, last = corner_positions(0), corner_positions(1), corner_positions(-1)
+        return FaceFrames(first, np.stack((last - first, second - first), axis=1))
 
     def face_rule(self, face: int) -> Rule:
-        """Integration points (q, 2) and weights (q,) on a face, exact for its shape functions' products."""
+        """Return an integration rule on a face, exact for products of two shape functions."""
         if len(self.faces[face]) == 3:
             return _simplex_rule(RefTri, 4)
         return gauss_points(3, dimensions=2)
 
 
 TETRAHEDRA_4 = ElementKind(
-    "4-node tetrahedra", "tetra", "C3D4", _LINEAR, _TET, (), _TET_FACES,
-    _simplex_rule(RefTet, 1), _simplex_rule(RefTet, 2),
-)  # fmt: skip
+    name="4-node tetrahedra",
+    file_type="tetra",
+    calculix="C3D4",
+    exponents=_LINEAR,
+    corners=_TETRAHEDRON_CORNERS,
+    edges=(),
+    faces=_TETRAHEDRON_FACES,
+    stiffness_rule=_simplex_rule(RefTet, 1),
+    mass_rule=_simplex_rule(RefTet, 2),
+)
 TETRAHEDRA_10 = ElementKind(
-    "10-node tetrahedra", "tetra10", "C3D10", _QUADRATIC, _TET, _TET_EDGES, _TET_FACES,
-    _simplex_rule(RefTet, 2), _simplex_rule(RefTet, 5),
-)  # fmt: skip
+    name="10-node tetrahedra",
+    file_type="tetra10",
+    calculix="C3D10",
+    exponents=_QUADRATIC,
+    corners=_TETRAHEDRON_CORNERS,
+    edges=_TETRAHEDRON_EDGES,
+    faces=_TETRAHEDRON_FACES,
+    stiffness_rule=_simplex_rule(RefTet, 2),
+    mass_rule=_simplex_rule(RefTet, 5),
+)
 HEXAHEDRA_8 = ElementKind(
-    "8-node hexahedra", "hexahedron", "C3D8", _TRILINEAR, _HEX, (), _HEX_FACES,
-    gauss_points(2), gauss_points(3),
-)  # fmt: skip
+    name="8-node hexahedra",
+    file_type="hexahedron",
+    calculix="C3D8",
+    exponents=_TRILINEAR,
+    corners=_HEXAHEDRON_CORNERS,
+    edges=(),
+    faces=_HEXAHEDRON_FACES,
+    stiffness_rule=gauss_points(2),
+    mass_rule=gauss_points(3),
+)
 HEXAHEDRA_20 = ElementKind(
-    "20-node hexahedra", "hexahedron20", "C3D20", _SERENDIPITY, _HEX, _HEX_EDGES, _HEX_FACES,
-    gauss_points(3), gauss_points(3),
-)  # fmt: skip
+    name="20-node hexahedra",
+    file_type="hexahedron20",
+    calculix="C3D20",
+    exponents=_SERENDIPITY,
+    corners=_HEXAHEDRON_CORNERS,
+    edges=_HEXAHEDRON_EDGES,
+    faces=_HEXAHEDRON_FACES,
+    stiffness_rule=gauss_points(3),
+    mass_rule=gauss_points(3),
+)
 WEDGES_6 = ElementKind(
-    "6-node wedges", "wedge", "C3D6", _PRISMATIC, _WEDGE, (), _WEDGE_FACES,
-    _wedge_rule(2, 2), _wedge_rule(4, 3),
-)  # fmt: skip
+    name="6-node wedges",
+    file_type="wedge",
+    calculix="C3D6",
+    exponents=_PRISMATIC,
+    corners=_WEDGE_CORNERS,
+    edges=(),
+    faces=_WEDGE_FACES,
+    stiffness_rule=_wedge_rule(2, 2),
+    mass_rule=_wedge_rule(4, 3),
+)
 WEDGES_15 = ElementKind(
-    "15-node wedges", "wedge15", "C3D15", _PRISMATIC_QUADRATIC, _WEDGE, _WEDGE_EDGES, _WEDGE_FACES,
-    _wedge_rule(2, 3), _wedge_rule(4, 3),
-)  # fmt: skip
+    name="15-node wedges",
+    file_type="wedge15",
+    calculix="C3D15",
+    exponents=_PRISMATIC_QUADRATIC,
+    corners=_WEDGE_CORNERS,
+    edges=_WEDGE_EDGES,
+    faces=_WEDGE_FACES,
+    stiffness_rule=_wedge_rule(2, 3),
+    mass_rule=_wedge_rule(4, 3),
+)
 KINDS = {
     kind.file_type: kind
     for kind in (TETRAHEDRA_4, TETRAHEDRA_10, HEXAHEDRA_8, HEXAHEDRA_20, WEDGES_6, WEDGES_15)
 }
 """The kinds by their names in meshio."""
-
 
 HEXAHEDRA_20_REDUCED = replace(
     HEXAHEDRA_20,
@@ -203,13 +335,16 @@ HEXAHEDRA_20_REDUCED = replace(
 )
 REDUCED = "hexahedron20 reduced"
 DECK_KINDS = KINDS | {REDUCED: HEXAHEDRA_20_REDUCED}
-"""The kinds that decks can ask for, by their names in a `Deck`; meshio knows cells, not their integration."""
+"""The kinds that decks can ask for, by their names in a `Deck`.
+
+The names of meshio are of cells only, not of their integration.
+"""
 
 
-def meshio_with_wedges() -> Any:
-    """Return meshio, whose version 5.3 forgets of how many dimensions a wedge of 15 nodes is."""
+def meshio_with_wedges() -> ModuleType:
+    """Return meshio, where 15-node wedges have three dimensions, which version 5.3 forgets."""
     import meshio
     from meshio._mesh import topological_dimension
 
     topological_dimension.setdefault("wedge15", 3)
-    return meshio
+    return cast(ModuleType, meshio)

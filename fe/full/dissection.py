@@ -1,14 +1,17 @@
 """Nested dissection: an order of elimination for sparse Cholesky factors, from the graph alone.
 
-A graph is cut in two by a small set of vertices, the separator, which is eliminated after both halves; the
-halves are cut in the same way. All parts of one depth are cut together, so that the work is a few passes
-over arrays. Cuts follow the distances, in edges, from two vertices at far ends of a part: for a slender body
-these are sections across it, whatever the shape of its cells.
+A graph is cut in two by a small set of vertices, the separator, which is eliminated after both
+halves; the halves are cut in the same way. All parts of one depth are cut together, so that the
+work is a few passes over arrays. Cuts follow the distances, in edges, from two vertices at distant
+ends of a part: for a slender body these are sections across it, whatever the shape of its cells.
 
 References
 ----------
-A. George, "Nested dissection of a regular finite element mesh", SIAM Journal on Numerical Analysis 10 (1973).
+A. George, "Nested dissection of a regular finite element mesh", SIAM Journal on Numerical Analysis
+10 (1973).
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -16,118 +19,233 @@ from scipy.sparse import csgraph
 
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 
-CUT_PLACES = (0.4, 0.5, 0.6)
-"""Shares of a part's weight at which a cut is tried."""
+CUT_FRACTIONS = (0.4, 0.5, 0.6)
+"""Fractions of a part's weight at which a cut is tried."""
 LARGEST_HALF = 0.8
-"""A cut may leave at most this share of a part on one side."""
+"""Largest fraction of a part that a cut may leave on one side."""
 _IMBALANCE_WEIGHT = 1.2
 
 
-def best_cut(part: IntArray, weight: FloatArray, ends: IntArray) -> tuple[BoolArray, BoolArray, BoolArray]:
+class Cuts(NamedTuple):
+    """The best cut of each part of a graph with n vertices.
+
+    Attributes
+    ----------
+    separator : (n,) array of bool
+        Whether a vertex belongs to the separator of its part.
+    side : (n,) array of bool
+        The side of the separator on which any other vertex lies.
+    is_cut : (parts,) array of bool
+        Whether a part was cut; the others are too closely connected.
+    """
+
+    separator: BoolArray
+    side: BoolArray
+    is_cut: BoolArray
+
+
+def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
     """Find the best cut of each part.
 
     Parameters
     ----------
-    part : (n,)
+    part : (n,) array of int
         Number of the part of each vertex.
-    weight : (n,)
+    weight : (n,) array
         Weight of each vertex.
-    ends : (2, m)
-        Vertices at the ends of each edge, both in one part.
+    edges : (2, m) array of int
+        The two vertices of each edge, both in one part.
+    """
+    total = np.asarray(np.bincount(part, weights=weight), dtype=np.float64)
+    weight_before = np.cumsum(total) - total
+    lowest_cost = np.full(len(total), np.inf)
+    separator = np.zeros(len(part), dtype=bool)
+    side = np.zeros(len(part), dtype=bool)
+    for coordinate in _coordinates(part, edges):
+        order = np.lexsort((coordinate, part))
+        cumulative = np.cumsum(weight[order])
+        for fraction in CUT_FRACTIONS:
+            # cut each part where this fraction of its weight is reached
+            median = order[np.searchsorted(cumulative, weight_before + fraction * total)]
+            is_above = coordinate > coordinate[median][part]
+            edge_is_above = is_above[edges]
+            crosses = edge_is_above[0] != edge_is_above[1]
+            for half in (True, False):  # the vertices on either side of the cut separate the halves
+                on_cut = np.zeros(len(part), dtype=bool)
+                on_cut[edges[:, crosses][edge_is_above[:, crosses] == half]] = True
+                cost = _cut_costs(part, weight, total, on_cut, is_above)
+                # keep what is better than before
+                is_better = cost < lowest_cost
+                lowest_cost[is_better] = cost[is_better]
+                chosen = is_better[part]
+                separator[chosen] = on_cut[chosen]
+                side[chosen] = is_above[chosen]
+    return Cuts(separator, side, np.isfinite(lowest_cost))
+
+
+def _cut_costs(
+    part: IntArray,
+    weight: FloatArray,
+    total: FloatArray,
+    on_cut: BoolArray,
+    is_above: BoolArray,
+) -> FloatArray:
+    """Return the cost of a cut of each part, infinite if its halves are too uneven.
+
+    Parameters
+    ----------
+    part, weight : (n,) array
+        Part and weight of each vertex.
+    total : (parts,) array
+        Weight of each part.
+    on_cut, is_above : (n,) array of bool
+        Whether a vertex is on the cut, and on which side of it.
 
     Returns
     -------
-    separator, side : (n,) bool
-        Whether a vertex belongs to the separator, and on which side of it the others lie.
-    done : (parts,) bool
-        Whether a part was cut; the others hang together too closely.
+    (parts,) array
+        The weight of the separator, increased if the halves are uneven.
     """
-    total = np.bincount(part, weights=weight)
-    best = np.full(len(total), np.inf)
-    separator, side = np.zeros((2, len(part)), dtype=bool)
-    before = np.cumsum(total) - total
-    for coordinate in _coordinates(part, ends):
-        order = np.lexsort((coordinate, part))
-        reached = np.cumsum(weight[order])
-        for share in CUT_PLACES:
-            middle = order[np.searchsorted(reached, before + share * total)]
-            above = coordinate > coordinate[middle][part]
-            upper = above[ends]
-            crossing = upper[0] != upper[1]
-            for half in (True, False):  # the vertices on either side of the cut separate the halves
-                on_cut = np.zeros(len(part), dtype=bool)
-                on_cut[ends[:, crossing][upper[:, crossing] == half]] = True
-                held, beyond = (
-                    np.bincount(part, weights=weight * where) for where in (on_cut, above & ~on_cut)
-                )
-                below = total - held - beyond
-                # The weight of the separator, more for uneven halves, infinite for too uneven ones.
-                cost = held * (1.0 + _IMBALANCE_WEIGHT * ((beyond - below) / total) ** 2)
-                cost[np.maximum(beyond, below) > LARGEST_HALF * total] = np.inf
-                better = cost < best
-                best[better] = cost[better]
-                chosen = better[part]
-                separator[chosen], side[chosen] = on_cut[chosen], above[chosen]
-    return separator, side, np.isfinite(best)
+    separator_weight = np.bincount(part, weights=weight * on_cut)
+    above = np.bincount(part, weights=weight * (is_above & ~on_cut))
+    below = total - separator_weight - above
+    imbalance = (above - below) / total
+    cost = separator_weight * (1.0 + _IMBALANCE_WEIGHT * imbalance**2)
+    cost[np.maximum(above, below) > LARGEST_HALF * total] = np.inf
+    return np.asarray(cost)
 
 
-def _coordinates(part: IntArray, ends: IntArray) -> list[FloatArray]:
-    """Distances (n,) from two far ends of each part, and their difference."""
+def _coordinates(part: IntArray, edges: IntArray) -> list[FloatArray]:
+    """Return coordinates (n,) of the vertices along which parts may be cut.
+
+    These are the distances from two distant ends of each part, and first their difference.
+    """
     size = len(part)
-    graph = sparse.coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(size, size)).tocsr()
+    ones = np.ones(edges.shape[1])
+    graph = sparse.coo_array((ones, tuple(edges)), shape=(size, size)).tocsr()
 
-    def distance(sources: IntArray) -> FloatArray:
-        found = csgraph.dijkstra(graph, directed=False, unweighted=True, indices=sources, min_only=True)
-        reached = np.isfinite(found)
-        # a piece that does not hang together with the rest is the farthest of all
-        return np.asarray(np.where(reached, found, found[reached].max() + 1.0))
+    def distance_from(sources: IntArray) -> FloatArray:
+        distance = csgraph.dijkstra(
+            graph, directed=False, unweighted=True, indices=sources, min_only=True
+        )
+        is_connected = np.isfinite(distance)
+        # a component that is not connected with the sources counts as the most distant
+        largest = distance[is_connected].max()
+        return np.asarray(np.where(is_connected, distance, largest + 1.0))
 
-    def farthest(values: FloatArray) -> IntArray:
-        order = np.lexsort((-values, part))
-        return np.asarray(order[np.concatenate(([True], np.diff(part[order]) != 0))])
+    def most_distant_of_each_part(distance: FloatArray) -> IntArray:
+        order = np.lexsort((-distance, part))
+        is_first_of_part = np.concatenate(([True], np.diff(part[order]) != 0))
+        return np.asarray(order[is_first_of_part])
 
-    first = distance(farthest(distance(farthest(np.zeros(size)))))
-    second = distance(farthest(first))
-    return [first - second, first, second]
+    # an end is the vertex most distant from a vertex that is itself distant
+    start = most_distant_of_each_part(np.zeros(size))
+    one_end = most_distant_of_each_part(distance_from(start))
+    from_one_end = distance_from(one_end)
+    from_other_end = distance_from(most_distant_of_each_part(from_one_end))
+    return [from_one_end - from_other_end, from_one_end, from_other_end]
+
+
+class _Parts(NamedTuple):
+    """Parts of a graph that are still to be cut.
+
+    Attributes
+    ----------
+    starts : (p,) array of int
+        The first position of each part in the order of elimination.
+    vertices : (v,) array of int
+        The vertices of all parts.
+    part : (v,) array of int
+        The number of the part of each vertex.
+    """
+
+    starts: IntArray
+    vertices: IntArray
+    part: IntArray
 
 
 def elimination_blocks(graph: sparse.csr_array, weight: FloatArray, leaf_weight: float) -> IntArray:
-    """Dissect a graph until its parts are light: first place (n,) of each vertex's leaf or separator.
+    """Dissect a graph until its parts are light: leaves, and separators between them.
 
-    The leaves and separators follow one another in the order of elimination: of a part first one half, then
-    the other, last its separator.
+    Leaves and separators follow one another in the order of elimination: of each part first one
+    half, then the other, last its separator.
 
     Parameters
     ----------
     graph : csr (n, n)
-        Symmetric pattern; values and diagonal do not count.
-    weight : (n,)
+        A symmetric pattern; values and diagonal do not count.
+    weight : (n,) array
         Weight of the vertices.
     leaf_weight : float
         Parts up to this weight are not cut.
+
+    Returns
+    -------
+    (n,) array of int
+        The first position, in the order of elimination, of the leaf or separator of each vertex.
     """
     size = graph.shape[0]
-    edges = graph.tocoo()
-    once = edges.row < edges.col
-    ends = np.stack((edges.row[once], edges.col[once])).astype(np.int64)
-    place = np.zeros(size, dtype=np.int64)
-    # what is still to be cut: the first places of the parts, the vertices and their parts
-    first, vertices, part = np.zeros(1, dtype=np.int64), np.arange(size), np.zeros(size, dtype=np.int64)
+    entries = graph.tocoo()
+    is_upper = entries.row < entries.col
+    edges = np.stack((entries.row[is_upper], entries.col[is_upper])).astype(np.int64)
+    position = np.zeros(size, dtype=np.int64)
+    # the whole graph is the first part
+    parts = _Parts(np.zeros(1, dtype=np.int64), np.arange(size), np.zeros(size, dtype=np.int64))
     while True:
-        heavy = np.bincount(part, weights=weight[vertices], minlength=len(first)) > leaf_weight
-        first, kept = first[heavy], heavy[part]
-        vertices, part = vertices[kept], (np.cumsum(heavy) - 1)[part[kept]]
-        if not len(vertices):
-            return place
+        parts = _heavy_parts(parts, weight, leaf_weight)
+        if not len(parts.vertices):
+            return position
+        # keep the edges inside parts, and number the vertices anew
         index = np.full(size, -1)
-        index[vertices] = np.arange(len(vertices))
-        ends = ends[:, (index[ends] >= 0).all(axis=0) & (place[ends[0]] == place[ends[1]])]
-        separator, side, done = best_cut(part, weight[vertices], index[ends])
-        kept = done[part]
-        vertices = vertices[kept]
-        block = (3 * (np.cumsum(done) - 1)[part] + np.where(separator, 2, side))[kept]
-        count = np.bincount(block, minlength=3 * int(done.sum())).reshape(-1, 3)
-        starts = first[done, None] + np.cumsum(count, axis=1) - count
-        place[vertices] = starts.ravel()[block]
-        half = block % 3 < 2
-        vertices, part, first = vertices[half], (block // 3 * 2 + block % 3)[half], starts[:, :2].ravel()
+        index[parts.vertices] = np.arange(len(parts.vertices))
+        is_inside = (index[edges] >= 0).all(axis=0) & (position[edges[0]] == position[edges[1]])
+        edges = edges[:, is_inside]
+        cuts = best_cuts(parts.part, weight[parts.vertices], index[edges])
+        parts = _halves(parts, cuts, position)
+
+
+def _heavy_parts(parts: _Parts, weight: FloatArray, leaf_weight: float) -> _Parts:
+    """Return the parts that are heavier than a leaf."""
+    part_weight = np.bincount(
+        parts.part, weights=weight[parts.vertices], minlength=len(parts.starts)
+    )
+    is_heavy = part_weight > leaf_weight
+    in_heavy_part = is_heavy[parts.part]
+    new_number = np.cumsum(is_heavy) - 1
+    return _Parts(
+        starts=parts.starts[is_heavy],
+        vertices=parts.vertices[in_heavy_part],
+        part=new_number[parts.part[in_heavy_part]],
+    )
+
+
+def _halves(parts: _Parts, cuts: Cuts, position: IntArray) -> _Parts:
+    """Return the halves of the parts that were cut, and set the positions of their vertices.
+
+    Parameters
+    ----------
+    parts : _Parts
+        The parts.
+    cuts : Cuts
+        Their cuts.
+    position : (n,) array of int
+        The first position of the block of each vertex; changed in place.
+    """
+    # each part that was cut becomes three blocks: two halves (0 and 1) and a separator (2)
+    in_cut_part = cuts.is_cut[parts.part]
+    vertices = parts.vertices[in_cut_part]
+    new_number = np.cumsum(cuts.is_cut) - 1
+    block_in_part = np.where(cuts.separator, 2, cuts.side)
+    block = (3 * new_number[parts.part] + block_in_part)[in_cut_part]
+    # the blocks of a part follow one another from its start
+    count = np.bincount(block, minlength=3 * int(cuts.is_cut.sum())).reshape(-1, 3)
+    block_starts = parts.starts[cuts.is_cut, None] + np.cumsum(count, axis=1) - count
+    position[vertices] = block_starts.ravel()[block]
+    # the halves are the next parts
+    is_half = block % 3 < 2
+    half_starts, _ = np.split(block_starts, [2], axis=1)
+    return _Parts(
+        starts=half_starts.ravel(),
+        vertices=vertices[is_half],
+        part=(block // 3 * 2 + block % 3)[is_half],
+    )

@@ -1,16 +1,15 @@
-"""Sparse Cholesky factors by the multifrontal method with dense LAPACK kernels; solutions and modes by them.
+"""Sparse Cholesky factors by the multifrontal method; solutions and modes by them.
 
-The unknowns are eliminated front by front: a front is a small dense matrix of the unknowns that a leaf or
-separator of a nested dissection holds (its pivots) and of those that they are coupled to later (its
-boundary). What the pivots leave on the boundary, the Schur complement, is added to a later front.
+The unknowns are eliminated front by front, see `fe.full.fronts`. A front is a small dense matrix,
+which LAPACK factorises. What its pivots leave on its boundary, the Schur complement, is added to a
+later front.
 
 References
 ----------
-I. S. Duff and J. K. Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM
-Transactions on Mathematical Software 9 (1983).
+I. S. Duff and J. K. Reid, "The multifrontal solution of indefinite sparse symmetric linear
+equations", ACM Transactions on Mathematical Software 9 (1983).
 """
 
-from collections.abc import Iterator
 from functools import cache, lru_cache
 from typing import NamedTuple, NoReturn
 
@@ -22,140 +21,92 @@ from threadpoolctl import ThreadpoolController
 
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import SolutionError
-from fe.sentences import said
 
-from .dissection import elimination_blocks
+from .fronts import Front, analyse
 
 MODE_RESIDUAL_LIMIT = 1e-12
-"""Largest max|K phi - omega^2 M phi| / (|K| max|phi|), in maximum norms, of an accepted mode."""
-LEAF_UNKNOWNS = 120
-"""Parts of the mesh with up to so many unknowns are eliminated as one dense front."""
+"""Largest residual of an accepted mode, max|K phi - omega^2 M phi| / (|K| max|phi|)."""
 BACKWARD_ERROR_LIMIT = 1e-12
-"""Largest backward error max|b - K u| / (|K| max|u| + max|b|) of an accepted solution, in maximum norms."""
+"""Largest backward error of an accepted solution, max|b - K u| / (|K| max|u| + max|b|)."""
 CORRECTION_LIMIT = 1e-4
 """Largest change |du| / |u| that one step of iterative refinement may still make.
 
-Thin cells make the condition number about 1e10, so that about 1e-6 is what double precision reaches.
+Thin cells make the condition number about 1e10, so that double precision reaches about 1e-6.
 """
 
 
-class Front(NamedTuple):
-    """Unknowns that are eliminated together, by their places in the order of elimination.
-
-    Attributes
-    ----------
-    start, end : int
-        The pivots are the places start to end - 1.
-    boundary : (b,)
-        Later places that the pivots are coupled to, rising.
-    parent : int
-        Number of the front that takes the Schur complement, -1 where the boundary is empty.
-    """
-
-    start: int
-    end: int
-    boundary: IntArray
-    parent: int
-
-
-def analyse(matrix: sparse.csr_array) -> tuple[IntArray, tuple[Front, ...]]:
-    """Find an order of elimination by nested dissection, and the fronts that follow from it.
+@lru_cache(maxsize=2)
+def _analysed_pattern(
+    size: int, row_starts: bytes, columns: bytes
+) -> tuple[IntArray, tuple[Front, ...]]:
+    """Analyse a pattern; the cache answers for the same pattern with other values, as with damage.
 
     Parameters
     ----------
-    matrix : csr (n, n)
-        Symmetric pattern with a full diagonal; the values do not count.
-
-    Returns
-    -------
-    order : (n,)
-        Unknown at each place of the order.
-    fronts : tuple of Front
-        In the order of elimination.
+    size : int
+        The number of rows.
+    row_starts, columns : bytes
+        The arrays `indptr` and `indices` of a csr array, of int32.
     """
-    first, group = _twins(matrix)
-    graph = matrix[first][:, first]
-    size = np.bincount(group)
-    block = elimination_blocks(graph, size.astype(np.float64), LEAF_UNKNOWNS)
-    order, starts = np.argsort(block, kind="stable"), np.unique(block)
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    size = size[order]
-    offset = np.concatenate(([0], np.cumsum(size)))
-    fronts = tuple(
-        Front(int(offset[start]), int(offset[end]), _expanded(boundary, size, offset), parent)
-        for start, end, boundary, parent in _boundaries(graph[order], place, starts)
-    )
-    return np.argsort(place[group], kind="stable"), fronts
-
-
-def _twins(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]:
-    """Group unknowns that are coupled to the same ones: first of each group (g,), group of each (n,).
-
-    Rows are told apart by the sum of random 64-bit keys of their columns; should two different rows ever
-    have the same sum, the order of elimination is still one, only a poorer one.
-    """
-    keys = np.random.default_rng(1973).integers(2**63, size=matrix.shape[0], dtype=np.int64)
-    sums = np.add.reduceat(keys[matrix.indices], matrix.indptr[:-1])
-    _, first, group = np.unique(sums, return_index=True, return_inverse=True)
-    return first.astype(np.int64), group.astype(np.int64)
-
-
-def _boundaries(
-    graph: sparse.csr_array, place: IntArray, starts: IntArray
-) -> Iterator[tuple[int, int, IntArray, int]]:
-    """Yield start, end, boundary and parent of each front, in places of the groups of unknowns."""
-    ends = np.append(starts[1:], graph.shape[0])
-    owner = np.repeat(np.arange(len(starts)), ends - starts)
-    coupled = place[graph.indices]
-    inherited: list[list[IntArray]] = [[] for _ in starts]
-    for start, end, passed_on in zip(starts.tolist(), ends.tolist(), inherited, strict=True):
-        near = coupled[graph.indptr[start] : graph.indptr[end]]
-        later = np.unique(np.concatenate((near, *passed_on)))
-        boundary = later[np.searchsorted(later, end) :]
-        parent = int(owner[boundary[0]]) if len(boundary) else -1
-        if parent >= 0:
-            inherited[parent].append(boundary)
-        yield start, end, boundary, parent
-
-
-def _expanded(groups: IntArray, size: IntArray, offset: IntArray) -> IntArray:
-    """Places of the unknowns of groups of unknowns (g,), given by their sizes and first places."""
-    count = size[groups]
-    before = np.cumsum(count) - count
-    return np.asarray(np.repeat(offset[groups] - before, count) + np.arange(count.sum()))
-
-
-@lru_cache(maxsize=2)
-def _analysed(size: int, starts: bytes, columns: bytes) -> tuple[IntArray, tuple[Front, ...]]:
-    """Analyse a pattern; a matrix of the same unknowns with other values, as after damage, asks again."""
-    places = np.frombuffer(columns, dtype=np.int32), np.frombuffer(starts, dtype=np.int32)
-    return analyse(sparse.csr_array((np.ones(len(places[0]), dtype=np.int8), *places), shape=(size, size)))
+    indptr = np.frombuffer(row_starts, dtype=np.int32)
+    indices = np.frombuffer(columns, dtype=np.int32)
+    ones = np.ones(len(indices), dtype=np.int8)
+    return analyse(sparse.csr_array((ones, indices, indptr), shape=(size, size)))
 
 
 _threads = cache(ThreadpoolController)
 
 
-class Factorisation:
-    """Cholesky factors of a sparse symmetric positive definite matrix X, its energy norm, and the dual norm.
+class _FrontFactor(NamedTuple):
+    """The columns of the Cholesky factor L of one front.
 
-    They are computed, and applied, in one thread: sums over several threads depend on their number, and the
-    fronts are too small to gain from them.
+    Attributes
+    ----------
+    diagonal : (p, p) array
+        The lower triangle of the pivots.
+    below : (b, p) array
+        The rows of the boundary.
+    """
+
+    diagonal: FloatArray
+    below: FloatArray
+
+
+class _SchurComplement(NamedTuple):
+    """What the pivots of a front leave on its boundary.
+
+    Attributes
+    ----------
+    boundary : (b,) array of int
+        Positions of the boundary.
+    values : (b, b) array
+        The complement, right of its diagonal.
+    """
+
+    boundary: IntArray
+    values: FloatArray
+
+
+class Factorisation:
+    """Cholesky factors of a sparse symmetric positive definite matrix X = L L'.
+
+    The factors are computed and applied in one thread: sums over several threads depend on the
+    number of threads, and the fronts are too small to gain from them.
 
     Parameters
     ----------
     stiffness : sparse (n, n)
-        X; only one half of it is factorised, the whole is kept for the residual.
+        The matrix X. Only one half is factorised; the whole is kept for residuals.
 
     Attributes
     ----------
     stiffness : csr (n, n)
-        X.
+        The matrix X.
 
     Raises
     ------
     SolutionError
-        If it is not positive definite.
+        If the matrix is not positive definite.
     """
 
     def __init__(self, stiffness: sparse.sparray) -> None:
@@ -165,165 +116,282 @@ class Factorisation:
                 "The structure has no free unknown: all its nodes are held. Hold fewer of them."
             )
         if not np.all(matrix.diagonal() > 0.0):
-            self._refuse(matrix, "it has a diagonal entry that is not positive")
-        places = (part.astype(np.int32).tobytes() for part in (matrix.indptr, matrix.indices))
-        self._order, self._fronts = _analysed(matrix.shape[0], *places)
-        self._factors: list[tuple[FloatArray, FloatArray]] = []
+            self._refuse("it has a diagonal entry that is not positive")
+        self._order, self._fronts = _analysed_pattern(
+            matrix.shape[0],
+            matrix.indptr.astype(np.int32).tobytes(),
+            matrix.indices.astype(np.int32).tobytes(),
+        )
+        self._factors: list[_FrontFactor] = []
         with _threads().limit(limits=1):
-            self._eliminate(matrix)
+            self._eliminate()
 
-    def _refuse(self, matrix: sparse.csr_array, why: str) -> NoReturn:
-        raise SolutionError(said("solution.singular", unknowns=matrix.shape[0], why=why))
+    def _refuse(self, reason: str) -> NoReturn:
+        raise SolutionError(
+            "The matrix cannot be factorised; some part of the structure is not held or has no "
+            f"stiffness: of {self.stiffness.shape[0]} unknowns, {reason}."
+        )
 
-    def _eliminate(self, matrix: sparse.csr_array) -> None:
-        size = matrix.shape[0]
-        place = np.empty(size, dtype=np.int64)
-        place[self._order] = np.arange(size)
-        rows = matrix[self._order]
-        columns = place[rows.indices]
-        local = np.empty(size, dtype=np.int64)
-        waiting: list[list[tuple[IntArray, FloatArray]]] = [[] for _ in self._fronts]
+    def _eliminate(self) -> None:
+        """Factorise front by front, and hand each Schur complement to the parent front."""
+        size = self.stiffness.shape[0]
+        position = np.empty(size, dtype=np.int64)
+        position[self._order] = np.arange(size)
+        rows = self.stiffness[self._order]
+        columns = position[rows.indices]
+        local = np.empty(size, dtype=np.int64)  # from positions to rows of the present front
+        waiting: list[list[_SchurComplement]] = [[] for _ in self._fronts]
         for front, contributions in zip(self._fronts, waiting, strict=True):
-            pivots, held = front.end - front.start, len(front.boundary)
+            pivots = front.end - front.start
             local[front.start : front.end] = np.arange(pivots)
-            local[front.boundary] = pivots + np.arange(held)
-            # Right of the diagonal only; transposed, that is the lower half of LAPACK.
-            top, rest = np.zeros((pivots, pivots + held)), np.zeros((held, held))
-            inside = slice(rows.indptr[front.start], rows.indptr[front.end])
-            row = np.repeat(np.arange(pivots), np.diff(rows.indptr[front.start : front.end + 1]))
-            later = columns[inside] >= front.start
-            top[row[later], local[columns[inside][later]]] = rows.data[inside][later]
-            while contributions:
-                _extend_add(top, rest, *contributions.pop(), local)
-            diagonal, side = np.ascontiguousarray(top[:, :pivots]), np.ascontiguousarray(top[:, pivots:])
+            local[front.boundary] = pivots + np.arange(len(front.boundary))
+            # assemble the front, right of its diagonal: transposed, that is LAPACK's lower half
+            pivot_rows = _assembled_pivot_rows(front, rows, columns, local)
+            remaining = np.zeros((len(front.boundary), len(front.boundary)))
+            while contributions:  # popped, so that each is freed as soon as it is added
+                _extend_add(pivot_rows, remaining, contributions.pop(), local)
+            # factorise the pivots
+            diagonal = np.ascontiguousarray(pivot_rows[:, :pivots])
+            coupling = np.ascontiguousarray(pivot_rows[:, pivots:])
             lower, failed = lapack.dpotrf(diagonal.T, lower=1, overwrite_a=1, clean=0)
             if failed:
                 unknown = self._order[front.start + failed - 1]
-                self._refuse(matrix, f"unknown {unknown} is left without a positive pivot")
-            if held:
-                below = blas.dtrsm(1.0, lower, side.T, side=1, lower=1, trans_a=1, overwrite_b=1)
-                left = blas.dsyrk(-1.0, below, beta=1.0, c=rest.T, lower=1, overwrite_c=1)
-                waiting[front.parent].append((front.boundary, left.T))
-            else:
-                below = side.T
-            self._factors.append((lower, below))
+                self._refuse(f"unknown {unknown} is left without a positive pivot")
+            below = coupling.T
+            if len(front.boundary):
+                below = blas.dtrsm(1.0, lower, below, side=1, lower=1, trans_a=1, overwrite_b=1)
+                complement = blas.dsyrk(
+                    -1.0, below, beta=1.0, c=remaining.T, lower=1, overwrite_c=1
+                )
+                waiting[front.parent].append(_SchurComplement(front.boundary, complement.T))
+            self._factors.append(_FrontFactor(lower, below))
 
     def riesz(self, right_hand_side: FloatArray) -> FloatArray:
-        """X^-1 f (n,) or (n, k) without a check of the residual, for iterations that check their own."""
+        """Return the Riesz representative X^-1 f (n,) or (n, k), its residual unchecked."""
         return self.unwhitened(self.whitened(right_hand_side))
 
     def whitened(self, right_hand_side: FloatArray) -> FloatArray:
-        """L^-1 f (n,) or (n, k), X = L L', in the order of elimination; its length is the dual norm of f."""
-        found = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
-        values = found.reshape(len(found), -1)
+        """Return loads in whitened coordinates, in which their length is the dual norm.
+
+        Parameters
+        ----------
+        right_hand_side : (n,) or (n, k) array
+            The loads f.
+
+        Returns
+        -------
+        (n,) or (n, k) array
+            L^-1 f in the order of elimination.
+        """
+        solution = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
+        values = solution.reshape(len(solution), -1)
         with _threads().limit(limits=1):
-            for front, (lower, below) in zip(self._fronts, self._factors, strict=True):
-                own = _substitute(lower, values[front.start : front.end], transposed=False)
+            for front, factor in zip(self._fronts, self._factors, strict=True):
+                pivots = values[front.start : front.end]
+                _substitute(factor.diagonal, pivots, transposed=False)
                 if len(front.boundary):
-                    values[front.boundary] -= below @ own
-        return found
+                    values[front.boundary] -= factor.below @ pivots
+        return solution
 
     def unwhitened(self, whitened: FloatArray) -> FloatArray:
-        """L'^-1 y (n,) or (n, k) of what is in the order of elimination."""
-        found = np.array(whitened, dtype=np.float64, order="C")
-        values = found.reshape(len(found), -1)
+        """Return displacements from whitened coordinates.
+
+        Parameters
+        ----------
+        whitened : (n,) or (n, k) array
+            Whitened coordinates y in the order of elimination.
+
+        Returns
+        -------
+        (n,) or (n, k) array
+            L'^-1 y in the order of the unknowns.
+        """
+        ordered = np.array(whitened, dtype=np.float64, order="C")
+        values = ordered.reshape(len(ordered), -1)
         with _threads().limit(limits=1):
-            for front, (lower, below) in zip(self._fronts[::-1], self._factors[::-1], strict=True):
-                own = values[front.start : front.end]
+            for front, factor in zip(self._fronts[::-1], self._factors[::-1], strict=True):
+                pivots = values[front.start : front.end]
                 if len(front.boundary):
-                    own -= below.T @ values[front.boundary]
-                _substitute(lower, own, transposed=True)
-        solution = np.empty_like(found)
-        solution[self._order] = found
+                    pivots -= factor.below.T @ values[front.boundary]
+                _substitute(factor.diagonal, pivots, transposed=True)
+        solution = np.empty_like(ordered)
+        solution[self._order] = ordered
         return solution
 
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
-        """Solution (n,) or (n, k), refined once, its backward error and its accuracy checked.
+        """Solve X u = f with one step of iterative refinement, and check the accuracy.
+
+        Parameters
+        ----------
+        right_hand_side : (n,) or (n, k) array
+            The loads f.
+
+        Returns
+        -------
+        (n,) or (n, k) array
+            The solution u.
 
         Raises
         ------
         SolutionError
-            If the backward error exceeds `BACKWARD_ERROR_LIMIT` or refinement still changes the solution by
-            more than `CORRECTION_LIMIT`.
+            If the backward error exceeds `BACKWARD_ERROR_LIMIT`, or refinement still changes the
+            solution by more than `CORRECTION_LIMIT`.
         """
         solution = self.riesz(right_hand_side)
         correction = self.riesz(right_hand_side - self.stiffness @ solution)
         solution = solution + correction
         error = self.backward_error(solution, right_hand_side)
-        change = float(np.linalg.norm(correction)) / max(float(np.linalg.norm(solution)), 1e-300)
-        if not (error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT):
-            limits = BACKWARD_ERROR_LIMIT, CORRECTION_LIMIT
-            raise SolutionError(said("solution.inaccurate", error=error, change=change, limits=limits))
+        length = max(float(np.linalg.norm(solution)), 1e-300)
+        change = float(np.linalg.norm(correction)) / length
+        is_accurate = error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT
+        if not is_accurate:
+            raise SolutionError(
+                f"The static solution has a backward error of {error:.2g} (at most "
+                f"{BACKWARD_ERROR_LIMIT:g}) and is accurate to {change:.2g} (at most "
+                f"{CORRECTION_LIMIT:g}); the stiffness matrix is nearly singular, some part of the "
+                "structure is hardly held."
+            )
         return solution
 
     def backward_error(self, solution: FloatArray, right_hand_side: FloatArray) -> float:
-        """Backward error max|b - K u| / (|K| max|u| + max|b|), in maximum norms (0 for a zero load)."""
-        size = float(norm(self.stiffness, np.inf))
-        scale = size * float(np.abs(solution).max()) + float(np.abs(right_hand_side).max())
+        """Return the backward error max|b - K u| / (|K| max|u| + max|b|), zero for a zero load."""
+        largest_row = float(norm(self.stiffness, np.inf))
+        largest_load = float(np.abs(right_hand_side).max())
+        scale = largest_row * float(np.abs(solution).max()) + largest_load
         residual = float(np.abs(right_hand_side - self.stiffness @ solution).max())
         return residual / scale if scale > 0.0 else residual
 
 
-def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> FloatArray:
-    """Solve L x = v or L' x = v in place, values (m, k) contiguous."""
-    if values.shape[1] == 1:
-        values[:, 0] = blas.dtrsv(lower, values[:, 0], lower=1, trans=int(transposed))
-    else:
-        # The transpose of C-ordered values is what BLAS takes without a copy: x' L' = v'.
-        values[:] = blas.dtrsm(1.0, lower, values.T, side=1, lower=1, trans_a=int(not transposed)).T
-    return values
-
-
-def _extend_add(
-    top: FloatArray, rest: FloatArray, boundary: IntArray, complement: FloatArray, local: IntArray
-) -> None:
-    """Add a Schur complement to the pivot rows and to the rest of a front."""
-    index, pivots = local[boundary], len(top)
-    mine = int(np.searchsorted(index, pivots))
-    later = index[mine:] - pivots
-    top[index[:mine, np.newaxis], index] += complement[:mine]
-    rest[later[:, np.newaxis], later] += complement[mine:, mine:]
-
-
-def most_moved(load: FloatArray, values: FloatArray, shapes: FloatArray) -> IntArray:
-    """Find the two modes (2,), ascending, that contribute most to the compliance under a load.
+def _assembled_pivot_rows(
+    front: Front, rows: sparse.csr_array, columns: IntArray, local: IntArray
+) -> FloatArray:
+    """Return the rows (p, p + b) of a front's pivots, right of the diagonal.
 
     Parameters
     ----------
-    load : (n,)
-        The load, on what the shapes are of.
-    values, shapes : (m,), (n, m)
-        Squared angular frequencies and mass-normalised shapes.
+    front : Front
+        The front, of p pivots and b boundary positions.
+    rows : csr (n, n)
+        The matrix, its rows in the order of elimination.
+    columns : (nnz,) array of int
+        The position of the column of each entry.
+    local : (n,) array of int
+        Column in the front of each of its positions.
     """
-    return np.asarray(np.sort(np.argsort((load @ shapes) ** 2 / values)[-2:]))
+    pivots = front.end - front.start
+    pivot_rows = np.zeros((pivots, pivots + len(front.boundary)))
+    entries = slice(rows.indptr[front.start], rows.indptr[front.end])
+    counts = np.diff(rows.indptr[front.start : front.end + 1])
+    row = np.repeat(np.arange(pivots), counts)
+    column = columns[entries]
+    is_later = column >= front.start
+    pivot_rows[row[is_later], local[column[is_later]]] = rows.data[entries][is_later]
+    return pivot_rows
+
+
+def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> None:
+    """Solve L x = v, or L' x = v, in place for contiguous values (m, k)."""
+    if values.shape[1] == 1:
+        values[:, 0] = blas.dtrsv(lower, values[:, 0], lower=1, trans=int(transposed))
+    else:
+        # BLAS takes the transpose of C-ordered values without a copy: x' L' = v'.
+        solution = blas.dtrsm(1.0, lower, values.T, side=1, lower=1, trans_a=int(not transposed))
+        values[:] = solution.T
+
+
+def _extend_add(
+    pivot_rows: FloatArray,
+    remaining: FloatArray,
+    contribution: _SchurComplement,
+    local: IntArray,
+) -> None:
+    """Add a Schur complement to the pivot rows (p, p + b) and the remaining block (b, b)."""
+    pivots = len(pivot_rows)
+    index = local[contribution.boundary]
+    split = int(np.searchsorted(index, pivots))
+    pivot_index = index[:split]
+    remaining_index = index[split:] - pivots
+    pivot_rows[pivot_index[:, np.newaxis], index] += contribution.values[:split]
+    remaining_block = contribution.values[split:, split:]
+    remaining[remaining_index[:, np.newaxis], remaining_index] += remaining_block
+
+
+def most_compliant_modes(load: FloatArray, squares: FloatArray, shapes: FloatArray) -> IntArray:
+    """Find the two modes that contribute most to the compliance under a load.
+
+    Parameters
+    ----------
+    load : (n,) array
+        The load.
+    squares : (m,) array
+        Squared angular frequencies [rad^2/s^2].
+    shapes : (n, m) array
+        Mass-normalised shapes.
+
+    Returns
+    -------
+    (2,) array of int
+        Numbers of the modes, ascending.
+    """
+    compliance = (load @ shapes) ** 2 / squares
+    return np.asarray(np.sort(np.argsort(compliance)[-2:]))
 
 
 def lowest_eigenpairs(
     stiffness: sparse.sparray | Factorisation, mass: sparse.sparray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Lowest eigenvalues (count,) [rad^2/s^2] and vectors (n, count) by shift-inverted Lanczos.
+    """Return the lowest eigenvalues and vectors by shift-inverted Lanczos iteration.
 
-    The stiffness may be given factorised.
+    Parameters
+    ----------
+    stiffness : sparse (n, n) or Factorisation
+        The stiffness, or its factors.
+    mass : sparse (n, n)
+        The mass.
+    count : int
+        The number of modes.
+
+    Returns
+    -------
+    squares : (count,) array
+        Squared angular frequencies [rad^2/s^2], ascending.
+    shapes : (n, count) array
+        The vectors.
 
     Raises
     ------
     SolutionError
-        If the iteration did not converge to `MODE_RESIDUAL_LIMIT`.
+        If the iteration does not converge to `MODE_RESIDUAL_LIMIT`.
     """
     factors = stiffness if isinstance(stiffness, Factorisation) else Factorisation(stiffness)
-    stiffness = factors.stiffness
-    size = stiffness.shape[0]
+    matrix = factors.stiffness
+    size = matrix.shape[0]
     inverse = LinearOperator((size, size), matvec=factors.riesz, dtype=float)
-    start = np.random.default_rng(16).standard_normal(size)  # fixed: the same model gives the same bytes
+    # a fixed start vector: the same model gives the same bytes
+    start = np.random.default_rng(16).standard_normal(size)
     try:
-        values, shapes = eigsh(stiffness, k=count, M=mass, sigma=0.0, OPinv=inverse, v0=start)
+        squares, shapes = eigsh(matrix, k=count, M=mass, sigma=0.0, OPinv=inverse, v0=start)
     except ArpackNoConvergence as error:
-        raise SolutionError(f"Only {len(error.eigenvalues)} of {count} eigenmodes converged.") from None
-    order = np.argsort(values)
-    values, shapes = values[order], shapes[:, order]
+        raise SolutionError(
+            f"Only {len(error.eigenvalues)} of {count} eigenmodes converged."
+        ) from None
+    order = np.argsort(squares)
+    squares = squares[order]
+    shapes = shapes[:, order]
+    _check_modes(matrix, mass, squares, shapes)
+    return squares, shapes
+
+
+def _check_modes(
+    stiffness: sparse.csr_array, mass: sparse.sparray, squares: FloatArray, shapes: FloatArray
+) -> None:
+    """Raise `SolutionError` if the residual of a mode exceeds `MODE_RESIDUAL_LIMIT`."""
     scale = float(norm(stiffness, np.inf)) * np.abs(shapes).max(axis=0)
-    residual = np.abs(stiffness @ shapes - (mass @ shapes) * values).max(axis=0) / scale
-    if not residual.max() <= MODE_RESIDUAL_LIMIT:
-        worst = int(residual.argmax()), residual.max(), MODE_RESIDUAL_LIMIT
-        raise SolutionError(said("solution.eigenmode", worst=worst))
-    return values, shapes
+    residual = np.abs(stiffness @ shapes - (mass @ shapes) * squares).max(axis=0) / scale
+    is_accurate = residual.max() <= MODE_RESIDUAL_LIMIT
+    if not is_accurate:
+        raise SolutionError(
+            f"Eigenmode {int(residual.argmax())} has a residual of {residual.max():.2g}, more than "
+            f"{MODE_RESIDUAL_LIMIT:g}; the stiffness matrix is nearly singular, or too few places "
+            "have mass."
+        )

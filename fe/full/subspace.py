@@ -1,20 +1,20 @@
-"""Offline: bases that are orthonormal in the energy norm of one stiffness X = L L', and solutions near it.
+"""Bases that are orthonormal in the energy norm of a stiffness X = L L', and solutions near it.
 
-All is held in coordinates in which X is the identity: a displacement u as L' u, a load f as L^-1 f. They are
-the same for u = X^-1 f. The energy norm of a displacement, and the dual norm of a load, is the length, and
-what the condition number of X, about 1e10, would do to orthogonality is done to its root alone.
+Everything is held in whitened coordinates, in which X is the identity: a displacement u as L' u, a
+load f as L^-1 f. Both are equal if u = X^-1 f. The energy norm of a displacement, and the dual norm
+of a load, is then the Euclidean length. Orthogonality in these coordinates suffers from the square
+root of the condition number of X, about 1e5, and not from the condition number itself.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from scipy import sparse
 from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, cg
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import SolutionError
-from fe.sentences import said
 
 from .factorisation import Factorisation
 
@@ -22,60 +22,97 @@ MOST_ITERATIONS = 100
 """Limit of conjugate gradients."""
 
 
-def affine_product(terms: Sequence[Any], coefficients: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return the sum of coefficients (T,) or (T, k) times sparse terms (n, n), times vectors (n, k)."""
-    parts = (factor * (term @ vectors) for term, factor in zip(terms, coefficients, strict=True))
-    return np.asarray(sum(parts))
+def affine_product(
+    terms: Sequence[sparse.csr_array], coefficients: FloatArray, vectors: FloatArray
+) -> FloatArray:
+    """Return the product of an affine sum of sparse terms with vectors.
+
+    Parameters
+    ----------
+    terms : sequence of csr (n, n)
+        The T terms.
+    coefficients : (T,) or (T, k) array
+        A coefficient for each term, or for each term and each vector.
+    vectors : (n, k) array
+        The vectors.
+
+    Returns
+    -------
+    (n, k) array
+        The products.
+    """
+    products = (factor * (term @ vectors) for term, factor in zip(terms, coefficients, strict=True))
+    return np.asarray(sum(products))
 
 
-def turned(terms: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return symmetric terms (T, n, n) in combinations (n, k) of the basis that they are in."""
-    found = directions.T @ terms @ directions
-    return np.asarray(0.5 * (found + found.swapaxes(1, 2)))  # what rounding made of the symmetry
+def project_terms(terms: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return symmetric terms (T, n, n) projected on directions (n, k): terms (T, k, k)."""
+    projected = directions.T @ terms @ directions
+    # Rounding leaves the products slightly unsymmetric.
+    return np.asarray(0.5 * (projected + projected.swapaxes(1, 2)))
 
 
-def solved_near(
-    factors: Factorisation, terms: Sequence[Any], coefficients: FloatArray, right: FloatArray,
-    start: FloatArray, tolerance: float,
-) -> FloatArray:  # fmt: skip
-    """Solve systems near a factorised one by conjugate gradients, all in its coordinates.
+def solve_near(
+    factors: Factorisation,
+    terms: Sequence[sparse.csr_array],
+    coefficients: FloatArray,
+    right_hand_sides: FloatArray,
+    start: FloatArray,
+    tolerance: float,
+) -> FloatArray:
+    """Solve affine systems near a factorised one by preconditioned conjugate gradients.
+
+    All vectors are in whitened coordinates. The systems are solved as one large system, so that
+    their products are computed together.
 
     Parameters
     ----------
     factors : Factorisation
-        Of a matrix to which all are spectrally equivalent.
-    terms : sequence of sparse (n, n)
-        What they are made of.
-    coefficients : (T, k) ndarray
-        Coefficients of the terms, a system each column.
-    right, start : (n, k) ndarray
-        Right-hand sides and starting values.
+        The factors of a matrix to which all systems are spectrally equivalent.
+    terms : sequence of csr (n, n)
+        The T terms of the systems.
+    coefficients : (T, k) array
+        The coefficients of the terms, a column for each system.
+    right_hand_sides : (n, k) array
+        The right-hand sides.
+    start : (n, k) array
+        The starting values.
     tolerance : float
-        Largest residual, relative to the right-hand side.
+        The largest residual, relative to the right-hand side.
 
     Returns
     -------
-    (n, k) ndarray
+    (n, k) array
         The solutions.
 
     Raises
     ------
     SolutionError
-        If the tolerance is not reached.
+        If the tolerance is not reached in `MOST_ITERATIONS` iterations.
     """
+    shape = right_hand_sides.shape
 
-    def product(flat: FloatArray) -> FloatArray:
-        vectors = factors.unwhitened(flat.reshape(right.shape))
+    def preconditioned_product(flat: FloatArray) -> FloatArray:
+        vectors = factors.unwhitened(flat.reshape(shape))
         return factors.whitened(affine_product(terms, coefficients, vectors)).ravel()
 
-    size = np.linalg.norm(right, axis=0)
-    size = np.where(size > 0.0, size, 1.0)
-    operator = LinearOperator((right.size, right.size), matvec=product, dtype=np.float64)
-    given = ((right / size).ravel(), (start / size).ravel())
-    found, missed = cg(operator, *given, rtol=0.0, atol=tolerance, maxiter=MOST_ITERATIONS)
-    if missed:
-        raise SolutionError(said("solution.iterations", tolerance=tolerance, most=MOST_ITERATIONS))
-    return np.asarray(found.reshape(right.shape) * size)
+    length = np.linalg.norm(right_hand_sides, axis=0)
+    length = np.where(length > 0.0, length, 1.0)
+    unknowns = right_hand_sides.size
+    solution, failed = cg(
+        LinearOperator((unknowns, unknowns), matvec=preconditioned_product, dtype=np.float64),
+        (right_hand_sides / length).ravel(),
+        (start / length).ravel(),
+        rtol=0.0,
+        atol=tolerance,
+        maxiter=MOST_ITERATIONS,
+    )
+    if failed:
+        raise SolutionError(
+            f"Conjugate gradients did not reach a residual of {tolerance:g} in {MOST_ITERATIONS} "
+            "iterations; the stiffness terms must be positive semi-definite."
+        )
+    return np.asarray(solution.reshape(shape) * length)
 
 
 class OrthonormalBasis:
@@ -84,74 +121,111 @@ class OrthonormalBasis:
     Parameters
     ----------
     size : int
-        Length n of the vectors.
+        The length n of the vectors.
     drop : float
-        A direction is dropped if it is less than this fraction of every vector of its block.
+        A direction is dropped if it is shorter than this fraction of every vector of its block.
 
     Attributes
     ----------
-    vectors : (n, k) ndarray
+    vectors : (n, k) array
         The basis.
     dropped_square : float
-        Bound of the sum of squared lengths of all that was dropped.
+        A bound of the sum of squared lengths of all that was dropped.
     """
 
     def __init__(self, size: int, *, drop: float) -> None:
-        self.vectors = np.empty((size, 0))
-        self.dropped_square, self._drop = 0.0, drop
+        self.vectors: FloatArray = np.empty((size, 0))
+        self.dropped_square = 0.0
+        self._drop = drop
 
     def extend(self, block: FloatArray) -> FloatArray:
-        """Add vectors (n, m); return their coordinates (k, m) in the basis."""
-        scale = np.linalg.norm(block, axis=0)
-        rest = block / np.where(scale > 0.0, scale, 1.0)
-        inside = np.zeros((self.vectors.shape[1], len(scale)))
+        """Add vectors (n, m) to the basis; return their coordinates (k, m) in it."""
+        length = np.linalg.norm(block, axis=0)
+        outside = block / np.where(length > 0.0, length, 1.0)
+        # classical Gram-Schmidt, twice: the second pass removes what rounding left
+        coordinates_inside = np.zeros((self.vectors.shape[1], len(length)))
         for _ in range(2):
-            share = self.vectors.T @ rest
-            rest -= self.vectors @ share
-            inside += share
-        directions, triangle, order = qr(rest, mode="economic", pivoting=True, overwrite_a=True)
-        new = np.linalg.norm(triangle, axis=1) > self._drop
-        outside = np.empty_like(triangle)
-        outside[:, order] = triangle * scale[order]
-        self.dropped_square += float(np.sum(outside[~new] ** 2))
-        self.vectors = np.concatenate((self.vectors, directions[:, new]), axis=1)
-        return np.concatenate((inside * scale, outside[new]))
+            projection = self.vectors.T @ outside
+            outside -= self.vectors @ projection
+            coordinates_inside += projection
+        # rank-revealing factorisation of the component outside the basis
+        directions, triangle, order = qr(outside, mode="economic", pivoting=True, overwrite_a=True)
+        is_new = np.linalg.norm(triangle, axis=1) > self._drop
+        coordinates_outside = np.empty_like(triangle)
+        coordinates_outside[:, order] = triangle * length[order]
+        self.dropped_square += float(np.sum(coordinates_outside[~is_new] ** 2))
+        self.vectors = np.concatenate((self.vectors, directions[:, is_new]), axis=1)
+        return np.concatenate((coordinates_inside * length, coordinates_outside[is_new]))
 
 
 class ProjectedBasis(OrthonormalBasis):
-    """A growing basis of displacements, orthonormal in the energy norm, with sparse terms projected on it.
+    """A growing basis of displacements, orthonormal in the energy norm, with projected terms.
 
     Parameters
     ----------
     factors : Factorisation
-        X.
-    *sums : tuple of csr (n, n)
-        The terms of each sum.
+        The factors of the matrix X of the energy norm.
+    stiffness_terms : sequence of csr (n, n)
+        The T stiffness terms.
+    mass_terms : sequence of csr (n, n)
+        The Q mass terms; none by default.
     drop : float
-        As of `OrthonormalBasis`.
+        As in `OrthonormalBasis`.
 
     Attributes
     ----------
-    displacements : (n, k) ndarray
-        The basis vectors themselves, L'^-1 `vectors`.
-    inner : list of (T, k, k) ndarray
-        The terms of each sum in the basis.
+    displacements : (n, k) array
+        The basis vectors as displacements; `vectors` has them in whitened coordinates.
+    stiffness : (T, k, k) array
+        The stiffness terms, projected on the basis.
+    mass : (Q, k, k) array
+        The mass terms, projected on the basis.
     """
 
-    def __init__(self, factors: Factorisation, *sums: tuple[Any, ...], drop: float) -> None:
+    def __init__(
+        self,
+        factors: Factorisation,
+        stiffness_terms: Sequence[sparse.csr_array],
+        mass_terms: Sequence[sparse.csr_array] = (),
+        *,
+        drop: float,
+    ) -> None:
         super().__init__(factors.stiffness.shape[0], drop=drop)
-        self.displacements, self.factors, self._sums = self.vectors, factors, sums
-        self.inner = [np.empty((len(terms), 0, 0)) for terms in sums]
+        self.factors = factors
+        self.displacements: FloatArray = self.vectors
+        self.stiffness: FloatArray = np.empty((len(stiffness_terms), 0, 0))
+        self.mass: FloatArray = np.empty((len(mass_terms), 0, 0))
+        self._stiffness_terms = stiffness_terms
+        self._mass_terms = mass_terms
 
-    def add(self, block: FloatArray) -> list[FloatArray]:
-        """Add what is new in vectors (n, m); return the terms (T, n, new) of each sum times that."""
-        before = self.vectors.shape[1]
+    def add(self, block: FloatArray) -> FloatArray:
+        """Add vectors to the basis, and project the terms on the new basis vectors.
+
+        Parameters
+        ----------
+        block : (n, m) array
+            The vectors, in whitened coordinates.
+
+        Returns
+        -------
+        (T, n, new) array
+            The stiffness terms times the new basis vectors.
+        """
+        previous_count = self.vectors.shape[1]
         self.extend(block)
-        new = self.factors.unwhitened(self.vectors[:, before:])
-        self.displacements = np.concatenate((self.displacements, new), axis=1)
-        images = [np.stack([term @ new for term in terms]) for terms in self._sums]
-        for number, (old, parts) in enumerate(zip(self.inner, images, strict=True)):
-            added = self.displacements.T @ parts
-            beside = added[:, :before]
-            self.inner[number] = np.block([[old, beside], [beside.swapaxes(1, 2), added[:, before:]]])
+        new_displacements = self.factors.unwhitened(self.vectors[:, previous_count:])
+        self.displacements = np.concatenate((self.displacements, new_displacements), axis=1)
+        images = np.stack([term @ new_displacements for term in self._stiffness_terms])
+        self.stiffness = self._extended_projection(self.stiffness, images)
+        if self._mass_terms:
+            mass_images = np.stack([term @ new_displacements for term in self._mass_terms])
+            self.mass = self._extended_projection(self.mass, mass_images)
         return images
+
+    def _extended_projection(self, projected: FloatArray, images: FloatArray) -> FloatArray:
+        """Return terms on the present basis, from those on the previous one and the new images."""
+        previous_count = projected.shape[1]
+        new_columns = self.displacements.T @ images
+        coupling = new_columns[:, :previous_count]
+        new_block = new_columns[:, previous_count:]
+        return np.block([[projected, coupling], [coupling.swapaxes(1, 2), new_block]])

@@ -1,4 +1,4 @@
-"""What is built once and kept between runs in files: of several processes one builds, the others wait."""
+"""Results that are built once and kept in files: one process builds, the others wait for it."""
 
 import logging
 import os
@@ -12,77 +12,92 @@ from reporting.errors import FileNotWrittenError
 
 _logger = logging.getLogger(__name__)
 
-_Kept = TypeVar("_Kept")
+Result = TypeVar("Result")
 
 
 def cache_folder() -> Path:
-    """Return the folder of what is kept: `$XDG_CACHE_HOME/uav-twin`, or `~/.cache/uav-twin`."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if base else Path.home() / ".cache") / "uav-twin"
+    """Return the cache folder: `$XDG_CACHE_HOME/uav-twin`, or `~/.cache/uav-twin`."""
+    cache_home = os.environ.get("XDG_CACHE_HOME", "")
+    parent = Path(cache_home) if cache_home else Path.home() / ".cache"
+    return parent / "uav-twin"
 
 
 def built_once(
-    path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], object]
-) -> _Kept:
-    """Return what is kept, or build and keep it; of several builders one builds, and the others wait for it.
+    path: Path,
+    load: Callable[[], Result],
+    build: Callable[[], Result],
+    keep: Callable[[Result], object],
+) -> Result:
+    """Return the result that a file holds, or build it and write the file.
+
+    Of several processes that need the same result one builds it, and the others wait.
 
     Parameters
     ----------
     path : Path
-        Its file; the lock lies beside it.
+        The file of the result; the lock file lies beside it.
     load : callable
-        Reads it; raises `OSError` or `ReducedModelFileError` where it is not there or not usable.
+        Reads the file. It raises `OSError` or `ReducedModelFileError` if the file is missing or
+        not usable.
     build : callable
-        Makes it.
+        Builds the result.
     keep : callable
-        Writes it; where that raises `FileNotWrittenError` it is used all the same, with a warning.
+        Writes the result to the file. If it raises `FileNotWrittenError`, a warning is logged and
+        the result is returned all the same.
+
+    Returns
+    -------
+    Result
+        The result that was read or built.
     """
-    with suppress(OSError):  # not there, or not readable
+    with suppress(OSError):  # the file is missing or cannot be read
         try:
             return load()
         except ReducedModelFileError as error:
             _logger.warning("What is kept is not usable and is built anew: %s", error)
     with _locked(path.with_suffix(".lock"), path):
         with suppress(OSError, ReducedModelFileError):
-            return load()  # another process may have been faster
-        built = build()
+            return load()  # another process may have built it meanwhile
+        result = build()
         try:
-            keep(built)
+            keep(result)
         except FileNotWrittenError as error:
             _logger.warning(
-                "What was built could not be kept in %s and will be built again: %s", path.parent, error
+                "What was built could not be kept in %s and will be built again: %s",
+                path.parent,
+                error,
             )
-    return built
+    return result
 
 
 @contextmanager
-def _locked(path: Path, what: Path) -> Iterator[None]:
-    """Hold a lock file while building; without a writable folder there is nothing to guard."""
+def _locked(lock_file: Path, result_file: Path) -> Iterator[None]:
+    """Hold a lock while a result is built; without a writable folder there is nothing to guard."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        lock_file.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError:
         yield
         return
     try:
-        with suppress(ImportError):  # Windows: several builders then build the same
-            _take(handle, what)
+        with suppress(ImportError):  # on Windows, where several processes then build the same
+            _acquire_lock(descriptor, result_file)
         yield
     finally:
-        os.close(handle)
+        os.close(descriptor)
 
 
-def _take(handle: int, what: Path) -> None:
-    """Take a lock, which ends with the process that holds it; who waits for it says so."""
+def _acquire_lock(descriptor: int, result_file: Path) -> None:
+    """Acquire a lock that ends with this process; log a warning while another process holds it."""
     import fcntl
 
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        number = os.pread(handle, 20, 0).decode()
-        holder = f"another process (number {number})" if number else "another process"
-        _logger.warning("Waiting for %s that makes %s.", holder, what)
-        fcntl.flock(handle, fcntl.LOCK_EX)
-    with suppress(OSError):  # such as a full disk: the number only informs those who wait
-        os.truncate(handle, 0)
-        os.pwrite(handle, str(os.getpid()).encode(), 0)
+        process_id = os.pread(descriptor, 20, 0).decode()
+        holder = f"another process (number {process_id})" if process_id else "another process"
+        _logger.warning("Waiting for %s that makes %s.", holder, result_file)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with suppress(OSError):  # a full disk, say: the number only informs those who wait
+        os.truncate(descriptor, 0)
+        os.pwrite(descriptor, str(os.getpid()).encode(), 0)

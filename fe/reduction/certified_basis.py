@@ -1,305 +1,444 @@
-"""Offline: the static part of a reduced model by a certified greedy search (pyMOR), for any affine structure.
+"""The static part of a reduced model: a greedy search with a certified error bound.
 
-First approximate dual solutions, on which the sharpness of the error bound rests: at each anchor a few of
-each output span what is combined for each state, a reduced basis of the output (Rozza, Huynh and Patera
-2008). The method and what it reaches are in `docs/reduced_model.md`. Displacements and loads are whitened,
-which `fe.full.subspace` explains.
+`docs/reduced_model.md` describes the method and its accuracy. Displacements and loads are whitened,
+see `fe.full.subspace`.
 """
 
 from bisect import bisect_left
 from collections.abc import Callable
 from math import ceil
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
-from fe.full.subspace import OrthonormalBasis, ProjectedBasis, solved_near, turned
+from fe.full.subspace import OrthonormalBasis, ProjectedBasis, project_terms, solve_near
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
-from fe.sentences import said
 from fe.structure.tables import StructureSettings
 from reporting.progress import Stage
 from reporting.words import counted
 
+from .dual_solutions import dual_solutions
+from .model_fields import DesignFields, ModalReduction
 from .terms import ReductionTerms, State
 
-OUTPUTS_TOGETHER = 8
-"""Outputs whose dual solutions are judged at once."""
-TOGETHER = 4
-"""Full solutions of the search, and states whose modes are refined, at once."""
-DUAL_TOLERANCE = 0.01
-"""Relative residual of approximate dual solutions at their own states."""
-LEAST_DUAL = 1e-5
-"""What rounding may leave of an output beside the residual of its dual solution, relative to it."""
-DEPENDENT = 1e-3
-"""Combinations of the dual solutions of an output that are shorter, relative to the longest, are left out."""
+STATES_PER_ROUND = 4
+"""Full solutions in a round of the search, and states whose modes are refined together."""
 SEARCH_MARGIN = 0.5
-"""The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
-LOOKED_AT = 6
-"""One of so many states is looked at in each round, where the bound was largest; all of them at the end."""
-FIRST_TOLERANCE, SNAPSHOT_TOLERANCE = 1e-10, 1e-6
-"""Relative residual of the first full solutions and of the others."""
-ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
-"""Rounding allowance as a multiple of the difference seen at the first full solutions, and its least value:
-with condition numbers of 1e10, full solutions differ by 1e-6 among themselves."""
+"""The search goes on to this fraction of the tolerance, so that the basis can be compressed."""
+INSPECTED_FRACTION = 6
+"""In each round one of so many states is evaluated, where the bound was largest; in the last round
+all of them are."""
+SOLUTION_TOLERANCE = 1e-6
+"""Relative residual of full solutions."""
+FIRST_SOLUTION_TOLERANCE = 1e-10
+"""The same of the first ones, which measure rounding."""
+ROUNDING_FACTOR = 8.0
+"""The rounding allowance as a multiple of the difference seen at the first full solutions."""
+LEAST_ROUNDING = 5e-6
+"""Least rounding allowance: with condition numbers of 1e10, full solutions differ by 1e-6."""
+RESIDUAL_ROUNDING = 1e-7
+"""Rounding allowance of the residual, per unit length of the reduced coordinates."""
+BASIS_DROP = 1e-7
+"""Shorter directions of full solutions are dropped, relative to the solutions of their round."""
+RESIDUAL_DROP = 1e-8
+"""The same for the images of the basis that span the residuals."""
+LEAST_SINGULAR_VALUE = 1e-7
+"""Singular directions below this fraction of the largest singular value are not used."""
 
 
-def fewest_directions(snapshots: FloatArray, least: int, good: Callable[[FloatArray], bool]) -> FloatArray:
-    """Return the fewest singular directions (N, K) of snapshots (N, S), at their unit lengths, that are good.
+def fewest_directions(
+    snapshots: FloatArray, least: int, is_accurate: Callable[[FloatArray], bool]
+) -> FloatArray:
+    """Return the fewest singular directions of snapshots that are accurate.
 
-    They are taken to become better with their number, from `least` on; all of them if fewer do not suffice.
-    """
-    unit = snapshots / np.linalg.norm(snapshots, axis=0)
-    directions, singular, _ = np.linalg.svd(unit, full_matrices=False)
-    most = int(np.sum(singular > 1e-7 * singular[0]))
-    number = bisect_left(range(most), True, min(least, most), key=lambda count: good(directions[:, :count]))
-    return np.asarray(directions[:, :number])
-
-
-def dual_solutions(
-    terms: ReductionTerms, outputs: FloatArray, stage: Stage
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Solve K psi = l for each output l, roughly: the norms of what that leaves are computed, not assumed.
+    The search bisects: accuracy is taken to improve with the number of directions.
 
     Parameters
     ----------
-    terms : ReductionTerms
-        The full model.
-    outputs : (n, O) ndarray
-        Its outputs.
-    stage : Stage
-        Told one more part, and of what.
+    snapshots : (N, S) array
+        The snapshots; their lengths do not count.
+    least : int
+        The least number of directions.
+    is_accurate : callable
+        Returns whether directions (N, K) are accurate.
 
     Returns
     -------
-    functions : (A, M, O, n) ndarray
-        What the solutions at each anchor span, orthonormal for each output; zero where that is less.
-    arrays : dict of str to ndarray
-        `dual_residual`, `dual_stiffness` and `dual_output` of `ReducedArrays`.
+    (N, K) array
+        The directions; all of them if fewer are not accurate.
     """
-    factors, (size, count), functions = terms.factors, outputs.shape, []
-    residual, stiffness = [], []
-    for anchor in terms.anchors():
-        solutions = []
-        for theta in anchor:
-            system = terms.stiffness_terms, np.tile(theta[:, np.newaxis], count)
-            solutions.append(solved_near(factors, *system, outputs, outputs, DUAL_TOLERANCE))
-            stage.advance(1, "dual solutions")
-        own, lengths, _ = np.linalg.svd(np.stack(solutions, axis=2).swapaxes(0, 1), full_matrices=False)
-        own *= (lengths > DEPENDENT * lengths[:, :1])[:, np.newaxis]
-        functions.append(own.transpose(2, 0, 1))
-        moved = factors.unwhitened(own.swapaxes(0, 1).reshape(size, -1)).reshape(size, count, -1)
-        for few in np.array_split(np.arange(count), ceil(count / OUTPUTS_TOGETHER)):
-            flat = moved[:, few].reshape(size, -1)
-            images = np.stack([(term @ flat).reshape(size, len(few), -1) for term in terms.stiffness_terms])
-            forces = factors.whitened(np.moveaxis(images, 0, 2).reshape(size, -1))
-            for output, inner, force in zip(
-                outputs[:, few].T,
-                np.einsum("nom,tnok->otmk", moved[:, few], images, optimize=True),
-                forces.reshape(size, len(few), -1).swapaxes(0, 1),
-                strict=True,
-            ):
-                # a function that is not there gets no part
-                inner[-1] += np.diag(np.diagonal(inner.sum(axis=0)) == 0.0)
-                stiffness.append(inner)
-                forced = np.column_stack((output, force))
-                rounded = LEAST_DUAL * np.linalg.norm(output) * np.eye(1, forced.shape[1])
-                residual.append(np.concatenate((np.linalg.qr(forced, mode="r"), rounded)))
-    duals = np.array(functions)
-    inner, norms = (
-        np.array(part).reshape(len(duals), count, *np.shape(part)[1:]) for part in (stiffness, residual)
+    unit_snapshots = snapshots / np.linalg.norm(snapshots, axis=0)
+    directions, singular_values, _ = np.linalg.svd(unit_snapshots, full_matrices=False)
+    most = int(np.sum(singular_values > LEAST_SINGULAR_VALUE * singular_values[0]))
+    number = bisect_left(
+        range(most),
+        True,
+        min(least, most),
+        key=lambda count: is_accurate(directions[:, :count]),
     )
-    of_output = np.einsum("no,amon->aom", outputs, duals)
-    return duals, {"dual_residual": norms, "dual_stiffness": inner, "dual_output": of_output}
+    return np.asarray(directions[:, :number])
+
+
+class _ResidualFactors(NamedTuple):
+    """Loads and images of the basis in an orthonormal basis of R residuals.
+
+    Attributes
+    ----------
+    load : (R, L) array
+        The loads.
+    stiffness : (R, T - 1, N) array
+        The varied stiffness terms times the basis vectors.
+    directions : (k, R) array
+        The residuals' basis in the coordinates of `StaticReduction.residuals`.
+    """
+
+    load: FloatArray
+    stiffness: FloatArray
+    directions: FloatArray
 
 
 class StaticReduction:
-    """State of the greedy search: the bases that full solutions have given.
+    """The greedy search: bases that the full solutions span, and the reduced model on them.
 
     Parameters
     ----------
     terms : ReductionTerms
-        The full model.
-    fixed : dict of str to anything
-        What a reduced model holds beside the statics, by the names of its fields.
-    modal_basis : (n, Nm) ndarray
+        The full model, with n free unknowns.
+    design_fields : DesignFields
+        The fields of the reduced model that no basis changes.
+    modal : ModalReduction
         Its modal basis.
     stage : Stage
-        Told one more part, and of what.
+        Advances after each state.
+
+    Attributes
+    ----------
+    basis : ProjectedBasis
+        The static basis, of N vectors.
+    snapshots : list of State
+        The states of the full solutions, in the order of the search.
     """
 
     def __init__(
-        self, terms: ReductionTerms, fixed: dict[str, Any], modal_basis: FloatArray, stage: Stage
+        self,
+        terms: ReductionTerms,
+        design_fields: DesignFields,
+        modal: ModalReduction,
+        stage: Stage,
     ) -> None:
-        self.terms, self.modal_basis, self.stage = terms, modal_basis, stage
-        self.loads, self.outputs = (terms.factors.whitened(own) for own in (terms.loads, terms.outputs))
-        self.least = terms.least(self.loads, self.outputs)
-        self.basis = ProjectedBasis(terms.factors, terms.stiffness_terms, drop=1e-7)
-        self.residuals = OrthonormalBasis(len(self.loads), drop=1e-8)
+        self.terms = terms
+        self.design_fields = design_fields
+        self.modal = modal
+        self.stage = stage
+        self.loads = terms.factors.whitened(terms.loads)
+        self.outputs = terms.factors.whitened(terms.outputs)
+        self.least_outputs = terms.least_outputs(self.loads, self.outputs)
+        self.basis = ProjectedBasis(terms.factors, terms.stiffness_terms, drop=BASIS_DROP)
+        # coordinates of loads and images in the basis of residuals
+        self.residuals = OrthonormalBasis(len(self.loads), drop=RESIDUAL_DROP)
         self.residual_load = self.residuals.extend(self.loads)
-        self.residual_stiffness = np.empty((len(self.residual_load), len(terms.stiffness_terms), 0))
-        self.duals, arrays = dual_solutions(terms, self.outputs, stage)
-        self.correction = self.duals @ self.residuals.vectors
-        self.fixed = fixed | arrays
-        self.rounding, self.snapshots = 0.0, list[State]()
+        self.residual_stiffness: FloatArray = np.empty(
+            (len(self.residual_load), len(terms.stiffness_terms), 0)
+        )
+        self.duals = dual_solutions(terms, self.outputs, stage)
+        self.dual_correction = self.duals.functions @ self.residuals.vectors
+        self.rounding = 0.0
+        self.snapshots: list[State] = []
 
     def add_snapshots(self, states: list[State]) -> bool:
-        """Solve the full model for all loads at several states and extend the bases."""
-        terms, loads = self.terms, self.loads.shape[1]
-        thetas = [terms.theta(state) for state in states]
-        # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
-        tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
-        right, coefficients = np.tile(self.loads, len(states)), np.repeat(thetas, loads, axis=0).T
-        start = np.concatenate([self._galerkin(theta) for theta in thetas], axis=1)
-        solutions = solved_near(terms.factors, terms.stiffness_terms, coefficients, right, start, tolerance)
-        (images,) = self.basis.add(solutions)
-        if not images.size:
-            return False  # rounding is reached; what the search reached is judged after it
-        known = self.residuals.vectors.shape[1]
-        found = self.residuals.extend(terms.factors.whitened(np.concatenate(images, axis=1)))
-        added = self.duals @ self.residuals.vectors[:, known:]
-        self.correction = np.concatenate((self.correction, added), axis=3)
-        # what was there lies in the basis that was there
-        rows = (0, len(found) - known)
-        self.residual_load = np.pad(self.residual_load, (rows, (0, 0)))
-        before, new = np.pad(self.residual_stiffness, (rows, (0, 0), (0, 0))), (len(found), len(images), -1)
-        self.residual_stiffness = np.concatenate((before, found.reshape(new)), axis=2)
+        """Solve the full model for all loads at several states, and extend the bases.
+
+        Returns
+        -------
+        bool
+            Whether the basis has grown; if not, rounding is reached.
+        """
+        thetas = [self.terms.theta(state) for state in states]
+        solutions = self._solve_full(thetas)
+        images = self.basis.add(solutions)
+        has_grown = images.shape[2] > 0
+        if not has_grown:
+            return False
+        self._extend_residuals(images)
         if not self.snapshots:
-            self.rounding = self._rounding(self._galerkin(thetas[0]), solutions)
+            self.rounding = self._measured_rounding(self._galerkin(thetas[0]), solutions)
         self.snapshots.extend(states)
         return True
 
+    def _solve_full(self, thetas: list[FloatArray]) -> FloatArray:
+        """Return the full solutions for L loads at S coefficient vectors: an (n, S L) array."""
+        count = self.loads.shape[1]
+        # Solutions for the basis may be rough, since residuals bound the errors; only the first
+        # ones, which measure rounding, must be accurate.
+        tolerance = SOLUTION_TOLERANCE if self.snapshots else FIRST_SOLUTION_TOLERANCE
+        return solve_near(
+            self.terms.factors,
+            self.terms.stiffness_terms,
+            np.repeat(thetas, count, axis=0).T,
+            np.tile(self.loads, len(thetas)),
+            start=np.concatenate([self._galerkin(theta) for theta in thetas], axis=1),
+            tolerance=tolerance,
+        )
+
+    def _extend_residuals(self, images: FloatArray) -> None:
+        """Add the images (T, n, new) of new basis vectors to the basis of residuals."""
+        previous_size = self.residuals.vectors.shape[1]
+        whitened = self.terms.factors.whitened(np.concatenate(images, axis=1))
+        coordinates = self.residuals.extend(whitened)
+        new_vectors = self.residuals.vectors[:, previous_size:]
+        new_correction = self.duals.functions @ new_vectors
+        self.dual_correction = np.concatenate((self.dual_correction, new_correction), axis=3)
+        # Loads and previous images have no component along the new vectors.
+        no_rows = (0, len(coordinates) - previous_size)
+        self.residual_load = np.pad(self.residual_load, (no_rows, (0, 0)))
+        previous_stiffness = np.pad(self.residual_stiffness, (no_rows, (0, 0), (0, 0)))
+        new_stiffness = coordinates.reshape(len(coordinates), len(images), -1)
+        self.residual_stiffness = np.concatenate((previous_stiffness, new_stiffness), axis=2)
+
     def _galerkin(self, theta: FloatArray) -> FloatArray:
-        """Return the solutions (n, L) in the present basis."""
-        basis, stiffness = self.basis.vectors, np.tensordot(theta, self.basis.inner[0], 1)
+        """Return the Galerkin solutions (n, L) in the present basis at coefficients (T,)."""
+        basis = self.basis.vectors
+        stiffness = np.tensordot(theta, self.basis.stiffness, 1)
         return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.loads))
 
-    def _rounding(self, found: FloatArray, solutions: FloatArray) -> float:
-        """Return the relative difference of outputs between full solutions and those of their basis."""
-        wanted = np.abs(self.outputs.T @ solutions)
-        difference = np.abs(self.outputs.T @ (found - solutions))
-        shares = [
-            difference[rows].max(axis=0) / np.maximum(wanted[rows].max(axis=0), least)
-            for rows, least in zip(self.terms.groups, self.least, strict=True)
+    def _measured_rounding(self, projected: FloatArray, solutions: FloatArray) -> float:
+        """Return the relative difference of outputs between full and projected solutions (n, L)."""
+        outputs = np.abs(self.outputs.T @ solutions)
+        difference = np.abs(self.outputs.T @ (projected - solutions))
+        relative = [
+            difference[group].max(axis=0) / np.maximum(outputs[group].max(axis=0), least)
+            for group, least in zip(self.terms.groups, self.least_outputs, strict=True)
         ]
-        return float(np.max(shares))
+        return float(np.max(relative))
 
     def model(self, directions: FloatArray | None = None) -> ReducedModel:
         """Return the reduced model of the present basis, or of combinations of it.
 
         Parameters
         ----------
-        directions : (N, K) ndarray, optional
+        directions : (N, K) array, optional
             Orthonormal combinations of the N basis vectors.
         """
-        terms, rounding = self.terms, ROUNDING_FACTOR * self.rounding
-        turn = np.eye(self.basis.vectors.shape[1]) if directions is None else directions
-        basis, images = self.basis.vectors @ turn, self.residual_stiffness @ turn
-        # along the images of the basis under the norm a solution leaves nothing
-        own = np.linalg.qr(np.tensordot(images, terms.reference, (1, 0)))[0]
-        # what changes with health first, loads, then the rest: columns of the triangular factor become longer
-        lasting = terms.stiffness_factors[:-1, 1] == 0
-        order, first = np.argsort(lasting, kind="stable"), turn.shape[1] * np.count_nonzero(~lasting)
-        columns = images[:, order].reshape(len(images), -1)
-        columns = np.concatenate((columns[:, :first], self.residual_load, columns[:, first:]), axis=1)
-        across, factor = np.linalg.qr(columns - own @ (own.T @ columns))
-        loads = slice(first, first + self.loads.shape[1])
-        changes = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)
-        # |sum c_q a_j d_qj| <= |c| |a| |d| with c = (1, theta); plus rounding
-        high, low = [ends[1] for ends in terms.parameters], [ends[0] for ends in terms.losses]
-        largest = terms.theta((*high, *low))
-        dropped = np.sqrt((1.0 + largest @ largest) * self.residuals.dropped_square)
-        moved = self.basis.displacements @ turn
+        terms = self.terms
+        if directions is None:
+            directions = np.eye(self.basis.vectors.shape[1])
+        basis = self.basis.vectors @ directions
+        displacements = self.basis.displacements @ directions
+        residual = self._residual_factors(directions)
         return ReducedModel(
-            static_stiffness=turned(self.basis.inner[0], turn),
+            static_stiffness=project_terms(self.basis.stiffness, directions),
             static_load=self.loads.T @ basis,
             static_output=self.outputs.T @ basis,
             bound_reference=terms.reference[:-1],
-            residual_load=factor[:, loads],
-            residual_stiffness=changes[:, np.argsort(order)],
-            residual_allowance=float(dropped) + 1e-7,
-            rounding_allowance=max(rounding, LEAST_ROUNDING),
-            dual_correction=self.correction @ across,
-            cross_mass=np.stack([self.modal_basis.T @ (term @ moved) for term in terms.structure.mass_terms]),
-            **self.fixed,
+            residual_load=residual.load,
+            residual_stiffness=residual.stiffness,
+            residual_allowance=self._residual_allowance(),
+            rounding_allowance=max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
+            dual_correction=self.dual_correction @ residual.directions,
+            dual_residual=self.duals.residual,
+            dual_stiffness=self.duals.stiffness,
+            dual_output=self.duals.output,
+            cross_mass=np.stack(
+                [self.modal.basis.T @ (term @ displacements) for term in terms.structure.mass_terms]
+            ),
+            **self.design_fields,
+            **self.modal.fields,
         )
+
+    def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:
+        """Return loads and images of combinations (N, K) of the basis, in a basis of residuals."""
+        images = self.residual_stiffness @ directions
+        # A Galerkin solution leaves nothing along the images of the basis under the energy norm.
+        reference_images = np.tensordot(images, self.terms.reference, (1, 0))
+        solved = np.linalg.qr(reference_images)[0]
+        # The order of columns is: terms that change with health, loads, other terms. A column of
+        # the triangular factor is zero below its diagonal, so that this keeps the first ones short.
+        region_numbers = self.terms.stiffness_factors[:-1, 1]
+        is_constant = region_numbers == 0
+        order = np.argsort(is_constant, kind="stable")
+        first_load = directions.shape[1] * np.count_nonzero(~is_constant)
+        columns = images[:, order].reshape(len(images), -1)
+        columns = np.concatenate(
+            (columns[:, :first_load], self.residual_load, columns[:, first_load:]), axis=1
+        )
+        residual_directions, factor = np.linalg.qr(columns - solved @ (solved.T @ columns))
+        # read out loads and terms, these in their own order
+        loads = slice(first_load, first_load + self.loads.shape[1])
+        ordered_terms = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)
+        return _ResidualFactors(
+            load=factor[:, loads],
+            stiffness=ordered_terms[:, np.argsort(order)],
+            directions=residual_directions,
+        )
+
+    def _residual_allowance(self) -> float:
+        """Return the bound of what the basis of residuals leaves out, per unit of coordinates.
+
+        By Cauchy and Schwarz |sum c_q a_j d_qj| <= |c| |a| |d| with c = (1, theta), where theta is
+        largest at the largest parameters and the least losses.
+        """
+        _, largest_parameters = self.terms.parameters.T
+        least_losses, _ = self.terms.losses.T
+        theta = self.terms.theta((*largest_parameters, *least_losses))
+        dropped = np.sqrt((1.0 + theta @ theta) * self.residuals.dropped_square)
+        return float(dropped) + RESIDUAL_ROUNDING
 
     def responses(self, model: ReducedModel, state: State) -> list[StaticResponse]:
         """Return the responses of a reduced model at a state to each load alone."""
-        chosen = model.nominal.copy()
-        chosen[: len(state)] = state
-        return [model.static_response(chosen, load=load) for load in np.eye(len(self.terms.load_factors))]
+        values = model.nominal.copy()
+        values[: len(state)] = state
+        unit_loads = np.eye(len(self.terms.load_factors))
+        return [model.static_response(values, load=load) for load in unit_loads]
 
     def bound(self, model: ReducedModel, state: State) -> float:
-        """Return the certified bound of a model of these bases at a state.
+        """Return the certified relative bound of a reduced model at a state.
 
-        It is that of the load where it is largest, by the largest gauge or displacement, or by `least`.
+        It is the largest of all loads, each relative to its largest strain or displacement, or to
+        `least_outputs` where that is larger.
         """
         worst = 0.0
-        for number, found in enumerate(self.responses(model, state)):
-            present = [(values, error) for values, error in found.bounded if values.size]
-            for (values, error), floor in zip(present, self.least[:, number], strict=True):
-                worst = max(worst, error / max(float(np.abs(values).max()), floor))
+        for number, response in enumerate(self.responses(model, state)):
+            groups = [(outputs, bound) for outputs, bound in response.bounded if outputs.size]
+            least_outputs = self.least_outputs[:, number]
+            for (outputs, bound), least in zip(groups, least_outputs, strict=True):
+                largest = max(float(np.abs(outputs).max()), least)
+                worst = max(worst, bound / largest)
         return worst
 
     def search(self, settings: StructureSettings) -> tuple[float, ...]:
         """Run the weak greedy search with the certified bound as its surrogate.
 
+        Parameters
+        ----------
+        settings : StructureSettings
+            The tolerance of the bound and the limit of full solutions.
+
         Returns
         -------
         tuple of float
-            Largest bound on the training set before each round of full solutions and at the end.
+            The largest bound on the training set after each round of full solutions.
 
         Raises
         ------
         ReductionError
-            If the bound stays too large.
+            If the bound stays larger than the tolerance.
+        SolutionError
+            If the full model cannot be solved.
         """
-        states, wanted = self.terms.training(), SEARCH_MARGIN * settings.bound_tolerance
-        places, history = np.array(states), list[float]()
-        known = np.full(len(states), np.inf)
-        # nothing to bound yet: begin in the middle
-        chosen = [states[int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]]
-        for _ in range(1 + ceil((settings.most_snapshots - 1) / TOGETHER)):
-            grown, left = self.add_snapshots(chosen), settings.most_snapshots - len(self.snapshots)
-            self.stage.advance(len(chosen), f"full solution {len(self.snapshots)}")
-            last = not (grown and left)
-            model, bounds = self.model(), np.zeros(len(states))
-            few = len(states) // LOOKED_AT if history and not last else len(states)
-            for place, number in enumerate(np.argsort(-known, kind="stable")):
-                if place == few and bounds.max() > wanted:
-                    break
-                bounds[number] = known[number] = self.bound(model, states[number])
+        states = self.terms.training_states()
+        points = np.array(states)
+        target = SEARCH_MARGIN * settings.bound_tolerance
+        latest = np.full(len(states), np.inf)
+        history: list[float] = []
+        next_states = [_most_central(states)]
+        rounds = 1 + ceil((settings.most_snapshots - 1) / STATES_PER_ROUND)
+        for _ in range(rounds):
+            has_grown = self.add_snapshots(next_states)
+            self.stage.advance(len(next_states), f"full solution {len(self.snapshots)}")
+            remaining = settings.most_snapshots - len(self.snapshots)
+            is_last = not (has_grown and remaining)
+            inspect_all = is_last or not history
+            bounds = self._training_bounds(states, latest, target, inspect_all=inspect_all)
             history.append(float(bounds.max()))
-            if history[-1] <= wanted or last:
+            if is_last or history[-1] <= target:
                 break
-            chosen = _spread(places, bounds, min(TOGETHER, left), wanted)
-        if history[-1] > settings.bound_tolerance:
-            made, design = counted(len(self.snapshots), "full solution"), self.terms.structure.design
-            why = {"made": made, "design": design, "reached": history[-1], "settings": settings}
-            raise ReductionError(said("reduction.bound", **why))
+            next_states = _next_states(points, bounds, min(STATES_PER_ROUND, remaining), target)
+        self._check_bound(history[-1], settings)
         return tuple(history)
+
+    def _training_bounds(
+        self, states: list[State], latest: FloatArray, target: float, *, inspect_all: bool
+    ) -> FloatArray:
+        """Evaluate the bounds of the present model, first at the states with the largest ones.
+
+        Parameters
+        ----------
+        states : list of State
+            The B training states.
+        latest : (B,) array
+            The latest bound that is known of each state; updated where it is evaluated.
+        target : float
+            The evaluation stops early only if a bound is larger than this.
+        inspect_all : bool
+            Evaluate all states.
+
+        Returns
+        -------
+        (B,) array
+            The bounds; zero where they were not evaluated.
+        """
+        model = self.model()
+        bounds = np.zeros(len(states))
+        enough = len(states) if inspect_all else len(states) // INSPECTED_FRACTION
+        for rank, number in enumerate(np.argsort(-latest, kind="stable")):
+            if rank == enough and bounds.max() > target:
+                break
+            bounds[number] = self.bound(model, states[number])
+            latest[number] = bounds[number]
+        return bounds
+
+    def _check_bound(self, reached: float, settings: StructureSettings) -> None:
+        """Raise `ReductionError` if the bound that the search reached is too large."""
+        if reached <= settings.bound_tolerance:
+            return
+        solutions = counted(len(self.snapshots), "full solution")
+        raise ReductionError(
+            f"After {solutions} the error bound of {self.terms.structure.design.name} is "
+            f"{reached:.2g} of the largest output, but {settings.bound_tolerance:.2g} was asked "
+            f"for; raise most_solutions (now {settings.most_snapshots}) or tolerance in the table "
+            "[reduction] of a structure file, or narrow the ranges of parameters and losses."
+        )
 
     def compressed(self, tolerance: float) -> FloatArray:
         """Return the fewest combinations (N, K) of the basis whose bound keeps a tolerance."""
-        model, states = self.model(), self.terms.training()
-        solutions = [found.coordinates for state in states for found in self.responses(model, state)]
+        model = self.model()
+        states = self.terms.training_states()
+        coordinates: list[FloatArray] = []
+        for state in states:
+            coordinates += [response.coordinates for response in self.responses(model, state)]
 
-        def good(directions: FloatArray) -> bool:
-            smaller = self.model(directions)
-            return all(self.bound(smaller, state) <= tolerance for state in states)
+        def keeps_tolerance(directions: FloatArray) -> bool:
+            smaller_model = self.model(directions)
+            return all(self.bound(smaller_model, state) <= tolerance for state in states)
 
-        return fewest_directions(np.array(solutions).T, 2, good)
+        return fewest_directions(np.array(coordinates).T, 2, keeps_tolerance)
 
 
-def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
-    """Return the worst state, then those above `least` by bound times distance from all that are chosen."""
-    places = states / np.maximum(np.ptp(states, axis=0), 1e-300)
+def _most_central(states: list[State]) -> State:
+    """Return the state that is nearest to the mean of all, where the search begins."""
+    points = np.array(states)
+    distance_square = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
+    return states[int(distance_square.argmin())]
+
+
+def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
+    """Return the states for the next full solutions: bad ones that are far from each other.
+
+    Parameters
+    ----------
+    states : (B, P + K) array
+        The training states.
+    bounds : (B,) array
+        The bound at each state.
+    count : int
+        The largest number of states.
+    least : float
+        After the worst state only those with larger bounds are taken.
+
+    Returns
+    -------
+    list of State
+        First the worst state, then always the one with the largest product of its bound and its
+        distance from all that are chosen.
+    """
+    scaled = states / np.maximum(np.ptp(states, axis=0), 1e-300)
     chosen = [int(bounds.argmax())]
     distance = np.full(len(states), np.inf)
     while len(chosen) < count:
-        distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=1))
+        distance_from_last = np.linalg.norm(scaled - scaled[chosen[-1]], axis=1)
+        distance = np.minimum(distance, distance_from_last)
         score = np.where(bounds > least, bounds * distance, 0.0)
         if not score.any():
             break

@@ -1,17 +1,17 @@
 """Reduced models kept between runs: an unchanged design is built once, a changed one is built anew.
 
-A build works in one thread, because sums over several threads depend on their number: a design gives the same
-bytes on a machine whatever its cores do.
+A build works in one thread, because sums over several threads depend on their number. A design
+therefore gives the same bytes on a machine, whatever its cores do.
 
-Also fields on the whole wing from the reduced model, and VTU files of them for ParaView. No equation of the
-full model is solved there: the reduced solution is spread over the mesh with the static basis, which takes
-milliseconds.
+This module also computes fields on the whole wing from the reduced model, and writes them as VTU
+files for ParaView. No equation of the full model is solved for them: the reduced solution is
+expanded on the mesh by the static basis, which takes milliseconds.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -34,53 +34,65 @@ from .built_once import built_once, cache_folder
 if TYPE_CHECKING:
     from .reduced_basis import Reduction
 
-MODELLING_ROOMS = ("runtime", "elements", "full", "structure", "wing", "reduction")
-"""The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
+MODELLING_PACKAGES = ("runtime", "elements", "full", "structure", "wing", "reduction")
+"""The subpackages that decide what a reduced model holds.
 
-_Kept = TypeVar("_Kept", bound=KeptArrays)
-Settings = StructureSettings | None
+A change in any of their files makes a new cache entry.
+"""
+
+_Record = TypeVar("_Record", bound=KeptArrays)
 
 
 def modelling_hash() -> str:
     """Return the SHA-256 of the modelling code, hexadecimal."""
-    rooms = (
-        hash_tree(Path(__file__).parents[1] / room, suffixes=[".py", ".toml"]) for room in MODELLING_ROOMS
-    )
-    return hash_bytes("".join(rooms).encode())
+    package = Path(__file__).parents[1]
+    hashes = [hash_tree(package / name, suffixes=[".py", ".toml"]) for name in MODELLING_PACKAGES]
+    return hash_bytes("".join(hashes).encode())
 
 
-def entry(kind: str, design_hash: str, settings: object) -> Path:
-    """Return the file of a cache entry: named by a hash of design, settings and modelling code."""
+def cache_file(kind: str, design_hash: str, settings: object) -> Path:
+    """Return the file of a cache entry, named by a hash of design, settings and modelling code.
+
+    Parameters
+    ----------
+    kind : str
+        The kind of record, such as "wing".
+    design_hash : str
+        The hash of the design.
+    settings : object
+        The settings of the build; their `repr` says all of them.
+    """
     content = f"{design_hash} {settings!r} {modelling_hash()}"
     return cache_folder() / f"{kind}-{hash_bytes(content.encode())[:32]}.npz"
 
 
-def _once(
-    kind: type[_Kept], name: str, design_hash: str, settings: object, build: Callable[[], _Kept]
-) -> _Kept:
-    """Return the arrays of a design from their file, or else build them in one thread, and keep them."""
-    path = entry(name, design_hash, settings)
-    built: Callable[[], _Kept] = threadpool_limits.wrap(limits=1)(build)
+def _cached(record: type[_Record], path: Path, build: Callable[[], _Record]) -> _Record:
+    """Return a record from its cache file, or build it in one thread and write the file."""
+    build_in_one_thread: Callable[[], _Record] = threadpool_limits.wrap(limits=1)(build)
     return built_once(
-        path, lambda: kind.load(path), built, lambda made: atomic_write_bytes(path, made.to_bytes())
+        path,
+        load=lambda: record.load(path),
+        build=build_in_one_thread,
+        keep=lambda result: atomic_write_bytes(path, result.to_bytes()),
     )
 
 
 @dataclass(frozen=True, repr=False)
 class WingFields(ReducedModel):
-    """A reduced model with its bases on the nodes and cells of the mesh; `wing_fields` gives it.
+    """A reduced model with its bases on the nodes and cells of the mesh, from `wing_fields`.
 
     Attributes
     ----------
-    points : (P, 3) ndarray
-        Nodes [m].
-    cells : (C, 20) ndarray
+    points : (P, 3) array
+        Positions of the nodes [m].
+    cells : (C, 20) array of int
         Nodes of the cells in VTK's order, with positive Jacobians.
-    region : (C,) ndarray
-        0 skin, 1 to K the damage regions, K + 1 webs, K + 2 ribs.
-    static_displacement : (P, 3, N) ndarray
+    region : (C,) array of int
+        The region of each cell: 0 is the skin, 1 to K are the damage regions, K + 1 the webs, K + 2
+        the ribs.
+    static_displacement : (P, 3, N) array
         Static basis vectors [m per unit coordinate].
-    modal_displacement : (P, 3, Nm) ndarray
+    modal_displacement : (P, 3, Nm) array
         Modal basis vectors.
     """
 
@@ -95,27 +107,29 @@ class WingFields(ReducedModel):
     @property
     def model(self) -> ReducedModel:
         """The reduced model alone."""
-        return ReducedModel(**_content(self))
+        return ReducedModel(**_fields_of(self))
 
 
-def _content(model: ReducedModel) -> dict[str, Any]:
-    """Return what a reduced model holds, by the names of its fields."""
-    return {item.name: getattr(model, item.name) for item in fields(ReducedModel)}
+def _fields_of(model: ReducedModel) -> dict[str, Any]:
+    """Return the fields of a reduced model by their names."""
+    return {field.name: getattr(model, field.name) for field in fields(ReducedModel)}
 
 
 def reduced_model(
-    design: WingDesign | None = None, progress: Progress | None = None, settings: Settings = None
+    design: WingDesign | None = None,
+    progress: Progress | None = None,
+    settings: StructureSettings | None = None,
 ) -> ReducedModel:
     """Return the reduced model of a wing, from the cache if it is there.
 
     Parameters
     ----------
     design : WingDesign, optional
-        The wing; the shipped one if left out.
+        The wing; the shipped one by default.
     progress : Progress, optional
         Where a build reports.
     settings : StructureSettings, optional
-        How well the model is to hold.
+        The accuracy that is asked for; by default that of the design.
 
     Raises
     ------
@@ -123,28 +137,48 @@ def reduced_model(
         If the design cannot be modelled or reduced.
     """
     wing = design or load_design()
-
-    def build() -> ReducedModel:
-        return wing_fields(wing, progress, settings).model
-
-    return _once(ReducedModel, "wing", wing.hash, settings, build)
+    return _cached(
+        ReducedModel,
+        cache_file("wing", wing.hash, settings),
+        lambda: wing_fields(wing, progress, settings).model,
+    )
 
 
 def wing_fields(
-    design: WingDesign | None = None, progress: Progress | None = None, settings: Settings = None
+    design: WingDesign | None = None,
+    progress: Progress | None = None,
+    settings: StructureSettings | None = None,
 ) -> WingFields:
     """Return the reduced model of a wing with its bases on the mesh, from the cache if it is there.
 
-    Parameters and errors as of `reduced_model`.
+    Parameters
+    ----------
+    design : WingDesign, optional
+        The wing; the shipped one by default.
+    progress : Progress, optional
+        Where a build reports.
+    settings : StructureSettings, optional
+        The accuracy that is asked for; by default that of the design.
+
+    Raises
+    ------
+    FiniteElementError
+        If the design cannot be modelled or reduced.
     """
     wing = design or load_design()
-    return _once(WingFields, "fields", wing.hash, settings, lambda: build_fields(wing, progress, settings))
+    return _cached(
+        WingFields,
+        cache_file("fields", wing.hash, settings),
+        lambda: build_fields(wing, progress, settings),
+    )
 
 
 def build_fields(
-    design: WingDesign, progress: Progress | None = None, settings: Settings = None
+    design: WingDesign,
+    progress: Progress | None = None,
+    settings: StructureSettings | None = None,
 ) -> WingFields:
-    """Build the reduced model and the bases of a wing, without the cache; see `reduced_model`."""
+    """Build what `wing_fields` returns, without the cache."""
     from .reduced_basis import reduce_structure
 
     operators = _assembled(design, progress)
@@ -152,21 +186,36 @@ def build_fields(
 
 
 def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators:
+    """Return the operators of a wing, and report the stage."""
     with reporter(progress).stage("Meshing and assembling the wing"):
         return assemble(design)
 
 
 def patch_arrays(design: WingDesign | None = None, progress: Progress | None = None) -> PatchArrays:
-    """Return the wing for patches of a design, from the cache if it is there.
+    """Return the arrays of a wing that can be patched, from the cache if they are there.
 
-    Parameters and errors are those of `reduced_model`.
+    Parameters
+    ----------
+    design : WingDesign, optional
+        The wing; the shipped one by default.
+    progress : Progress, optional
+        Where a build reports.
+
+    Raises
+    ------
+    FiniteElementError
+        If the design cannot be modelled or reduced.
     """
     wing = design or load_design()
-    return _once(PatchArrays, "patches", wing.hash, None, lambda: build_patch_arrays(wing, progress))
+    return _cached(
+        PatchArrays,
+        cache_file("patches", wing.hash, None),
+        lambda: build_patch_arrays(wing, progress),
+    )
 
 
 def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> PatchArrays:
-    """Build the wing for patches of a design, without the cache; see `patch_arrays`."""
+    """Build what `patch_arrays` returns, without the cache."""
     from .patch_basis import reduce_patches
 
     return reduce_patches(_assembled(design, progress), progress)
@@ -188,10 +237,11 @@ def reduced_structure(
     progress : Progress, optional
         Where a build reports.
     memory_limit : float, optional
-        As of `fe.structure.operators.load_and_assemble`.
+        Bytes that assembly and factorisation may take, as in
+        `fe.structure.operators.load_and_assemble`.
     with_ports : bool
-        Whether the model also holds the force and the displacement at each port of the file, see
-        `AffineStructure.pushed_at_ports`. Its `design_hash` is the one of the model without them.
+        Whether the model also has the force and the displacement at each port of the file, see
+        `AffineStructure.pushed_at_ports`. Its `design_hash` is that of the model without them.
 
     Raises
     ------
@@ -208,50 +258,83 @@ def reduced_structure(
             structure = structure.pushed_at_ports()
         return reduce_structure(structure, progress=progress).model
 
-    return _once(ReducedModel, "structure", *_asked(Path(file), with_ports=with_ports), build)
+    path = _structure_cache_file(Path(file), with_ports=with_ports)
+    return _cached(ReducedModel, path, build)
 
 
 def check_structure(file: Path | str) -> None:
-    """Read a structure file with its mesh and assemble both, unless their reduced model is kept.
+    """Read a structure file with its mesh and assemble both, unless its reduced model is cached.
 
     Raises
     ------
     FiniteElementError
         If the structure cannot be read or modelled.
     """
-    if not entry("structure", *_asked(Path(file))).is_file():
+    if not _structure_cache_file(Path(file)).is_file():
         assemble_structure(file)
 
 
-def _asked(file: Path, *, with_ports: bool = False) -> tuple[str, object]:
-    """Return the hash of a structure file with its mesh, and how it is to be reduced."""
+def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
+    """Return the cache file of the reduced model of a structure file, with its ports or without."""
     design = load_structure(file)
-    return structure_hash(design, file.parent, with_ports=with_ports), design.reduction
+    design_hash = structure_hash(design, file.parent, with_ports=with_ports)
+    return cache_file("structure", design_hash, design.reduction)
 
 
 def field_basis(operators: AffineOperators, reduction: "Reduction") -> WingFields:
-    """Spread the bases of a reduction of the full model over its mesh."""
+    """Return a reduced model with its bases expanded on the mesh of the full model.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The full model of the wing.
+    reduction : Reduction
+        Its reduced model, and the bases.
+    """
     mesh = operators.wing_mesh
-    static, modal = (
-        np.asarray(operators.expansion @ basis).reshape(-1, 3, basis.shape[1])
-        for basis in (reduction.static_basis, reduction.modal_basis)
-    )
+
+    def on_nodes(basis: FloatArray) -> FloatArray:
+        return np.asarray(operators.expansion @ basis).reshape(-1, 3, basis.shape[1])
+
     return WingFields(
-        **_content(reduction.model),
+        **_fields_of(reduction.model),
         points=mesh.points,
         cells=mesh.cells,
         region=mesh.region,
-        static_displacement=static,
-        modal_displacement=modal,
+        static_displacement=on_nodes(reduction.static_basis),
+        modal_displacement=on_nodes(reduction.modal_basis),
     )
+
+
+class _CellStrains(NamedTuple):
+    """Strains at the centres of cells.
+
+    Attributes
+    ----------
+    tensor : (C, 6) array
+        Strains xx, yy, zz, yz, xz, xy, with engineering shear strains.
+    spanwise : (C,) array
+        Strain along the span, positive if compressed, as the gauges read it.
+    """
+
+    tensor: FloatArray
+    spanwise: FloatArray
+
+
+def _strains_at_centres(wing: WingFields, displacement: FloatArray) -> _CellStrains:
+    """Return the strains of nodal displacements (P, 3) [m] at the centres of the cells."""
+    mesh = CellMesh(HEXAHEDRA_20, wing.points, wing.cells)
+    tensor = mesh.strains(displacement).squeeze(axis=1)
+    _, spanwise, *_ = tensor.T
+    return _CellStrains(tensor, -spanwise)
 
 
 def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
     """Write displacement, strain and damage of the wing at rest as a VTU file.
 
-    Point data: `displacement` [m]. Cell data, at the centres of the cells: `strain` (xx, yy, zz, yz, xz, xy),
-    `spanwise_strain` (yy, positive where compressed, as the gauges), `region` (as in `WingFields`),
-    `stiffness_loss` (fraction).
+    Point data is `displacement` [m]. Cell data, at the centres of the cells, are `strain` (xx, yy,
+    zz, yz, xz, xy), `spanwise_strain` (yy, positive if compressed, as the gauges read it), `region`
+    (as in `WingFields`) and `stiffness_loss` (fraction).
 
     Parameters
     ----------
@@ -259,7 +342,7 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
         The file; an existing one is replaced.
     wing : WingFields
         The wing, from `wing_fields`.
-    vector : (V,) ndarray
+    vector : (V,) array
         Values of all that can be chosen, from `ReducedModel.vector`.
 
     Raises
@@ -270,26 +353,56 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
         If the file cannot be written.
     """
     displacement = wing.static_displacement @ wing.static_response(vector).coordinates
-    lost = [0.0, *(vector[wing.chosen.index(name)] for name in wing.regions), 0.0, 0.0]  # of each region
-    strain = CellMesh(HEXAHEDRA_20, wing.points, wing.cells).strains(displacement)[:, 0]
-    cells = {
-        "strain": strain,
-        "spanwise_strain": -strain[:, 1],
-        "region": wing.region,
-        "stiffness_loss": np.array(lost)[wing.region],
-    }
-    write_vtu(path, wing.points, (HEXAHEDRA_20.file_type, wing.cells), {"displacement": displacement}, cells)
+    strains = _strains_at_centres(wing, displacement)
+    region_losses = [vector[wing.chosen.index(name)] for name in wing.regions]
+    skin_loss, web_loss, rib_loss = 0.0, 0.0, 0.0
+    losses = np.array([skin_loss, *region_losses, web_loss, rib_loss])
+    write_vtu(
+        path,
+        wing.points,
+        (HEXAHEDRA_20.file_type, wing.cells),
+        point_data={"displacement": displacement},
+        cell_data={
+            "strain": strains.tensor,
+            "spanwise_strain": strains.spanwise,
+            "region": wing.region,
+            "stiffness_loss": losses[wing.region],
+        },
+    )
 
 
 def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
     """Write the mode shapes of the wing as a VTU file.
 
-    Point data: `mode_1_5.632Hz` and so on, mass-normalised displacements [kg^-1/2]. Cell data: `region`.
-    Parameters and errors are those of `write_wing_vtu`.
+    Point data are `mode_1_5.632Hz` and so on, mass-normalised displacements [kg^-1/2]. Cell data is
+    `region`.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; an existing one is replaced.
+    wing : WingFields
+        The wing, from `wing_fields`.
+    vector : (V,) array
+        Values of all that can be chosen, from `ReducedModel.vector`.
+
+    Raises
+    ------
+    OutsideModelError
+        If a value lies outside the validity box of the model.
+    FileNotWrittenError
+        If the file cannot be written.
     """
     modes = wing.modes(vector)
-    named = {
-        f"mode_{number}_{frequency:.3f}Hz": wing.modal_displacement @ shape
-        for number, (frequency, shape) in enumerate(zip(modes.frequency, modes.shape.T, strict=True), start=1)
-    }
-    write_vtu(path, wing.points, (HEXAHEDRA_20.file_type, wing.cells), named, {"region": wing.region})
+    shapes = {}
+    for number, (frequency, shape) in enumerate(
+        zip(modes.frequency, modes.shape.T, strict=True), start=1
+    ):
+        shapes[f"mode_{number}_{frequency:.3f}Hz"] = wing.modal_displacement @ shape
+    write_vtu(
+        path,
+        wing.points,
+        (HEXAHEDRA_20.file_type, wing.cells),
+        point_data=shapes,
+        cell_data={"region": wing.region},
+    )

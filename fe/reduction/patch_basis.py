@@ -1,14 +1,16 @@
-"""Offline: the wing in a basis that is rich enough for the changes of `fe.runtime.patch`.
+"""The wing in a basis that is rich enough for the changes of `fe.runtime.patch`.
 
-In two steps. A working basis of several hundred vectors holds what the full model answers to loads, to point
-forces, to the gauges as loads (whose presence squares the error of a strain) and to each stiffness and mass
-term, at two states of health. In it, many patched states are solved; the singular directions of their
-solutions and modes, weighed by what is looked at most, are the basis that is kept.
+The basis is made in two steps. A working basis of several hundred vectors holds the solutions of
+the full model under loads, point forces, the gauges as loads (whose presence squares the error of a
+strain), and each stiffness and mass term, at two states of health. In the working basis many
+patched states are solved. The basis that is kept consists of the singular directions of their
+solutions and modes, with larger weights for what is used most.
 """
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import legendre
 from scipy import sparse
 from scipy.linalg import eigh
 
@@ -22,21 +24,67 @@ from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, reporter
 
-LARGEST_LOSS, COMPLIANCE_SHARE, LARGEST_MASS = 0.7, 0.4, 0.25
-"""How far changes may go: loss of stiffness in a box along the span, root compliance as a share of the tip's,
-point mass [kg]."""
-VECTORS, STATES = 240, 240
-"""Size n of the basis, and patched states that are solved in the working basis."""
-DAMAGED_ANCHOR = 0.7
-"""Stiffness loss of every damage region in the second state of health at which the full model is solved."""
-LIFT_MOMENTS = 6
-"""Courses of the lift along the span for which the full model is solved: Legendre polynomials."""
-MODES, SHAPES = 8, 6
-"""Modes that are snapshots, and those of them whose inertia and parts of the skin are answered, too."""
+LARGEST_LOSS = 0.7
+"""Largest loss of stiffness in a box along the span."""
+COMPLIANCE_FRACTION = 0.4
+"""Largest root compliance as a fraction of the compliance at the tip."""
+LARGEST_MASS = 0.25
+"""Largest point mass [kg]."""
+BASIS_VECTORS = 240
+"""Size of the basis."""
+PATCHED_STATES = 240
+"""Patched states that are solved in the working basis."""
+DAMAGED_LOSS = 0.7
+"""Stiffness loss of every damage region in the second state of health of the working basis."""
+LIFT_POLYNOMIALS = 6
+"""Legendre polynomials along the span by which the lift is weighted for the working basis."""
+MODES = 8
+"""Modes that are snapshots."""
+INERTIA_SHAPES = 6
+"""Of these, modes whose inertia, and whose forces in parts of the skin, are loads as well."""
+POINT_STATIONS = 13
+"""Stations at which point forces act, about."""
+NEAR_GAUGE = 1.5
+"""A strip is near a gauge within this multiple of the largest distance of mesh lines."""
 START_SHAPES = 16
 """Modes from which those of a patched wing are iterated."""
 WORKING_TOLERANCE = 3e-7
 """Squared size, relative to the largest, of a direction that the working basis leaves out."""
+
+MAIN_LOAD_WEIGHT = 3.0
+"""Weight of the solutions under tip force, lift and washed-out lifts; others have one."""
+WASHOUT_EXPONENTS = (0.5, 1.0, 2.0, 4.0)
+"""Exponents of the washed-out lifts."""
+OUTBOARD_STATIONS = (0.75, 1.0)
+"""Where point forces act, as fractions of the semi-span."""
+OTHER_STRAIN_WEIGHT = 0.4
+"""Weight of the solutions under strains across a gauge, and under shear strains, as loads."""
+MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
+UNCHANGED_WEIGHT = 10.0
+"""Weight of the wing as it was; a patched state has one."""
+
+
+class _ChangeProbabilities(NamedTuple):
+    """Fractions of the patched states with losses in their regions, and with each change."""
+
+    region_losses: float = 0.5
+    local_loss: float = 0.75
+    compliance: float = 0.4
+    point_mass: float = 0.6
+
+
+class _ChangeFractions(NamedTuple):
+    """The numbers of the changes of a patched state, as fractions of their ranges."""
+
+    start: float
+    length: float
+    loss: float
+    compliance: float
+    mass: float
+    station: float
+
+
+PROBABILITIES = _ChangeProbabilities()
 
 
 def reduce_patches(operators: AffineOperators, progress: Progress | None = None) -> PatchArrays:
@@ -57,147 +105,270 @@ def reduce_patches(operators: AffineOperators, progress: Progress | None = None)
     progress = reporter(progress)
     with progress.stage("Solving the wing for changes"):
         full = assemble_patch_operators(operators)
-        healthy, damaged = _responses(full, 0.0), _responses(full, DAMAGED_ANCHOR)
-        snapshots = np.concatenate((healthy, damaged), axis=1)
-        values, vectors = np.linalg.eigh(snapshots.T @ (operators.stiffness() @ snapshots))
-        kept = values > WORKING_TOLERANCE * values[-1]
-        basis = snapshots @ (vectors[:, kept] / np.sqrt(values[kept]))
+        basis = _working_basis(full)
     with progress.stage("Reducing the patched wing"):
-        return project(full, basis @ _directions(project(full, basis)))
+        directions = _kept_directions(project(full, basis))
+        return project(full, basis @ directions)
 
 
-def _responses(full: PatchOperators, loss: float) -> FloatArray:
-    """Return solutions (n, k) of the full model, all damage regions with one loss, in their natural sizes."""
-    operators, rows, stations = full.operators, full.rows, full.plain["stations"]
+def _working_basis(full: PatchOperators) -> FloatArray:
+    """Return a basis (n, N) that holds the snapshots of both states, orthonormal in the energy."""
+    snapshots = np.concatenate((_snapshots(full, 0.0), _snapshots(full, DAMAGED_LOSS)), axis=1)
+    gram = snapshots.T @ (full.operators.stiffness() @ snapshots)
+    squares, vectors = np.linalg.eigh(gram)
+    is_large = squares > WORKING_TOLERANCE * squares[-1]
+    return np.asarray(snapshots @ (vectors[:, is_large] / np.sqrt(squares[is_large])))
+
+
+def _snapshots(full: PatchOperators, loss: float) -> FloatArray:
+    """Return solutions (n, S) of the full model, all damage regions with one loss.
+
+    Parameters
+    ----------
+    full : PatchOperators
+        The full model.
+    loss : float
+        The stiffness loss.
+    """
+    operators = full.operators
     health = dict.fromkeys(operators.regions, loss)
     factors = Factorisation(operators.stiffness(None, health))
     frequency, modes = natural_frequencies(operators, MODES, health, factors)
-    step = max(1, len(stations) // 13)
-    along_x, along_y, elastic, *others = rows["line_rows"]
-    along, *turned = rows["strain_rows"]
-    lines = (
-        *turned,
-        elastic[2:],  # where point masses may sit
-        *(line[step::step] for line in others),
-        *(line[2 * step :: 2 * step] for line in (along_x, along_y)),
+    # solutions under loads, of unit energy, and modes
+    whitened = factors.whitened(_snapshot_loads(full, modes).T)
+    responses = factors.unwhitened(whitened / np.linalg.norm(whitened, axis=0))
+    solutions = np.concatenate((responses, modes / (2.0 * np.pi * frequency)), axis=1)
+    # solutions under the forces that each part of the skin takes in these solutions
+    skin_forces = np.concatenate(_skin_forces(full, solutions), axis=1)
+    return np.concatenate((solutions, factors.riesz(skin_forces)), axis=1)
+
+
+def _snapshot_loads(full: PatchOperators, modes: FloatArray) -> FloatArray:
+    """Return the loads (L, n) of the snapshots: first the gauges, then tip force and lift.
+
+    Parameters
+    ----------
+    full : PatchOperators
+        The full model.
+    modes : (n, m) array
+        Its modes.
+    """
+    operators = full.operators
+    lines = full.line_rows
+    stations = full.layout["stations"]
+    step = max(1, len(stations) // POINT_STATIONS)
+    polynomials = legendre.legvander(2.0 * stations / stations[-1] - 1.0, LIFT_POLYNOMIALS - 1)
+    point_forces = (
+        lines.elastic_z[2:],  # where point masses may sit
+        *(line[step::step] for line in lines.others_z),
+        lines.elastic_x[2 * step :: 2 * step],
+        lines.elastic_y[2 * step :: 2 * step],
     )
-    single = [rows[name] for name in ("load_tip", "load_lift", "tip_row", "weight", "flap_row")]
-    moments = np.polynomial.legendre.legvander(2.0 * stations / stations[-1] - 1.0, LIFT_MOMENTS - 1)
-    inertia = [(term @ modes[:, :SHAPES]).T for term in operators.mass_terms]
-    several = (line.toarray() for line in lines)
-    loads = (along.toarray(), *single, moments.T @ rows["lift_rows"], *several, *inertia)
-    answers = factors.whitened(np.vstack(loads).T)
-    answers = factors.unwhitened(answers / np.linalg.norm(answers, axis=0))
-    solutions = np.concatenate((answers, modes / (2.0 * np.pi * frequency)), axis=1)
-    # what each part of the skin does to the main solutions, and to the gauges near it
-    places, edges = full.plain["gauge_stations"], full.plain["strip_lines"]
-    gauges, under_loads, _ = np.split(solutions, [len(places), len(places) + 2], axis=1)
-    main = np.concatenate((under_loads, solutions[:, -MODES:][:, :SHAPES]), axis=1)
-    middle = 0.5 * (edges[1:] + edges[:-1])[full.plain["strip_of"], np.newaxis]
-    near = np.abs(places - middle) < 1.5 * np.diff(edges).max()
-    changes = [
-        part @ np.concatenate((main, gauges[:, close]), axis=1)
-        for part, close in zip(full.strips, near, strict=True)
+    inertia = [(term @ modes[:, :INERTIA_SHAPES]).T for term in operators.mass_terms]
+    return np.vstack(
+        (
+            full.strain_rows.along.toarray(),
+            operators.load_tip,
+            operators.load_lift,
+            operators.tip_row,
+            full.weight,
+            full.flap_row,
+            polynomials.T @ full.lift_rows,
+            full.strain_rows.across.toarray(),
+            full.strain_rows.shear.toarray(),
+            *(force.toarray() for force in point_forces),
+            *inertia,
+        )
+    )
+
+
+def _skin_forces(full: PatchOperators, solutions: FloatArray) -> list[FloatArray]:
+    """Return the forces (n, s) of each part of the skin in main solutions, and in those of gauges.
+
+    Parameters
+    ----------
+    full : PatchOperators
+        The full model.
+    solutions : (n, S) array
+        Solutions under the loads of `_snapshot_loads`, then the modes.
+    """
+    layout = full.layout
+    gauge_stations = layout["gauge_stations"]
+    gauge_count = len(gauge_stations)
+    main_loads = 2  # tip force and lift
+    of_gauges, of_main_loads, _ = np.split(
+        solutions, [gauge_count, gauge_count + main_loads], axis=1
+    )
+    main_modes = solutions[:, -MODES:][:, :INERTIA_SHAPES]
+    main_solutions = np.concatenate((of_main_loads, main_modes), axis=1)
+    # a local change matters to the gauges near its strip
+    edges = layout["strip_lines"]
+    strip_middles = 0.5 * (edges[1:] + edges[:-1])
+    part_middles = strip_middles[layout["strip_of"], np.newaxis]
+    is_near = np.abs(gauge_stations - part_middles) < NEAR_GAUGE * np.diff(edges).max()
+    return [
+        strip @ np.concatenate((main_solutions, of_gauges[:, near_gauges]), axis=1)
+        for strip, near_gauges in zip(full.strips, is_near, strict=True)
     ]
-    return np.concatenate((solutions, factors.riesz(np.concatenate(changes, axis=1))), axis=1)
 
 
-def _inner(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
-    """Return basis^T matrix basis, on the rows that the matrix has."""
-    used = np.flatnonzero(np.diff(matrix.indptr))
-    part = basis[used]
-    product = part.T @ (matrix[used][:, used] @ part)
+def _projected(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
+    """Return basis' matrix basis (N, N), computed on the rows that the matrix has."""
+    rows = np.flatnonzero(np.diff(matrix.indptr))
+    basis_rows = basis[rows]
+    product = basis_rows.T @ (matrix[rows][:, rows] @ basis_rows)
     return np.asarray(0.5 * (product + product.T))
 
 
 def project(full: PatchOperators, basis: FloatArray) -> PatchArrays:
-    """Return the arrays of a wing in a basis (n_full, n), without reducing it further."""
-    lower, operators = np.tril_indices(basis.shape[1]), full.operators
-    rows: dict[str, Any] = {
-        name: np.stack([part @ basis for part in own]) if isinstance(own, tuple) else np.asarray(own @ basis)
-        for name, own in full.rows.items()
-    }
-    stiffness, mass = (
-        np.stack([_inner(term, basis) for term in terms])
-        for terms in ([term.matrix for term in operators.stiffness_terms], operators.mass_terms)
-    )
-    whole, tip, load_place = stiffness.sum(axis=0), rows["load_tip"], full.plain["load_place"]
-    nominal = np.tensordot((1.0, *operators.masses.values()), mass, 1)
-    shapes = eigh(whole, nominal, subset_by_index=[0, START_SHAPES - 1])[1]
+    """Return the arrays of a wing in a basis.
+
+    Parameters
+    ----------
+    full : PatchOperators
+        The full model, with n free unknowns.
+    basis : (n, N) array
+        The basis.
+    """
+    operators = full.operators
+    lower = np.tril_indices(basis.shape[1])
+    stiffness = np.stack([_projected(term.matrix, basis) for term in operators.stiffness_terms])
+    mass = np.stack([_projected(term, basis) for term in operators.mass_terms])
+    load_tip = np.asarray(operators.load_tip @ basis)
+    tip_row = np.asarray(operators.tip_row @ basis)
+    # the wing as it was
+    nominal_stiffness = stiffness.sum(axis=0)
+    nominal_mass = np.tensordot((1.0, *operators.masses.values()), mass, 1)
+    _, shapes = eigh(nominal_stiffness, nominal_mass, subset_by_index=[0, START_SHAPES - 1])
+    tip_compliance = float(load_tip @ np.linalg.solve(nominal_stiffness, load_tip))
     return PatchArrays(
         design_hash=operators.design_hash,
         regions=operators.regions,
         validity_box=np.array(list(operators.ranges.values())),
         largest_loss=LARGEST_LOSS,
-        largest_compliance=COMPLIANCE_SHARE * float(tip @ np.linalg.solve(whole, tip)) / load_place**2,
+        largest_compliance=COMPLIANCE_FRACTION * tip_compliance / full.layout["load_place"] ** 2,
         largest_mass=LARGEST_MASS,
         stiffness=stiffness,
         mass=mass,
-        strip_stiffness=np.stack([_inner(part, basis)[lower].astype(np.float32) for part in full.strips]),
-        start_shapes=_unit(shapes * np.where(rows["tip_row"] @ shapes < 0.0, -1.0, 1.0)),
-        **full.plain,
-        **rows,
+        strip_stiffness=np.stack(
+            [_projected(strip, basis)[lower].astype(np.float32) for strip in full.strips]
+        ),
+        start_shapes=_unit_columns(shapes * np.where(tip_row @ shapes < 0.0, -1.0, 1.0)),
+        flap_row=np.asarray(full.flap_row @ basis),
+        line_rows=np.stack([rows @ basis for rows in full.line_rows.stacked]),
+        load_tip=load_tip,
+        load_lift=np.asarray(operators.load_lift @ basis),
+        lift_rows=np.asarray(full.lift_rows @ basis),
+        weight=np.asarray(full.weight @ basis),
+        strain_rows=np.stack([rows @ basis for rows in full.strain_rows]),
+        tip_row=tip_row,
+        **full.layout,
     )
 
 
-LOAD_WEIGHT = 3.0
-"""How much more the solutions under tip force, lift and washed-out lifts count than those under others."""
-WASHOUTS = (0.5, 1.0, 2.0, 4.0)
-"""Exponents of these."""
-OUTBOARD = (0.75, 1.0)
-"""Where point forces act, in semi-spans."""
-TURNED_WEIGHT = 0.4
-"""How much representatives of strain across a gauge and of shear count."""
-MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
-CHANGED, TAKEN = 6, (0.5, 0.75, 0.4, 0.6)
-"""Numbers of the changes: start, length, amount of a local loss, root compliance, point mass, its station;
-and the shares of the states that have losses of their regions, and each of the three changes."""
-PLAIN_WEIGHT = 10.0
-"""How much more the wing as it was counts than one of the patched states."""
+class _SnapshotLoads(NamedTuple):
+    """Loads whose solutions are compressed.
+
+    Attributes
+    ----------
+    columns : (N, L) array
+        The loads in the working basis.
+    weights : (L,) array
+        The weights of their solutions.
+    """
+
+    columns: FloatArray
+    weights: FloatArray
 
 
-def _directions(arrays: PatchArrays) -> FloatArray:
-    """Return the kept directions (N, n) of the working basis."""
+def _kept_directions(arrays: PatchArrays) -> FloatArray:
+    """Return the directions (N, n) of the working basis that are kept.
+
+    They are the largest eigenvectors of the weighted sum of all snapshots' outer products.
+    """
     wing = PatchedWing(arrays)
-    eta, upwards = arrays.stations / wing.span, arrays.line_rows[2:]
-    washed = np.power.outer(eta, WASHOUTS).T @ arrays.lift_rows
-    forces = upwards[:, np.searchsorted(eta, OUTBOARD)].reshape(-1, wing.size)
-    span_row, (along, *turned) = arrays.station_weights @ upwards[0], arrays.strain_rows
-    groups = (
-        np.vstack((arrays.load_tip, arrays.load_lift, washed)),
-        np.vstack((arrays.weight, forces, along, arrays.flap_row, span_row)),
-        np.vstack(turned),
+    loads = _weighted_loads(wing)
+    outer_products = np.zeros((wing.size, wing.size))
+    change_count = len(_ChangeProbabilities._fields) + len(_ChangeFractions._fields)
+    value_count = len(arrays.validity_box) - 2  # the last two are load factor and tip force
+    generator = np.random.default_rng(1)
+    fractions = generator.random((PATCHED_STATES, change_count + value_count))
+    for number, state_fractions in enumerate(fractions):
+        is_unchanged = number == 0
+        structure = _patched_state(wing, state_fractions, unchanged=is_unchanged)
+        solutions = _unit_columns(structure.static(loads.columns)) * loads.weights
+        modes = _unit_columns(structure.lowest(MODES).shapes) * MODE_WEIGHTS
+        snapshots = np.concatenate((solutions, modes), axis=1)
+        weight = UNCHANGED_WEIGHT**2 if is_unchanged else 1.0
+        outer_products += snapshots @ snapshots.T * weight
+    first = max(0, wing.size - BASIS_VECTORS)
+    _, directions = eigh(outer_products, subset_by_index=[first, wing.size - 1])
+    return np.asarray(directions[:, ::-1])
+
+
+def _weighted_loads(wing: PatchedWing) -> _SnapshotLoads:
+    """Return the loads whose solutions are compressed, with their weights."""
+    arrays = wing.arrays
+    eta = arrays.stations / wing.span
+    upward_rows = arrays.line_rows[2:]
+    washed_out_lifts = np.power.outer(eta, WASHOUT_EXPONENTS).T @ arrays.lift_rows
+    point_forces = upward_rows[:, np.searchsorted(eta, OUTBOARD_STATIONS)].reshape(-1, wing.size)
+    mean_displacement = arrays.station_weights @ upward_rows[0]
+    strain_along, *other_strains = arrays.strain_rows
+    main = np.vstack((arrays.load_tip, arrays.load_lift, washed_out_lifts))
+    plain = np.vstack(
+        (arrays.weight, point_forces, strain_along, arrays.flap_row, mean_displacement)
     )
-    columns = np.concatenate(groups).T
-    weights = np.repeat((LOAD_WEIGHT, 1.0, TURNED_WEIGHT), [len(rows) for rows in groups])
-    all_snapshots = np.zeros((wing.size, wing.size))
-    numbers = len(TAKEN) + CHANGED + len(arrays.validity_box) - 2
-    places = np.random.default_rng(1).random((STATES, numbers))
-    for number, shares in enumerate(places):
-        structure = _patched_state(wing, shares, plain=number == 0)
-        solutions, modes = _unit(structure.static(columns)), _unit(structure.lowest(MODES).shapes)
-        shapes = np.concatenate((solutions * weights, modes * MODE_WEIGHTS), axis=1)
-        all_snapshots += shapes @ shapes.T * (1.0 if number else PLAIN_WEIGHT**2)
-    first = max(0, wing.size - VECTORS)
-    return np.asarray(eigh(all_snapshots, subset_by_index=[first, wing.size - 1])[1][:, ::-1])
+    other = np.vstack(other_strains)
+    weights = (MAIN_LOAD_WEIGHT, 1.0, OTHER_STRAIN_WEIGHT)
+    return _SnapshotLoads(
+        columns=np.concatenate((main, plain, other)).T,
+        weights=np.repeat(weights, [len(main), len(plain), len(other)]),
+    )
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _unit_columns(vectors: FloatArray) -> FloatArray:
+    """Return vectors (N, k) scaled to length one."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
-def _patched_state(wing: PatchedWing, shares: FloatArray, *, plain: bool) -> PatchedState:
-    """Return a state at shares of all ranges; `plain`: the wing as it was, in the middle of them."""
-    arrays, span = wing.arrays, wing.span
-    damaged, *changed = (shares[: len(TAKEN)] < TAKEN) & (not plain)
-    start, length, loss, compliance, mass, station, *shares = shares[len(TAKEN) :].tolist()
-    low, high = arrays.validity_box[:-2].T  # all but the loads
-    values = low + (high - low) * (0.5 if plain else np.array(shares))
-    values[1:-2] *= damaged
-    changes = (
-        LocalStiffnessLoss(loss**0.5 * arrays.largest_loss, start * span, (0.02 + 0.28 * length) * span),
-        RootCompliance(compliance * arrays.largest_compliance),
-        PointMass(mass * arrays.largest_mass, (0.1 + 0.9 * station) * span),
+def _patched_state(wing: PatchedWing, fractions: FloatArray, *, unchanged: bool) -> PatchedState:
+    """Return the wing at fractions of all ranges.
+
+    Parameters
+    ----------
+    wing : PatchedWing
+        The wing in the working basis.
+    fractions : (F,) array
+        Fractions that decide which changes there are, the fractions of the changes' ranges, and
+        those of the ranges of modulus, losses and masses.
+    unchanged : bool
+        Return the wing as it was, in the middle of its ranges, without damage.
+    """
+    arrays = wing.arrays
+    draws, change_values, value_fractions = np.split(
+        fractions,
+        [len(PROBABILITIES), len(PROBABILITIES) + len(_ChangeFractions._fields)],
     )
-    patch = ModelPatch(tuple(change for change, taken in zip(changes, changed, strict=True) if taken))
-    return wing.at(np.append(values, (0.0, 0.0)), patch)
+    occurs = (draws < PROBABILITIES) & (not unchanged)
+    has_losses, *has_change = occurs
+    # modulus, losses of the regions and masses
+    low, high = arrays.validity_box[:-2].T  # without load factor and tip force
+    values = low + (high - low) * (0.5 if unchanged else value_fractions)
+    values[1:-2] *= has_losses
+    # changes of the patch
+    change = _ChangeFractions(*change_values.tolist())
+    changes = (
+        LocalStiffnessLoss(
+            change.loss**0.5 * arrays.largest_loss,
+            change.start * wing.span,
+            (0.02 + 0.28 * change.length) * wing.span,
+        ),
+        RootCompliance(change.compliance * arrays.largest_compliance),
+        PointMass(change.mass * arrays.largest_mass, (0.1 + 0.9 * change.station) * wing.span),
+    )
+    patch = ModelPatch(
+        tuple(part for part, present in zip(changes, has_change, strict=True) if present)
+    )
+    no_loads = (0.0, 0.0)
+    return wing.at(np.append(values, no_loads), patch)

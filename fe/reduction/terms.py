@@ -1,172 +1,325 @@
-"""Offline: a structure as its reduction sees it, where it is looked at, and how a reduced model is judged."""
+"""A structure as its reduction sees it, and the states at which the reduced model is tested."""
 
 import itertools
+from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from fe.full.factorisation import Factorisation
-from fe.runtime.arrays import FloatArray
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.structure.affine import AffineStructure, affine_sum
 
 MOST_GRID_REGIONS = 3
-"""Regions up to which the states that are looked at form a full grid; with more, they are chosen."""
+"""Up to this number of damage regions the tested states form a full grid; beyond it they are
+chosen."""
 State = tuple[float, ...]
-"""Parameters and losses."""
-ModalState = tuple[FloatArray, FloatArray]
-"""Coefficients of the stiffness terms (T,) and of the mass terms (1 + P,)."""
+"""Values of the parameters, then the losses of the damage regions."""
 
 LEAST_COSINE = 1e-3
-"""A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
-nothing of the structure sees it there."""
-UNSEEN_SHARE = 0.1
-"""Where another load is seen, one that is not is judged by this part of what that does, each at its most."""
-SAMPLED_INSIDE = 10
-"""States inside the box at which the modes are refined."""
-CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
-"""States inside the box on the training set, beside corners; of more regions than a grid would take."""
+"""An output is compared with at least this fraction of the largest output that a load of the same
+energy could cause."""
+UNSEEN_FRACTION = 0.1
+"""A load that no output sees is judged by this fraction of the largest output of the other
+loads, each at its largest coefficient."""
+INNER_MODAL_STATES = 10
+"""States inside the box at which the working basis of the modes is refined."""
+INNER_TRAINING_STATES = 128
+"""States inside the box on the training set, beside its corners."""
+INNER_TRAINING_STATES_MANY_REGIONS = 1024
+"""The same with more than `MOST_GRID_REGIONS` regions."""
+MOST_MASS_CORNERS = 64
+"""Corners of the box of masses at which modes are compressed."""
 
 
-def loss_at(ends: FloatArray, share: FloatArray) -> FloatArray:
-    """Return losses at shares of their ranges (K, 2) or (2,), by equal ratios of what is kept."""
-    low, high = ends.T
-    return np.asarray(1.0 - (1.0 - low) * ((1.0 - high) / (1.0 - low)) ** share)
+class ModalState(NamedTuple):
+    """The coefficients that decide the modes.
+
+    Attributes
+    ----------
+    stiffness : (T,) array
+        Coefficients of the stiffness terms.
+    mass : (1 + P,) array
+        Coefficients of the mass terms: one, then the free masses [kg].
+    """
+
+    stiffness: FloatArray
+    mass: FloatArray
 
 
-def halton(dimensions: int, count: int) -> FloatArray:
-    """Return the first points (N, D) of the Halton sequence."""
-    from scipy.stats import qmc  # takes a second to load, and who has the reduced model needs no points
+def loss_at(ranges: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Return losses at fractions of their ranges, in equal ratios of the remaining stiffness.
+
+    Parameters
+    ----------
+    ranges : (K, 2) or (2,) array
+        Least and largest loss.
+    fraction : array
+        Fractions of the ranges, 0 to 1, that broadcast against (K,).
+    """
+    low, high = ranges.T
+    return np.asarray(1.0 - (1.0 - low) * ((1.0 - high) / (1.0 - low)) ** fraction)
+
+
+def halton_points(dimensions: int, count: int) -> FloatArray:
+    """Return the first points (count, dimensions) of the Halton sequence."""
+    # SciPy's module takes a second to load, and a cached reduced model does not need it.
+    from scipy.stats import qmc
 
     return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))
 
 
-def corners(dimensions: int) -> FloatArray:
-    """Return corners (N, D) of a unit cube: all up to four dimensions, of more those on one edge with two.
+def cube_corners(dimensions: int) -> FloatArray:
+    """Return corners (N, dimensions) of a unit cube.
 
-    These two are where all coordinates are 0, and 1; in the others one differs from all the others.
+    These are all corners in up to `MOST_GRID_REGIONS` dimensions. In more dimensions they are the
+    corner at 0, the corner at 1, and all corners that share an edge with one of these two.
     """
     if dimensions <= MOST_GRID_REGIONS:
         return np.array(list(itertools.product((0.0, 1.0), repeat=dimensions)))
-    alone, ends = np.eye(dimensions), np.zeros((1, dimensions))
-    return np.concatenate((ends, alone, 1.0 - alone, 1.0 - ends))
+    zero = np.zeros((1, dimensions))
+    unit_vectors = np.eye(dimensions)
+    return np.concatenate((zero, unit_vectors, 1.0 - unit_vectors, 1.0 - zero))
+
+
+def _number_from_one(names: Sequence[str], name: str | None) -> int:
+    """Return the number of a name, counted from one, or zero for no name."""
+    return 0 if name is None else 1 + names.index(name)
+
+
+def _ranges_of(structure: AffineStructure, names: Sequence[str]) -> FloatArray:
+    """Return least and largest value (N, 2) of quantities by their names."""
+    ranges = [structure.ranges[name] for name in names]
+    return np.array(ranges, dtype=np.float64).reshape(-1, 2)
 
 
 class ReductionTerms:
-    """What the reduction takes of a structure: terms merged by what they are times, the constant one last."""
+    """The terms of a structure, merged by their factors, with the constant stiffness term last.
+
+    Parameters
+    ----------
+    structure : AffineStructure
+        The full model, with n free unknowns.
+
+    Attributes
+    ----------
+    stiffness_terms : tuple of csr (n, n)
+        The T stiffness terms.
+    stiffness_factors : (T, 2) array of int
+        Parameter and damage region that each stiffness term is proportional to, counted from one;
+        zero for none.
+    loads : (n, L) array
+        The loads, without those that are zero.
+    load_factors : (L, 2) array of int
+        Control and free mass that each load is proportional to, counted from one; zero for none.
+    outputs : (n, O) array
+        Strains of the gauges, then displacement outputs.
+    groups : tuple of slice
+        The outputs that are judged by the largest among them: strains, displacements.
+    parameters, losses, masses : (P, 2), (K, 2), (M, 2) array
+        Least and largest values.
+    varied : int
+        Number of parameters and losses.
+    middle : list of float
+        Mean of the range of each parameter.
+    reference : (T,) array
+        Coefficients of the stiffness terms in the middle of all ranges.
+    splits : (K,) or (0,) array
+        Losses that separate two anchors along each region; none if there is a single anchor.
+    """
 
     def __init__(self, structure: AffineStructure) -> None:
         self.structure = structure
-        parameters, controls = list(structure.parameters), list(structure.controls)
-        masses, regions = list(structure.masses), list(structure.regions)
+        self.parameters = _ranges_of(structure, tuple(structure.parameters))
+        self.losses = _ranges_of(structure, structure.regions)
+        self.masses = _ranges_of(structure, tuple(structure.masses))
+        self.varied = len(self.parameters) + len(self.losses)
+        self._set_stiffness_terms()
+        self._set_loads()
+        self._set_outputs()
+        self._set_reference()
 
-        def number(names: list[str], name: str | None) -> int:
-            return 0 if name is None else 1 + names.index(name)
-
-        terms = [
-            (term.matrix, (number(parameters, term.parameter), number(regions, term.region)))
-            for term in structure.stiffness_terms
+    def _set_stiffness_terms(self) -> None:
+        """Set the stiffness terms with their factors; the error bound needs a constant one."""
+        parameters = tuple(self.structure.parameters)
+        regions = self.structure.regions
+        matrices = [term.matrix for term in self.structure.stiffness_terms]
+        factors = [
+            (_number_from_one(parameters, term.parameter), _number_from_one(regions, term.region))
+            for term in self.structure.stiffness_terms
         ]
-        if terms[-1][1] != (0, 0):  # the error bound has a constant term
-            terms.append((sparse.csr_array(terms[0][0].shape), (0, 0)))
-        self.stiffness_factors = np.array([factors for _, factors in terms], dtype=np.int64)
-        columns: dict[tuple[int, int], FloatArray] = {}
-        for load in structure.load_terms:
-            place = (number(controls, structure.loads[load.load]), number(masses, load.mass))
-            columns[place] = columns[place] + load.vector if place in columns else load.vector
-        columns = {place: vector for place, vector in columns.items() if vector.any()}
-        self.load_factors = np.array(list(columns), dtype=np.int64).reshape(-1, 2)
-        outputs = sparse.vstack((structure.gauge_output, structure.displacement_output)).T
-        count, gauges = outputs.shape[1], len(structure.gauges)
-        groups = (slice(0, gauges), slice(gauges, count))
-        self.stiffness_terms = tuple(matrix for matrix, _ in terms)
-        self.loads = np.stack([np.zeros(structure.unknowns), *columns.values()], axis=1)[:, 1:]
-        self.outputs = np.asarray(outputs.toarray())
-        self.groups = tuple(part for part in groups if part.stop > part.start)
-        self.parameters, self.losses, self.masses = (
-            np.array([structure.ranges[name] for name in names], dtype=np.float64).reshape(-1, 2)
-            for names in (parameters, regions, masses)
-        )
-        self.varied = len(parameters) + len(regions)
-        self.middle = [float(np.mean(ends)) for ends in self.parameters]
-        (halves,) = self.levels(0.5)
-        self.reference = self.theta((*self.middle, *halves))
-        # between two anchors along each loss; with many regions there is but one
-        self.splits = halves[: len(regions) if len(regions) <= MOST_GRID_REGIONS else 0]
+        constant = (0, 0)
+        if factors[-1] != constant:
+            matrices.append(sparse.csr_array(matrices[0].shape))
+            factors.append(constant)
+        self.stiffness_terms = tuple(matrices)
+        self.stiffness_factors: IntArray = np.array(factors, dtype=np.int64)
+
+    def _set_loads(self) -> None:
+        """Set the loads: the sum of all load terms with the same control and the same free mass."""
+        controls = tuple(self.structure.controls)
+        masses = tuple(self.structure.masses)
+        vectors: dict[tuple[int, int], FloatArray] = {}
+        for term in self.structure.load_terms:
+            control = self.structure.loads[term.load]
+            factors = (
+                _number_from_one(controls, control),
+                _number_from_one(masses, term.mass),
+            )
+            if factors in vectors:
+                vectors[factors] = vectors[factors] + term.vector
+            else:
+                vectors[factors] = term.vector
+        vectors = {factors: vector for factors, vector in vectors.items() if vector.any()}
+        self.load_factors: IntArray = np.array(list(vectors), dtype=np.int64).reshape(-1, 2)
+        # A column of zeros keeps the shape of a stack of no loads.
+        nothing = np.zeros(self.structure.unknowns)
+        self.loads: FloatArray = np.stack([nothing, *vectors.values()], axis=1)[:, 1:]
+
+    def _set_outputs(self) -> None:
+        """Set the outputs and the groups in which they are judged."""
+        rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
+        self.outputs: FloatArray = np.asarray(rows.T.toarray())
+        gauges = len(self.structure.gauges)
+        groups = (slice(0, gauges), slice(gauges, self.outputs.shape[1]))
+        self.groups = tuple(group for group in groups if group.stop > group.start)
+
+    def _set_reference(self) -> None:
+        """Set the middle of all ranges, and the losses that separate anchors."""
+        self.middle = [float(np.mean(limits)) for limits in self.parameters]
+        (middle_losses,) = self.losses_at(0.5)
+        self.reference = self.theta((*self.middle, *middle_losses))
+        regions = len(self.losses)
+        self.splits = middle_losses[: regions if regions <= MOST_GRID_REGIONS else 0]
 
     @cached_property
     def factors(self) -> Factorisation:
-        """The factorised stiffness at the reference, whose energy norm is that of the reduction."""
+        """The factorised stiffness at the reference; its energy norm is that of the reduction."""
         return Factorisation(affine_sum(self.reference, self.stiffness_terms))
 
     def theta(self, state: State) -> FloatArray:
-        """Coefficients (T,) of the stiffness terms at parameters and losses."""
-        values, count = np.array(state), len(self.parameters)
-        factor, kept = np.append(1.0, values[:count]), np.append(1.0, 1.0 - values[count:])
-        return np.asarray(factor[self.stiffness_factors[:, 0]] * kept[self.stiffness_factors[:, 1]])
+        """Return the coefficients (T,) of the stiffness terms at a state."""
+        values = np.array(state)
+        count = len(self.parameters)
+        parameter = np.append(1.0, values[:count])
+        remaining_stiffness = np.append(1.0, 1.0 - values[count:])
+        parameter_numbers, region_numbers = self.stiffness_factors.T
+        return np.asarray(parameter[parameter_numbers] * remaining_stiffness[region_numbers])
 
-    def levels(self, *shares: float) -> FloatArray:
-        """Losses (B, K) at shares of all their ranges."""
-        return loss_at(self.losses, np.array(shares)[:, np.newaxis])
+    def losses_at(self, *fractions: float) -> FloatArray:
+        """Return losses (B, K), all of them at each of B fractions of their ranges."""
+        return loss_at(self.losses, np.array(fractions)[:, np.newaxis])
 
     def anchors(self) -> list[list[FloatArray]]:
-        """Coefficients (T,) where dual solutions are wanted, at each anchor; the last loss changes first.
+        """Return, for each anchor, the coefficients (T,) at which dual solutions are wanted.
 
-        Around a single anchor for many regions they are the corners.
+        With a few regions an anchor is one state in each cell of a grid of losses, of which the
+        last changes first. With many regions the corners of the box surround a single anchor.
         """
         if not self.splits.size:
-            return [[self.theta(state) for state in self.states(corners(self.varied))]]
-        losses = itertools.product(*self.levels(0.25, 0.75).T)
-        return [[self.theta((*self.middle, *own))] for own in losses]
+            corner_states = self.states(cube_corners(self.varied))
+            return [[self.theta(state) for state in corner_states]]
+        anchors = []
+        losses_of_regions = self.losses_at(0.25, 0.75).T
+        for losses in itertools.product(*losses_of_regions):
+            state = (*self.middle, *losses)
+            anchors.append([self.theta(state)])
+        return anchors
 
-    def states(self, shares: FloatArray) -> list[State]:
-        """States at shares (B, P + K) of the ranges; a loss goes by equal ratios of what is kept."""
-        first, (low, high) = len(self.parameters), np.concatenate((self.parameters, self.losses)).T
-        places = low + (high - low) * shares
-        places[:, first:] = loss_at(self.losses, shares[:, first:])
-        return [tuple(state) for state in np.clip(places, low, high).tolist()]
+    def states(self, fractions: FloatArray) -> list[State]:
+        """Return states at fractions of the ranges.
 
-    def training(self) -> list[State]:
-        """States on which the greedy search looks for the largest bound: corners, and points between them."""
-        count = CHOSEN_STATES if len(self.losses) <= MOST_GRID_REGIONS else CHOSEN_OF_MANY
-        return self.states(np.concatenate((corners(self.varied), halton(self.varied, count))))
+        Parameters
+        ----------
+        fractions : (B, P + K) array
+            Fractions of the ranges of parameters and losses. A loss goes by equal ratios of the
+            remaining stiffness.
+        """
+        first_loss = len(self.parameters)
+        low, high = np.concatenate((self.parameters, self.losses)).T
+        values = low + (high - low) * fractions
+        values[:, first_loss:] = loss_at(self.losses, fractions[:, first_loss:])
+        return [tuple(state) for state in np.clip(values, low, high).tolist()]
 
-    def sampled_modes(self) -> list[ModalState]:
-        """Corners under least and largest masses in turns, and a few states inside."""
-        ends = corners(self.varied)
-        turns = np.add.outer(np.arange(len(ends)), np.arange(len(self.masses))) % 2
-        return self._modal_states(np.concatenate((ends, turns), axis=1), SAMPLED_INSIDE)
+    def training_states(self) -> list[State]:
+        """Return the states of the greedy search: corners of the box, and points inside it."""
+        if len(self.losses) <= MOST_GRID_REGIONS:
+            count = INNER_TRAINING_STATES
+        else:
+            count = INNER_TRAINING_STATES_MANY_REGIONS
+        fractions = (cube_corners(self.varied), halton_points(self.varied, count))
+        return self.states(np.concatenate(fractions))
 
-    def compressed_modes(self) -> list[ModalState]:
-        """Corners under all least and largest masses, at most 64 of them, and states inside."""
-        masses = list(itertools.product((0.0, 1.0), repeat=len(self.masses)))[:64]
-        ends = itertools.product(corners(self.varied), masses)
-        return self._modal_states(np.array([np.append(*pair) for pair in ends]), 4 * SAMPLED_INSIDE)
+    def refinement_states(self) -> list[ModalState]:
+        """Return the states at which the working basis of the modes is refined.
 
-    def _modal_states(self, ends: FloatArray, count: int) -> list[ModalState]:
-        """Return states at shares of all ranges and masses, and after them `count` inside."""
-        shares = np.concatenate((ends, halton(ends.shape[1], 1 + count)[1:]))
+        These are corners of the box, under least and largest masses in turn, and some states
+        inside.
+        """
+        corners = cube_corners(self.varied)
+        corner_numbers = np.arange(len(corners))
+        mass_numbers = np.arange(len(self.masses))
+        mass_fractions = np.add.outer(corner_numbers, mass_numbers) % 2
+        fractions = np.concatenate((corners, mass_fractions), axis=1)
+        return self._modal_states(fractions, INNER_MODAL_STATES)
+
+    def compression_states(self) -> list[ModalState]:
+        """Return the states whose modes the modal basis must hold.
+
+        These are corners of the box under the corners of the box of masses, and states inside.
+        """
+        all_mass_corners = itertools.product((0.0, 1.0), repeat=len(self.masses))
+        mass_corners = list(itertools.islice(all_mass_corners, MOST_MASS_CORNERS))
+        pairs = itertools.product(cube_corners(self.varied), mass_corners)
+        fractions = [np.append(corner, masses) for corner, masses in pairs]
+        return self._modal_states(np.array(fractions), 4 * INNER_MODAL_STATES)
+
+    def _modal_states(self, fractions: FloatArray, inner_count: int) -> list[ModalState]:
+        """Return states at fractions of all ranges and masses, then `inner_count` states inside."""
+        inner_fractions = halton_points(fractions.shape[1], 1 + inner_count)[1:]
+        fractions = np.concatenate((fractions, inner_fractions))
         low, high = self.masses.T
-        masses = low + (high - low) * shares[:, self.varied :]
+        masses = low + (high - low) * fractions[:, self.varied :]
+        states = self.states(fractions[:, : self.varied])
         return [
-            (self.theta(state), np.append(1.0, chosen))
-            for state, chosen in zip(self.states(shares[:, : self.varied]), masses, strict=True)
+            ModalState(self.theta(state), np.append(1.0, kilograms))
+            for state, kilograms in zip(states, masses, strict=True)
         ]
 
-    def least(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:
-        """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`.
+    def least_outputs(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:
+        """Return the outputs below which a load counts as unseen, see `LEAST_COSINE`.
 
-        Loads (n, L) and outputs (n, O) are those of the structure, whitened by `factors`.
+        Parameters
+        ----------
+        loads : (n, L) array
+            The loads, whitened by `factors`.
+        outputs : (n, O) array
+            The outputs, whitened by `factors`.
+
+        Returns
+        -------
+        (G, L) array
+            The least output of each group and load.
         """
-        controls, masses = (
-            np.abs([(1.0, 1.0), *(self.structure.ranges[name] for name in names)]).max(axis=1)
-            for names in (self.structure.controls, self.structure.masses)
-        )
-        largest = controls[self.load_factors[:, 0]] * masses[self.load_factors[:, 1]]  # coefficients
-        seen, found = np.abs(outputs.T @ loads), []
-        for part in self.groups:
-            most = np.linalg.norm(outputs[:, part], axis=0).max() * np.linalg.norm(loads, axis=0)
-            least, size = LEAST_COSINE * most, seen[part].max(axis=0)
-            of_others = UNSEEN_SHARE * (size * largest).max() / largest
-            found.append(np.where(size < least, np.maximum(least, of_others), least))
-        return np.array(found)
+        coefficients = self._largest_load_coefficients()
+        responses = np.abs(outputs.T @ loads)
+        least = []
+        for group in self.groups:
+            largest_output = np.linalg.norm(outputs[:, group], axis=0).max()
+            floor = LEAST_COSINE * (largest_output * np.linalg.norm(loads, axis=0))
+            largest_response = responses[group].max(axis=0)
+            largest_of_all = (largest_response * coefficients).max()
+            floor_of_unseen = np.maximum(floor, UNSEEN_FRACTION * largest_of_all / coefficients)
+            least.append(np.where(largest_response < floor, floor_of_unseen, floor))
+        return np.array(least)
+
+    def _largest_load_coefficients(self) -> FloatArray:
+        """Return the largest coefficient (L,) of each load in the ranges of controls and masses."""
+        constant = (1.0, 1.0)
+        control_ranges = _ranges_of(self.structure, tuple(self.structure.controls))
+        controls = np.abs([constant, *control_ranges]).max(axis=1)
+        masses = np.abs([constant, *self.masses]).max(axis=1)
+        control_numbers, mass_numbers = self.load_factors.T
+        return np.asarray(controls[control_numbers] * masses[mass_numbers])

@@ -1,13 +1,13 @@
 """A structure as affine operators with names: sums of a few matrices and vectors.
 
-K = sum of p (1 - z) K_pz over the pairs of a parameter p (or none) and a damage region z (or none), M = M_0 +
-sum of m M_m over the free point masses, and loads f = sum of u (f_l0 + sum of m f_lm) with the controls u,
-where acceleration fields act on the free masses too.
+K = sum of p (1 - z) K_pz over the pairs of a parameter p (or none) and a damage region z (or none),
+M = M_0 + sum of m M_m over the free point masses, and loads f = sum of u (f_l0 + sum of m f_lm) with
+the controls u, where acceleration fields act on the free masses, too.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,9 +15,9 @@ from scipy import sparse
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
-from fe.runtime.errors import InvalidDesignError, InvalidStateError, SolutionError
+from fe.runtime.errors import InvalidStateError, SolutionError
 from fe.runtime.state import losses_of
-from fe.sentences import said
+from reporting.words import comma_list
 
 from .tables import StructureDesign
 
@@ -29,14 +29,14 @@ No name in a structure file has a dot.
 """
 
 
-def affine_sum(coefficients: ArrayLike, terms: tuple[Any, ...]) -> Any:
-    """Return the sparse matrix sum of `coefficients` times `terms`."""
-    first, *others = (factor * term for factor, term in zip(np.asarray(coefficients), terms, strict=True))
-    return sum(others, first).tocsr()
+def affine_sum(coefficients: ArrayLike, terms: Sequence[sparse.csr_array]) -> sparse.csr_array:
+    """Return the sum of sparse matrices times coefficients (T,)."""
+    products = [factor * term for factor, term in zip(np.asarray(coefficients), terms, strict=True)]
+    return sum(products[1:], products[0]).tocsr()
 
 
 class StiffnessTerm(NamedTuple):
-    """Stiffness (n, n) [N/m] that is proportional to a parameter and to what a region has kept."""
+    """Stiffness (n, n) [N/m] that is proportional to a parameter, and to one minus a region's loss."""
 
     matrix: sparse.csr_array
     parameter: str | None = None
@@ -51,6 +51,32 @@ class LoadTerm(NamedTuple):
     mass: str | None = None
 
 
+class SystemMatrices(NamedTuple):
+    """A structure at certain values.
+
+    Attributes
+    ----------
+    stiffness : csr (n, n)
+        Stiffness [N/m].
+    mass : csr (n, n)
+        Mass [kg].
+    load : (n,) array
+        The sum of all loads [N].
+    """
+
+    stiffness: sparse.csr_array
+    mass: sparse.csr_array
+    load: FloatArray
+
+
+class SplitValues(NamedTuple):
+    """Values by name, split by what they are of."""
+
+    parameters: dict[str, float]
+    losses: dict[str, float]
+    masses: dict[str, float]
+
+
 @dataclass(frozen=True)
 class AffineStructure:
     """Affine model of a structure on its n free unknowns.
@@ -58,33 +84,34 @@ class AffineStructure:
     Attributes
     ----------
     design : StructureDesign
-        What was asked for.
+        The design.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
     control_units : dict of str to str
         Unit of each control.
     ranges : dict of str to (float, float)
-        Least and largest value for which a reduced model is to hold, of these and of the losses, by name.
+        Least and largest value for which a reduced model is to hold, of parameters, losses, free
+        masses and controls, by name.
     regions : tuple of str
         Names of the damage regions.
     stiffness_terms : tuple of StiffnessTerm
         One for each pair of parameter and region that occurs; springs are with the pair of none.
     mass_terms : tuple of csr (n, n)
-        Structure with its fixed point masses [kg]; then 1 kg at each free point mass [1].
+        The structure with its fixed point masses [kg]; then 1 kg at each free point mass [1].
     loads : dict of str to str or None
-        The control that each load is times, None for a constant one.
+        The control that each load is proportional to, None for a constant load.
     load_terms : tuple of LoadTerm
-        What they are made of.
+        The parts of the loads.
     gauges, displacements, accelerations : tuple of str
         Names of the outputs.
     ports : tuple of str
         Names of the ports where a force that the model lacks may act.
-    gauge_output : csr (gauges, n) 1/m
-        Strain of each gauge, positive in tension.
-    displacement_output, acceleration_output : csr (m, n) 1
-        Rows that give a displacement, or with second derivatives an acceleration.
-    port_output : csr (ports, n) 1
-        Rows that give the displacement of a port; transposed, a force of 1 N there.
+    gauge_output : csr (gauges, n)
+        Strain of each gauge, positive in tension [1/m].
+    displacement_output, acceleration_output : csr (m, n)
+        Rows that give a displacement, or with second derivatives an acceleration [1].
+    port_output : csr (ports, n)
+        Rows that give the displacement of a port [1]; transposed, a force of 1 N there.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
     design_hash : str
@@ -124,7 +151,7 @@ class AffineStructure:
     def theta(
         self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()
     ) -> FloatArray:
-        """Coefficients of the stiffness terms.
+        """Return the coefficients (T,) of the stiffness terms.
 
         Parameters
         ----------
@@ -133,33 +160,47 @@ class AffineStructure:
         stiffness_loss : mapping of str to float, or iterable of float
             Stiffness losses of the regions, see `fe.runtime.state.losses_of`.
         """
-        factor = _updated(self.parameters, parameters, "parameter")
-        lost = {None: 0.0} | dict(zip(self.regions, losses_of(stiffness_loss, self.regions), strict=True))
-        return np.array([factor[term.parameter] * (1.0 - lost[term.region]) for term in self.stiffness_terms])
+        factors = _changed_factors(self.parameters, parameters, "parameter")
+        losses = losses_of(stiffness_loss, self.regions)
+        loss_of_region = {None: 0.0} | dict(zip(self.regions, losses, strict=True))
+        return np.array(
+            [factors[term.parameter] * (1.0 - loss_of_region[term.region]) for term in self.stiffness_terms]
+        )
 
     def stiffness(
         self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()
     ) -> sparse.csr_array:
-        """Stiffness (n, n) [N/m], see `theta`."""
+        """Return the stiffness (n, n) [N/m]; parameters are those of `theta`."""
         terms = tuple(term.matrix for term in self.stiffness_terms)
         return affine_sum(self.theta(parameters, stiffness_loss), terms)
 
     def mass(self, masses: Values | None = None) -> sparse.csr_array:
-        """Mass (n, n) [kg]; `masses` [kg] are those free ones that differ from their nominal values."""
-        return affine_sum([*_updated(self.masses, masses, "free mass").values()], self.mass_terms)
+        """Return the mass (n, n) [kg].
+
+        Parameters
+        ----------
+        masses : mapping of str to float, optional
+            Free masses that differ from their nominal values [kg].
+        """
+        factors = _changed_factors(self.masses, masses, "free mass")
+        return affine_sum([*factors.values()], self.mass_terms)
 
     def control_value_alone(self, load: str) -> float:
-        """Return the value of its control at which a load is looked at alone.
+        """Return the value of a load's control at which the load is examined alone.
 
-        That is the nominal value, or one unit where the nominal value is zero, at which there is no load; one
-        for a constant load.
+        That is the nominal value, or one if the nominal value is zero, at which there is no load. It
+        is one for a constant load.
         """
-        control = self.loads[load]
-        nominal = 1.0 if control is None else self.controls[control]
+        nominal = self._nominal_control(load)
         return 1.0 if nominal == 0.0 else nominal
 
+    def _nominal_control(self, load: str) -> float:
+        """Return the nominal value of the control of a load, one for a constant load."""
+        control = self.loads[load]
+        return 1.0 if control is None else self.controls[control]
+
     def load(self, name: str, value: float | None = None, masses: Values | None = None) -> FloatArray:
-        """Load (n,) [N].
+        """Return a load (n,) [N].
 
         Parameters
         ----------
@@ -168,130 +209,92 @@ class AffineStructure:
         value : float, optional
             Value of its control; nominal by default, and one for a constant load.
         masses : mapping of str to float, optional
-            As of `mass`.
+            Free masses that differ from their nominal values [kg].
         """
-        control = self.loads[name]
-        factor = (1.0 if control is None else self.controls[control]) if value is None else value
-        kilograms = _updated(self.masses, masses, "free mass")
-        parts = (factor * kilograms[term.mass] * term.vector for term in self.load_terms if term.load == name)
-        return sum(parts, np.zeros(self.unknowns))
+        control_value = self._nominal_control(name) if value is None else value
+        kilograms = _changed_factors(self.masses, masses, "free mass")
+        total: FloatArray = np.zeros(self.unknowns)
+        for term in self.load_terms:
+            if term.load == name:
+                total = total + control_value * kilograms[term.mass] * term.vector
+        return total
 
-    def at(self, values: Values) -> tuple[sparse.csr_array, sparse.csr_array, FloatArray]:
-        """Stiffness [N/m], mass [kg] and the sum of all loads [N] at values by name.
+    def system_at(self, values: Values) -> SystemMatrices:
+        """Return stiffness, mass and the sum of all loads at values by name.
 
         Parameters
         ----------
         values : mapping of str to float
-            Parameters, losses, free masses and controls; what is left out is nominal, and healthy.
+            Parameters, losses, free masses and controls; the others are nominal, and healthy.
         """
-        parameters, losses, masses = self.parted(values)
-        loads = (self.load(name, values.get(control or ""), masses) for name, control in self.loads.items())
-        return self.stiffness(parameters, losses), self.mass(masses), sum(loads, np.zeros(self.unknowns))
+        chosen = self.split_values(values)
+        total_load: FloatArray = np.zeros(self.unknowns)
+        for name, control in self.loads.items():
+            control_value = None if control is None else values.get(control)
+            total_load = total_load + self.load(name, control_value, chosen.masses)
+        return SystemMatrices(
+            stiffness=self.stiffness(chosen.parameters, chosen.losses),
+            mass=self.mass(chosen.masses),
+            load=total_load,
+        )
 
-    def parted(self, values: Values) -> tuple[dict[str, float], ...]:
+    def split_values(self, values: Values) -> SplitValues:
         """Return the parameters, the losses and the free masses among values by name."""
-        kinds = (self.parameters, self.regions, self.masses)
-        return tuple({name: values[name] for name in names if name in values} for names in kinds)
+
+        def among(names: Iterable[str]) -> dict[str, float]:
+            return {name: values[name] for name in names if name in values}
+
+        return SplitValues(among(self.parameters), among(self.regions), among(self.masses))
 
     def pushed_at_ports(self) -> "AffineStructure":
         """Return the structure with a force [N] and a displacement [m] at each port, named `port.NAME`.
 
-        The force is a control whose nominal value is zero, so that it acts only where something asks for it.
+        The force is a control whose nominal value is zero: it acts only where something asks for it.
         """
         names = tuple(f"{PORT_PREFIX}{port}" for port in self.ports)
-        forces = zip(names, self.port_output.toarray(), strict=True)
+        unit_forces = self.port_output.toarray()
+        port_loads = [LoadTerm(name, force) for name, force in zip(names, unit_forces, strict=True)]
         return replace(
             self,
             controls=self.controls | dict.fromkeys(names, 0.0),
             control_units=self.control_units | dict.fromkeys(names, "N"),
             ranges=self.ranges | dict.fromkeys(names, (-1.0, 1.0)),
             loads=self.loads | dict(zip(names, names, strict=True)),
-            load_terms=(*self.load_terms, *(LoadTerm(name, vector) for name, vector in forces)),
+            load_terms=(*self.load_terms, *port_loads),
             displacements=(*self.displacements, *names),
             displacement_output=sparse.vstack((self.displacement_output, self.port_output), format="csr"),
         )
 
     def full_displacement(self, free: FloatArray) -> FloatArray:
-        """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
+        """Return the displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
         return np.asarray(self.expansion @ free).reshape(-1, 3)
 
 
-def designed(
-    design: StructureDesign,
-    expansion: sparse.csr_array,
-    mass: sparse.csr_array,
-    point_masses: Iterable[sparse.csr_array],
-    loads: Iterable[FloatArray],
-    outputs: Mapping[str, sparse.csr_array],
-) -> dict[str, Any]:
-    """Return fields of the affine model of a structure file, all but the stiffness terms and the hash.
+def _changed_factors(nominal: dict[str, float], changed: Values | None, kind: str) -> dict[str | None, float]:
+    """Return the factors of terms by name: one for None, then nominal values or changed ones.
 
     Parameters
     ----------
-    design : StructureDesign
-        What was asked for.
-    expansion : csr (full, n)
-        Free unknowns to all unknowns.
-    mass : csr (full, full) kg
-        Mass without point masses.
-    point_masses : iterable of csr (full, full) 1
-        Mass of 1 kg at each of the point masses of the design.
-    loads : iterable of (full,)
-        Of each of its loads the forces [N], or the field [m/s^2] of an acceleration, which acts on the free
-        masses, too.
-    outputs : mapping of str to csr (m, full)
-        Rows of the tables `gauge`, `displacement`, `acceleration` and `port`.
+    nominal : dict of str to float
+        Nominal values.
+    changed : mapping of str to float, optional
+        Values that differ.
+    kind : str
+        What the values are of, for sentences.
 
     Raises
     ------
-    InvalidDesignError
-        If a port lies where nothing can move.
+    InvalidStateError
+        If a changed value has a name that the structure does not have.
     """
-    restriction = expansion.T.tocsr()
-    masses: dict[str | None, sparse.csr_array] = {None: mass}
-    for part, matrix in zip(design.mass, point_masses, strict=True):
-        if part.free:
-            masses[part.name] = matrix
-        else:
-            masses[None] = masses[None] + part.mass * matrix
-    terms = []
-    for load, vector in zip(design.load, loads, strict=True):
-        if load.acceleration is None:
-            terms.append(LoadTerm(load.name, restriction @ vector))
-        else:
-            terms += [LoadTerm(load.name, restriction @ (own @ vector), name) for name, own in masses.items()]
-    rows_on_free = {key: (rows @ expansion).tocsr() for key, rows in outputs.items()}
-    for (where, port), row in zip(design.numbered("port"), rows_on_free["port"].toarray(), strict=True):
-        if not row.any():
-            raise InvalidDesignError(said("structure.held_port", where=where, port=port))
-    return {
-        "design": design,
-        "parameters": {part.name: part.nominal for part in design.parameter},
-        "masses": {part.name: part.mass for part in design.mass if part.free},
-        "controls": {part.name: part.nominal for part in design.control},
-        "control_units": {part.name: part.unit for part in design.control},
-        "ranges": design.ranges,
-        "regions": tuple(part.name for part in design.damage),
-        "mass_terms": tuple((restriction @ (own @ expansion)).tocsr() for own in masses.values()),
-        "loads": {part.name: part.control for part in design.load},
-        "load_terms": tuple(terms),
-        "gauges": tuple(part.name for part in design.gauge),
-        "displacements": tuple(part.name for part in design.displacement),
-        "accelerations": tuple(part.name for part in design.acceleration),
-        "ports": tuple(part.name for part in design.port),
-        **{f"{key}_output": rows for key, rows in rows_on_free.items()},
-        "expansion": expansion,
-    }
-
-
-def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> dict[str | None, float]:
-    """Return the factors of terms by what they are times: of nothing one, then values by name."""
-    unknown = set(changed or {}) - set(nominal)
-    if unknown:
-        known = ", ".join(nominal) or "none"
-        raise InvalidStateError(said("structure.unknown", what=what, name=min(unknown), known=known))
+    changes = dict(changed or {})
+    unknown_names = set(changes) - set(nominal)
+    if unknown_names:
+        raise InvalidStateError(
+            f"The structure has no {kind} named {min(unknown_names)!r}; there are {comma_list(nominal)}."
+        )
     factors: dict[str | None, float] = {None: 1.0}
-    factors.update(nominal | dict(changed or {}))
+    factors.update(nominal | changes)
     return factors
 
 
@@ -301,14 +304,14 @@ class StaticResponse:
 
     Attributes
     ----------
-    displacement : (n,) m
-        Free unknowns.
+    displacement : (n,) array
+        Free unknowns [m].
     largest : float
         Largest displacement of a node [m].
-    strain : (gauges,)
+    strain : (gauges,) array
         Strain at the gauges, positive in tension.
-    output : (displacements,) m
-        Displacement outputs.
+    output : (displacements,) array
+        Displacement outputs [m].
     """
 
     displacement: FloatArray
@@ -318,7 +321,17 @@ class StaticResponse:
 
 
 def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
-    """Solve for each load alone, the structure undamaged, its control as of `control_value_alone`.
+    """Solve for each load alone, the structure undamaged, with the value of `control_value_alone`.
+
+    Parameters
+    ----------
+    structure : AffineStructure
+        The structure.
+
+    Returns
+    -------
+    dict of str to StaticResponse
+        The response to each load by the load's name.
 
     Raises
     ------
@@ -328,28 +341,41 @@ def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
     if not structure.loads:
         return {}
     factors = Factorisation(structure.stiffness())
-    values = {name: structure.control_value_alone(name) for name in structure.loads}
-    loads = np.column_stack([structure.load(name, value) for name, value in values.items()])
-    fields = factors.solve(loads)
-    return {name: _response(structure, field) for name, field in zip(structure.loads, fields.T, strict=True)}
+    loads = np.column_stack(
+        [structure.load(name, structure.control_value_alone(name)) for name in structure.loads]
+    )
+    solutions = factors.solve(loads)
+    return {
+        name: _static_response(structure, solution)
+        for name, solution in zip(structure.loads, solutions.T, strict=True)
+    }
 
 
 def static_response(structure: AffineStructure, values: Mapping[str, float]) -> StaticResponse:
-    """Solve for all loads together at values by name; what is left out is nominal, and healthy.
+    """Solve for all loads together.
+
+    Parameters
+    ----------
+    structure : AffineStructure
+        The structure.
+    values : mapping of str to float
+        Parameters, losses, free masses and controls; the others are nominal, and healthy.
 
     Raises
     ------
     SolutionError
-        As of `static_responses`.
+        If the stiffness cannot be factorised, or the solution is not accurate.
     """
-    stiffness, _, load = structure.at(values)
-    return _response(structure, Factorisation(stiffness).solve(load))
+    system = structure.system_at(values)
+    return _static_response(structure, Factorisation(system.stiffness).solve(system.load))
 
 
-def _response(structure: AffineStructure, displacement: FloatArray) -> StaticResponse:
+def _static_response(structure: AffineStructure, displacement: FloatArray) -> StaticResponse:
+    """Return the response with free unknowns (n,)."""
+    nodal_displacement = structure.full_displacement(displacement)
     return StaticResponse(
         displacement=displacement,
-        largest=float(np.linalg.norm(structure.full_displacement(displacement), axis=1).max()),
+        largest=float(np.linalg.norm(nodal_displacement, axis=1).max()),
         strain=np.asarray(structure.gauge_output @ displacement),
         output=np.asarray(structure.displacement_output @ displacement),
     )
@@ -361,21 +387,40 @@ def natural_frequencies(
     values: Mapping[str, float] | None = None,
     factors: Factorisation | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Lowest frequencies (m,) [Hz], rising, and mass-normalised shapes (n, m), undamped; see `at` for values.
+    """Return the lowest natural frequencies and mode shapes, undamped.
 
-    Who has the factorised stiffness at these values may give it.
+    Parameters
+    ----------
+    structure : AffineStructure
+        The structure.
+    count : int
+        The number of modes.
+    values : mapping of str to float, optional
+        Parameters, losses and free masses; the others are nominal, and healthy.
+    factors : Factorisation, optional
+        The factorised stiffness at these values, if it is at hand.
+
+    Returns
+    -------
+    frequencies : (count,) array
+        Natural frequencies [Hz], ascending.
+    shapes : (n, count) array
+        Mass-normalised shapes.
 
     Raises
     ------
     SolutionError
         If there is no mass, there are not so many modes, or the iteration did not converge.
     """
-    if count not in range(1, structure.unknowns):
-        most = structure.unknowns - 1
-        raise SolutionError(said("structure.modes", count=count, unknowns=structure.unknowns, most=most))
-    stiffness, mass, _ = structure.at(values or {})
-    if not mass.diagonal().any():
+    most = structure.unknowns - 1
+    if not 1 <= count <= most:
+        raise SolutionError(
+            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives 1 to "
+            f"{most}."
+        )
+    system = structure.system_at(values or {})
+    if not system.mass.diagonal().any():
         raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")
-    squares, shapes = lowest_eigenpairs(factors or stiffness, mass, count)
-    shapes = shapes / np.sqrt(np.einsum("im,im->m", shapes, mass @ shapes))
-    return np.sqrt(squares) / (2.0 * np.pi), shapes
+    squares, shapes = lowest_eigenpairs(factors or system.stiffness, system.mass, count)
+    modal_masses = np.einsum("im,im->m", shapes, system.mass @ shapes)
+    return np.sqrt(squares) / (2.0 * np.pi), shapes / np.sqrt(modal_masses)

@@ -16,7 +16,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fe.elements.cells import axes_of
+from fe.elements.elasticity import axes_of
 from fe.elements.kinds import DECK_KINDS, ElementKind
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError

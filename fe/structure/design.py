@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from fe.elements.cells import axes_of, isotropic_compliance, orthotropic_compliance, rotate_elasticity
+from fe.elements.elasticity import axes_of, isotropic_compliance, orthotropic_compliance, rotate_elasticity
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS

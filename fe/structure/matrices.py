@@ -1,314 +1,315 @@
-"""From matrices and a structure file to affine operators, and what is said of matrices that are no structure.
+"""From matrices and a structure file to affine operators; matrices that are no structure's are refused.
 
-Matrices are turned into SI units as they are read: stiffness in N/m, mass in kg, unknowns in metres (turns
-times the unit of length). A row that reads a displacement is then, transposed, a force of 1 N there.
+Matrices are converted to SI units as they are read: stiffness in N/m, mass in kg, unknowns in metres
+(turns times the unit of length). A row that reads a displacement is then, transposed, a force of 1 N
+there.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy import sparse
 
-from fe.elements.cells import unit_vector
+from fe.elements.elasticity import unit_vector
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
-from fe.sentences import said
 
-from .affine import AffineStructure, StiffnessTerm, designed
-from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass
-from .mesh_file import Place, read_matrix, read_unknowns, read_vector
-from .tables import MOTIONS, Vector
-
-Shares = Mapping[int, tuple[float, ...]]
-
-READ: Shares = {
-    1: (1.0,), 2: (0.5,) * 2, 3: (1 / 6, 2 / 3, 1 / 6), 4: (0.25,) * 4, 8: (0.25,) * 4 + (0.0,) * 4,
-}  # fmt: skip
-"""Shares of the rows that carry one name in its displacement: CalculiX expands a node of a shell into two or
-three through the thickness and one of a beam into four or eight (found by what version 2.20 prints)."""
-PUSHED: Shares = {**READ, 3: (-0.5, 2.0, -0.5)}
-"""Shares of these rows in a force on the node, as CalculiX shares it."""
+from .affine import AffineStructure, StiffnessTerm
+from .affine_fields import AffineFields, OutputRows, affine_fields
+from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput, StiffnessPart
+from .matrix_files import FORCE_WEIGHTS, READ_WEIGHTS, MatrixFiles, place_in_words
+from .mesh_file import Place, read_matrix, read_unknowns
+from .tables import MOTIONS
 
 _ROUNDING = 1e-12
-"""Entries of a difference of matrices below this share of the diagonal are rounding."""
-_UNSYMMETRIC = 1e-9
+"""Entries of a difference of matrices below this fraction of the diagonal are rounding."""
 _INDEFINITE = 1e-3
-"""How far below zero, as a share of the whole, a part may come: matrices in files are rounded."""
+"""Fraction of the whole by which a part may be negative: matrices in files are rounded."""
 _FREE = 1e-10
-"""A motion with less stiffness than this share of its diagonal is free."""
-_MOST_FREE = 7  # motions that are looked at
-
-
-def _named(place: Place) -> str:
-    return f"node {place[0]}, component {place[1]}"
-
-
-@dataclass(frozen=True)
-class Matrices:
-    """Matrices and vectors by name, and node and component of each of their n rows.
-
-    Attributes
-    ----------
-    folder : Path
-        Where the files are.
-    places : list of (int, int)
-        Node and component of each row.
-    unit : float
-        Metres in the unit of length of the matrices.
-    """
-
-    folder: Path
-    places: list[Place]
-    unit: float
-
-    @cached_property
-    def rows(self) -> dict[Place, list[int]]:
-        """Rows of each node's component."""
-        found: dict[Place, list[int]] = {}
-        for row, place in enumerate(self.places):
-            found.setdefault(place, []).append(row)
-        return found
-
-    def rows_of(self, place: Place, where: str) -> list[int]:
-        """Rows of a node's component; raises `MeshError` where the matrices have none."""
-        if place not in self.rows:
-            node, component = place
-            own = ", ".join(str(other) for number, other in sorted(self.rows) if number == node)
-            known = f"its components {own}" if own else "no such node"
-            raise MeshError(
-                said("matrices.component", where=where, node=node, component=component, known=known)
-            )
-        return self.rows[place]
-
-    def at(self, place: Place, where: str, shares: Shares = READ) -> FloatArray:
-        """Vector (n,) of 1 at a node's component, shared among the rows of that name.
-
-        Raises
-        ------
-        MeshError
-            If the matrices have no such row, or so many that it is not known how they share.
-        """
-        own, found = self.rows_of(place, where), np.zeros(len(self.places))
-        if len(own) not in shares:
-            raise MeshError(said("matrices.rows", where=where, place=place, count=len(own)))
-        found[own] = shares[len(own)]
-        return found
-
-    def along(self, node: int, direction: Vector, where: str, shares: Shares = READ) -> FloatArray:
-        """Vector (n,) of a direction (3,) at a node."""
-        parts = [x * self.at((node, axis), where, shares) for axis, x in enumerate(direction, start=1) if x]
-        return np.asarray(np.sum(parts, axis=0))
-
-    def everywhere(self, field: Vector, where: str) -> FloatArray:
-        """Vector (n,) of a shift of all nodes; raises `MeshError` where turns may look like shifts."""
-        if len(self.rows) < len(self.places):
-            raise MeshError(said("matrices.turns", where=where))
-        return np.array([[*field, 0.0, 0.0, 0.0][component - 1] for _, component in self.places])
-
-    def vector(self, name: str, where: str, shares: Shares = READ) -> FloatArray:
-        """Vector (n,) of a file."""
-        return read_vector(self.folder, name, lambda place: self.at(place, where, shares), len(self.places))
-
-    def matrix(self, name: str, where: str, *, partial: bool = False) -> sparse.csr_array:
-        """Return the symmetric matrix (n, n) of a file [N/m or kg], its rows in the order of the places.
-
-        A `partial` one may end before them, as a table does whose last rows are zero.
-
-        Raises
-        ------
-        MeshError
-            If it cannot be read, has other rows, is not finite or not symmetric.
-        """
-        matrix, own = read_matrix(self.folder, name)
-        size, place = len(self.places), f"{where}: {self.folder / name}"
-        if own is not None:
-            chosen = [self.rows_of(each, place)[0] for each in own]
-            placed = sparse.eye_array(size, format="csc")[:, chosen].tocsr()
-            matrix = (placed @ matrix @ placed.T).tocsr()
-        if partial and matrix.shape[0] < size:
-            matrix.resize((size, size))
-        if matrix.shape[0] != size:
-            raise MeshError(said("matrices.size", where=place, rows=matrix.shape[0], size=size))
-        largest = abs(matrix).max() if matrix.nnz else 0.0
-        if not np.isfinite(largest):
-            raise MeshError(f"{place} holds a number that is not finite.")
-        skew = abs(matrix - matrix.T).tocoo()
-        if skew.nnz and skew.max() > _UNSYMMETRIC * largest:
-            worst = int(skew.data.argmax())
-            both = [_named(self.places[int(axis[worst])]) for axis in skew.coords]
-            raise MeshError(said("matrices.skew", where=place, both=both, apart=skew.data[worst]))
-        return sparse.csr_array(0.5 * (matrix + matrix.T) / self.unit)
+"""A motion with less stiffness than this fraction of its diagonal is free."""
+_MOST_FREE_MOTIONS = 7
+"""Free motions that are counted at most."""
 
 
 def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> AffineStructure:
     """Make the affine operators of a structure from matrices.
 
+    Parameters
+    ----------
+    design : MatrixDesign
+        The design.
+    folder : Path
+        The folder of its files.
+    design_hash : str
+        Its hash.
+
     Raises
     ------
     MeshError
-        If a file cannot be read, does not fit the others, lacks what the design names, or is no structure's:
-        unsymmetric, indefinite, not held, or with mass that nothing holds.
+        If a file cannot be read, does not fit the others, lacks what the design names, or is not of a
+        structure: unsymmetric, indefinite, not held, or with mass that nothing holds.
     """
-    files = Matrices(folder, _places(design, folder), design.unit)
-    stiffness, mass = (
-        sum(files.matrix(name, key) for name in getattr(design, key))
-        for key in ("stiffness_matrix", "mass_matrix")
-    )
-    moves = (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0)
-    for where, part in design.numbered("support"):
-        for node, motion in itertools.product(part.nodes, part.hold):
-            moves[files.rows_of((node, MOTIONS.index(motion) + 1), where)] = False
-    free = np.flatnonzero(moves)
+    files = MatrixFiles(folder, _places(design, folder), design.unit)
+    stiffness = sum(files.matrix(name, "stiffness_matrix") for name in design.stiffness_matrix)
+    mass = sum(files.matrix(name, "mass_matrix") for name in design.mass_matrix)
+    free = _free_rows(design, files, (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0))
     if not len(free):
         raise MeshError(f"{folder}: the matrices have no row that is free and has stiffness or mass.")
-    _check_whole(stiffness[free][:, free], mass[free][:, free], [files.places[row] for row in free])
-
-    fields = designed(
-        design,
-        sparse.eye_array(len(moves), format="csc")[:, free].tocsr(),
-        mass,
-        (_point_mass(part, files, where) for where, part in design.numbered("mass")),
-        (_load(part, files, where) for where, part in design.numbered("load")),
-        {
-            key: sparse.csr_array(np.array([*_rows(design, files, key)]).reshape(-1, len(moves)))
-            for key in ("gauge", "displacement", "acceleration", "port")
-        },
-    )
+    free_places = [files.places[row] for row in free]
+    _check_structure(stiffness[free][:, free], mass[free][:, free], free_places)
+    fields = _fields(design, files, mass, free)
+    # The expansion of the model gives displacements of nodes, not the rows of the matrices.
+    fields["expansion"] = _nodal_displacements(files)[:, free]
     return AffineStructure(
-        **fields | {"expansion": _expansion(files)[:, free]},
+        design=design,
+        **fields,
         stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free)),
         design_hash=design_hash,
     )
 
 
 def _places(design: MatrixDesign, folder: Path) -> list[Place]:
+    """Return node and component of each row: of the file of unknowns, or of the stiffness itself.
+
+    Raises
+    ------
+    MeshError
+        If a stiffness matrix does not name its rows, and no file of unknowns does.
+    """
     if design.unknowns is not None:
         return read_unknowns(folder / design.unknowns)
-    found: set[Place] = set()
+    places: set[Place] = set()
     for name in design.stiffness_matrix:
-        _, own = read_matrix(folder, name)
-        if own is None:
-            raise MeshError(said("matrices.unnamed", path=folder / name))
-        found.update(own)
-    return sorted(found)
+        _, places_in_file = read_matrix(folder, name)
+        if places_in_file is None:
+            raise MeshError(
+                f"{folder / name} does not say which node and component each row is; name a file with a line "
+                "for each row, such as `97.3`, by the key unknowns."
+            )
+        places.update(places_in_file)
+    return sorted(places)
 
 
-def _point_mass(part: MatrixMass, files: Matrices, where: str) -> sparse.csr_array:
+def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -> IntArray:
+    """Return the rows that can move (n,) and are not held by the design."""
+    is_free = can_move.copy()
+    for label, support in design.numbered("support"):
+        for node, motion in itertools.product(support.nodes, support.hold):
+            component = MOTIONS.index(motion) + 1
+            is_free[files.rows_of((node, component), label)] = False
+    return np.flatnonzero(is_free)
+
+
+def _fields(design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, free: IntArray) -> AffineFields:
+    """Return the fields of the affine model, whose expansion selects the free rows."""
+    size = len(files.places)
+    point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
+    loads = (_load(load, files, label) for label, load in design.numbered("load"))
+
+    def output_rows(key: str) -> sparse.csr_array:
+        rows = [
+            _output_row(output, files, f"{label} ({output.name})") for label, output in design.numbered(key)
+        ]
+        return sparse.csr_array(np.array(rows).reshape(-1, size))
+
+    return affine_fields(
+        design,
+        expansion=sparse.eye_array(size, format="csc")[:, free].tocsr(),
+        mass=mass,
+        point_masses=point_masses,
+        loads=loads,
+        outputs=OutputRows(
+            gauge=output_rows("gauge"),
+            displacement=output_rows("displacement"),
+            acceleration=output_rows("acceleration"),
+            port=output_rows("port"),
+        ),
+    )
+
+
+def _point_mass(part: MatrixMass, files: MatrixFiles, where: str) -> sparse.csr_array:
     """Return the mass matrix (n, n) of 1 kg."""
     if part.matrix is not None:
         return files.matrix(part.matrix, where, partial=True)
     assert part.node is not None
-    known = [axis for axis in (1, 2, 3) if (part.node, axis) in files.rows] or [1]
-    column = sparse.csr_array(np.array([files.at((part.node, axis), where) for axis in known]).T)
-    return sparse.csr_array(column @ column.T)
+    axes = [axis for axis in (1, 2, 3) if (part.node, axis) in files.rows]
+    if not axes:
+        axes = [1]  # refused by name below
+    columns = np.array([files.unit_vector_at((part.node, axis), where) for axis in axes]).T
+    selection = sparse.csr_array(columns)
+    return sparse.csr_array(selection @ selection.T)
 
 
-def _load(load: MatrixLoad, files: Matrices, where: str) -> FloatArray:
+def _load(load: MatrixLoad, files: MatrixFiles, where: str) -> FloatArray:
     """Return the vector (n,) of a load [N], or of the field of an acceleration [m/s^2]."""
     if load.acceleration is not None:
-        return files.everywhere(load.acceleration, where)
+        return files.uniform_field(load.acceleration, where)
     if load.node is not None and load.force is not None:
-        return files.along(load.node, load.force, where, PUSHED)
-    return files.vector(str(load.vector), where, PUSHED)
+        return files.direction_at(load.node, load.force, where, FORCE_WEIGHTS)
+    return files.vector(str(load.vector), where, FORCE_WEIGHTS)
 
 
-def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArray]:
-    """Yield the rows (n,) of strains [1/m], or of displacements, accelerations or ports [1]."""
-    scale = 1.0 / design.unit if key == "gauge" else 1.0
-    for place, part in design.numbered(key):
-        where = f"{place} ({part.name})"
-        if part.vector is not None:
-            yield scale * files.vector(part.vector, where)
-            continue
-        assert part.direction is not None
-        direction = tuple(unit_vector(part.direction))
-        if isinstance(part, Extension):
-            first, last = (files.along(node, direction, where) for node in part.nodes or ())
-            yield scale * (last - first) / (part.length or 1.0)
-        elif part.node is not None:
-            yield files.along(part.node, direction, where)
+def _output_row(output: Extension | NodeOutput, files: MatrixFiles, where: str) -> FloatArray:
+    """Return the row (n,) of a strain [1/m], or of a displacement, acceleration or port [1]."""
+    is_strain = isinstance(output, Extension)
+    scale = 1.0 / files.unit if is_strain else 1.0
+    if output.vector is not None:
+        return scale * files.vector(output.vector, where)
+    assert output.direction is not None
+    x, y, z = unit_vector(output.direction).tolist()
+    if isinstance(output, Extension):
+        assert output.nodes is not None
+        assert output.length is not None
+        first, last = (files.direction_at(node, (x, y, z), where) for node in output.nodes)
+        return scale * (last - first) / output.length
+    assert output.node is not None
+    return files.direction_at(output.node, (x, y, z), where)
 
 
-def _expansion(files: Matrices) -> sparse.csr_array:
-    """Return the displacements of all nodes (3 nodes, n), zero where the matrices do not tell them."""
+def _nodal_displacements(files: MatrixFiles) -> sparse.csr_array:
+    """Return the displacements of all nodes (3 nodes, n) from rows; zero for unknown components."""
     nodes = sorted({node for node, _ in files.places})
-    found = sparse.lil_array((3 * len(nodes), len(files.places)))
-    for row, place in enumerate(itertools.product(nodes, (1, 2, 3))):
-        own = files.rows.get(place, [])
-        if len(own) in READ:
-            found[row, own] = READ[len(own)]
-    return found.tocsr()
+    displacements = sparse.lil_array((3 * len(nodes), len(files.places)))
+    for number, place in enumerate(itertools.product(nodes, (1, 2, 3))):
+        rows = files.rows.get(place, [])
+        if len(rows) in READ_WEIGHTS:
+            displacements[number, rows] = READ_WEIGHTS[len(rows)]
+    return displacements.tocsr()
 
 
 def _stiffness_terms(
-    design: MatrixDesign, files: Matrices, whole: sparse.csr_array, free: IntArray
+    design: MatrixDesign, files: MatrixFiles, whole: sparse.csr_array, free: IntArray
 ) -> Iterator[StiffnessTerm]:
-    """Yield the parts, then what they leave of the whole; each at least semidefinite."""
-    rest, nominal = whole, {part.name: part.nominal for part in design.parameter}
-    for where, part in design.numbered("part"):
-        if part.changed is not None and part.times is not None:
-            own = (whole - files.matrix(part.changed, where)) / (1.0 - part.times)
-        else:
-            own = files.matrix(str(part.matrix), where, partial=True)
-        rest = rest - own
-        inside = _part_of(whole, own, free, said("matrices.softened", where=where))
-        if not inside.nnz:
-            raise MeshError(f"{where} has no stiffness: its matrix changes nothing that is free.")
-        yield StiffnessTerm(inside / nominal.get(part.scaled_by or "", 1.0), part.scaled_by, part.damage)
-    left = _part_of(whole, rest, free, said("matrices.overlap"))
-    if left.nnz:
-        yield StiffnessTerm(left)
+    """Yield the parts of the stiffness (n, n), then the remainder; each is at least semidefinite.
+
+    Raises
+    ------
+    MeshError
+        If a part has no stiffness or takes some away, or the parts are stiffer than the whole.
+    """
+    nominal = {parameter.name: parameter.nominal for parameter in design.parameter}
+    remainder = whole
+    for label, part in design.numbered("part"):
+        matrix = _part_matrix(part, files, whole, label)
+        remainder = remainder - matrix
+        free_part = _free_part(
+            whole,
+            matrix,
+            free,
+            refusal=f"{label} takes stiffness away somewhere; its file is of another run or part.",
+        )
+        if not free_part.nnz:
+            raise MeshError(f"{label} has no stiffness: its matrix changes nothing that is free.")
+        scale = nominal.get(part.scaled_by or "", 1.0)
+        yield StiffnessTerm(free_part / scale, part.scaled_by, part.damage)
+    free_remainder = _free_part(
+        whole,
+        remainder,
+        free,
+        refusal="the parts are together stiffer than the whole; two parts must not overlap.",
+    )
+    if free_remainder.nnz:
+        yield StiffnessTerm(free_remainder)
 
 
-def _part_of(
-    whole: sparse.csr_array, part: sparse.csr_array, free: IntArray, sentence: str
+def _part_matrix(
+    part: StiffnessPart, files: MatrixFiles, whole: sparse.csr_array, where: str
 ) -> sparse.csr_array:
-    """Return the free rows of a part without what is rounding of the whole; refuse an indefinite one."""
-    found, size = part.tocoo(), np.sqrt(np.abs(whole.diagonal()))
-    found.data[np.abs(found.data) <= _ROUNDING * size[found.row] * size[found.col]] = 0.0
-    inside = found.tocsr()[free][:, free]
-    inside.eliminate_zeros()
-    _check_definite(inside + _INDEFINITE * whole[free][:, free], sentence)
-    return inside
+    """Return the stiffness (n, n) of a part: of its file, or from a whole with a changed modulus."""
+    if part.changed is not None and part.times is not None:
+        changed_whole = files.matrix(part.changed, where)
+        return (whole - changed_whole) / (1.0 - part.times)
+    return files.matrix(str(part.matrix), where, partial=True)
 
 
-def _check_definite(matrix: sparse.csr_array, sentence: str) -> None:
+def _free_part(
+    whole: sparse.csr_array, part: sparse.csr_array, free: IntArray, *, refusal: str
+) -> sparse.csr_array:
+    """Return the free rows of a part without entries that are rounding of the whole.
+
+    Raises
+    ------
+    MeshError
+        If the part is indefinite; with the sentence of `refusal`.
+    """
+    entries = part.tocoo()
+    size = np.sqrt(np.abs(whole.diagonal()))
+    is_rounding = np.abs(entries.data) <= _ROUNDING * size[entries.row] * size[entries.col]
+    entries.data[is_rounding] = 0.0
+    free_part = entries.tocsr()[free][:, free]
+    free_part.eliminate_zeros()
+    _check_definite(free_part + _INDEFINITE * whole[free][:, free], refusal)
+    return free_part
+
+
+def _check_definite(matrix: sparse.csr_array, refusal: str) -> None:
+    """Raise `MeshError` with a sentence if a matrix is not positive definite."""
     try:
         Factorisation(sparse.csr_array(matrix))
     except SolutionError:
-        raise MeshError(sentence) from None
+        raise MeshError(refusal) from None
 
 
-def _check_whole(stiffness: sparse.csr_array, mass: sparse.csr_array, places: list[Place]) -> None:
-    """Refuse a stiffness that leaves motions free or is indefinite, and mass that is unheld or indefinite."""
-    diagonal, heavy = stiffness.diagonal(), mass.diagonal()
-    for bad, what in (
-        (diagonal < 0.0, "a negative stiffness on its own: the matrix is no structure's at rest"),
-        ((diagonal == 0.0) & (heavy != 0.0), "mass but no stiffness: hold it, or give it stiffness"),
-        (heavy < 0.0, "a negative mass"),
-    ):
-        if bad.any():
-            more = f" ({int(bad.sum())} rows are like it)" if bad.sum() > 1 else ""
-            raise MeshError(f"{_named(places[int(bad.argmax())])} has {what}{more}.")
+def _check_structure(stiffness: sparse.csr_array, mass: sparse.csr_array, places: list[Place]) -> None:
+    """Raise `MeshError` if the free matrices (m, m) are not those of a structure at rest.
+
+    The stiffness must leave no motion free and be positive definite. The mass must be held, and be
+    positive semidefinite.
+    """
+    stiffness_diagonal = stiffness.diagonal()
+    mass_diagonal = mass.diagonal()
+    _check_rows(
+        places,
+        stiffness_diagonal < 0.0,
+        "a negative stiffness on its own: the matrix is no structure's at rest",
+    )
+    _check_rows(
+        places,
+        (stiffness_diagonal == 0.0) & (mass_diagonal != 0.0),
+        "mass but no stiffness: hold it, or give it stiffness",
+    )
+    _check_rows(places, mass_diagonal < 0.0, "a negative mass")
     try:
         Factorisation(stiffness).solve(np.random.default_rng(16).standard_normal(len(places)))
     except SolutionError:
         _refuse_singular(stiffness, places)
-    floor = np.where(heavy > 0.0, heavy, heavy.mean() or 1.0)
-    _check_definite(mass + sparse.diags_array(1e-6 * floor), said("matrices.indefinite_mass"))
+    floor = np.where(mass_diagonal > 0.0, mass_diagonal, mass_diagonal.mean() or 1.0)
+    _check_definite(
+        mass + sparse.diags_array(1e-6 * floor),
+        "the mass matrix is indefinite: some motion of the structure has negative mass.",
+    )
+
+
+def _check_rows(places: list[Place], is_faulty: FloatArray, fault: str) -> None:
+    """Raise `MeshError` if a row (m,) is faulty; it names the first one."""
+    count = int(is_faulty.sum())
+    if not count:
+        return
+    first = place_in_words(places[int(is_faulty.argmax())])
+    further = f" ({count} rows are like it)" if count > 1 else ""
+    raise MeshError(f"{first} has {fault}{further}.")
 
 
 def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
-    """Say which motions a stiffness that cannot be solved with leaves free, or that it is indefinite."""
-    scale, identity = sparse.diags_array(1.0 / np.sqrt(stiffness.diagonal())), sparse.eye_array(len(places))
+    """Raise `MeshError` for a stiffness that cannot be solved with: indefinite, or with free motions."""
+    # unit diagonal, lifted so that free motions have the least positive eigenvalues
+    scale = sparse.diags_array(1.0 / np.sqrt(stiffness.diagonal()))
+    identity = sparse.eye_array(len(places))
     lifted = sparse.csr_array(scale @ stiffness @ scale + _INDEFINITE * identity)
-    _check_definite(lifted, said("matrices.indefinite_stiffness"))
-    values, shapes = lowest_eigenpairs(lifted, identity, min(_MOST_FREE, len(places) - 1))
-    free = int((values < _INDEFINITE + _FREE).sum())
-    moved = int(np.abs(scale @ shapes[:, 0]).argmax())
-    raise MeshError(said("matrices.free", count=free or 1, place=_named(places[moved])))
+    _check_definite(
+        lifted,
+        "the stiffness is indefinite: some motion of the structure has negative stiffness.",
+    )
+    count = min(_MOST_FREE_MOTIONS, len(places) - 1)
+    eigenvalues, shapes = lowest_eigenpairs(lifted, identity, count)
+    free_count = int((eigenvalues < _INDEFINITE + _FREE).sum())
+    lowest_shape = shapes.T[0]
+    largest = int(np.abs(scale @ lowest_shape).argmax())
+    raise MeshError(
+        f"motions that the stiffness leaves free, or nearly: {free_count or 1}; in one "
+        f"{place_in_words(places[largest])} moves most. Hold the structure by [[support]], or before its "
+        "matrices are written."
+    )

@@ -24,7 +24,7 @@ from scipy.sparse import csgraph
 
 from fe.elements.cells import BATCH, jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
-from fe.full.factorisation import analyse
+from fe.full.fronts import analyse
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from fe.sentences import said
@@ -92,7 +92,7 @@ def _check_edges(mesh: StructureMesh) -> None:
 
 
 def _check_jacobians(mesh: StructureMesh) -> None:
-    local = np.vstack((mesh.kind.places, mesh.kind.stiffness_rule[0]))
+    local = np.vstack((mesh.kind.node_positions, mesh.kind.stiffness_rule[0]))
     parts = np.array_split(mesh.nodes, len(mesh.nodes) // BATCH + 1)
     least = np.concatenate([np.linalg.det(jacobians(mesh.kind, part, local)).min(axis=1) for part in parts])
     bad = ~((least > 0.0) & (least < np.inf))
@@ -133,7 +133,7 @@ def read_by_meshio(path: Path) -> Deck:
         known = block.type in KINDS or block.type in FLAT
         table = block.data if known else np.zeros((len(block.data), 0), dtype=np.int64)
         if suffix == ".med" and block.type in KINDS:
-            table = table[:, KINDS[block.type].mirrored]
+            table = table[:, KINDS[block.type].med_order]
         mine = []
         for nodes, without_group in zip((table + 1).tolist(), is_outside.tolist(), strict=True):
             count += 1

@@ -3,43 +3,55 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+import numpy.typing as npt
 from scipy import sparse
 
-from fe.elements.cells import unit_vector
+from fe.elements.elasticity import unit_vector
 from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
-from fe.sentences import said
 from reporting.files import atomic_file
 
 from .affine import AffineStructure, static_response
-from .design import MatrixDesign, MeshDesign, load_structure, structure_hash
-from .location import gauge_rows, nodal_load, point_shares, port_row
+from .affine_fields import OutputRows
+from .body import Body, PointMass
+from .design import (
+    Damage,
+    Material,
+    MatrixDesign,
+    MeshDesign,
+    PointOutput,
+    Port,
+    load_structure,
+    structure_hash,
+)
+from .gauges import gauge_rows
 from .matrices import assemble_matrices
-from .mesh import Body, PointMass, StructureMesh, supported
+from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
+from .nodal_loads import nodal_load, point_weights, port_row
+from .supports import supports_of_design
 
 
 @dataclass(frozen=True)
 class Structure(AffineStructure):
-    """Finite element model of a structure.
+    """Finite element model of a structure from a mesh.
 
     Attributes
     ----------
     design : MeshDesign
-        What was asked for.
+        The design.
     body : Body
-        Its mesh, and what it is made of.
-    material_of : (nc,)
+        Its mesh with materials and supports.
+    material_of : (nc,) array of int
         Number of the material of each cell.
-    region_of : (nc,)
+    region_of : (nc,) array of int
         Number of the damage region of each cell, -1 for none.
-    gauges_moved : (gauges,) m
-        How far each gauge lies from where it was asked for.
+    gauges_moved : (gauges,) array
+        Distance of each gauge from where it was asked for [m].
     """
 
     design: MeshDesign
@@ -55,7 +67,14 @@ class Structure(AffineStructure):
 
 
 def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
-    """Read the mesh of the design in `file`, which may name it relative to itself, with the design's sets.
+    """Read the mesh of a design, and add the sets that the design defines.
+
+    Parameters
+    ----------
+    design : MeshDesign
+        The design.
+    file : Path
+        Its file; the design may name the mesh relative to it.
 
     Raises
     ------
@@ -63,43 +82,76 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
         If the mesh cannot be read or is faulty.
     """
     mesh = read_mesh(file.parent / design.mesh, design.unit, design.length_unit)
-    sets: dict[str, dict[str, IntArray]] = {"nodes": {}, "cells": {}}
-    for part in design.set:
-        places = mesh.points if part.of == "nodes" else mesh.centres
-        low, high = design.unit * np.array(part.box)
-        slack = 1e-9 * mesh.size
-        inside = ((places >= low - slack) & (places <= high + slack)).all(axis=1)
-        sets[part.of][part.name] = np.flatnonzero(inside)
-    return replace(mesh, node_sets=mesh.node_sets | sets["nodes"], cell_sets=mesh.cell_sets | sets["cells"])
+    node_sets = dict(mesh.node_sets)
+    cell_sets = dict(mesh.cell_sets)
+    tolerance = 1e-9 * mesh.size
+    for box_set in design.set:
+        low, high = design.unit * np.array(box_set.box)
+        points = mesh.points if box_set.of == "nodes" else mesh.centres
+        is_inside = ((points >= low - tolerance) & (points <= high + tolerance)).all(axis=1)
+        sets = node_sets if box_set.of == "nodes" else cell_sets
+        sets[box_set.name] = np.flatnonzero(is_inside)
+    return replace(mesh, node_sets=node_sets, cell_sets=cell_sets)
 
 
-def _owners(mesh: StructureMesh, design: MeshDesign, key: str, what: str) -> IntArray:
-    """Find the number (nc,) of the part whose set holds each cell, -1 for none.
+def _part_of_cells(mesh: StructureMesh, labelled: list[tuple[str, Material | Damage]], kind: str) -> IntArray:
+    """Return the number (nc,) of the part whose set holds each cell, -1 for none.
 
     Parameters
     ----------
-    mesh, design : StructureMesh, MeshDesign
-        The mesh and its design.
-    key : str
-        The table of the parts in the design.
-    what : str
-        What they are, for the sentence.
+    mesh : StructureMesh
+        The mesh.
+    labelled : list of (str, Material or Damage)
+        The parts, each with its key in the file.
+    kind : str
+        What the parts are, for sentences.
 
     Raises
     ------
     MeshError
         If a set is missing or empty, or two overlap.
     """
-    owner = np.full(len(mesh.cells), -1, dtype=np.int64)
-    for number, (where, part) in enumerate(design.numbered(key)):
-        cells = mesh.cells_of(part.set, where)
-        taken = cells[owner[cells] >= 0]
-        if len(taken):
-            other, count = getattr(design, key)[owner[taken[0]]], len(taken)
-            both = {"what": what, "name": part.name, "other": other.name, "cell": mesh.cell(taken[0])}
-            raise MeshError(said("mesh.shared", where=where, count=count, **both))
-        owner[cells] = number
-    return owner
+    part_of_cell = np.full(len(mesh.cells), -1, dtype=np.int64)
+    for number, (label, part) in enumerate(labelled):
+        cells = mesh.cells_of(part.set, label)
+        shared = cells[part_of_cell[cells] >= 0]
+        if len(shared):
+            _, other = labelled[part_of_cell[shared[0]]]
+            raise MeshError(
+                f"{label}: the {kind}s {part.name!r} and {other.name!r} share {len(shared)} elements, such "
+                f"as {mesh.cell(shared[0])}; their sets must not overlap."
+            )
+        part_of_cell[cells] = number
+    return part_of_cell
+
+
+class _StiffnessParts(NamedTuple):
+    """Parts of the stiffness: the pairs of a parameter and a damage region that occur.
+
+    Attributes
+    ----------
+    part_of : (nc,) array of int
+        Part of each cell.
+    names : tuple of (str or None, str or None)
+        Parameter and damage region of each part.
+    """
+
+    part_of: IntArray
+    names: tuple[tuple[str | None, str | None], ...]
+
+
+def _stiffness_parts(design: MeshDesign, material_of: IntArray, region_of: IntArray) -> _StiffnessParts:
+    """Return the parts of the stiffness from material and region (nc,) of each cell."""
+    parameters: list[str | None] = [parameter.name for parameter in design.parameter]
+    parameters.append(None)
+    regions: list[str | None] = [region.name for region in design.damage]
+    regions.append(None)
+    parameter_of_material = np.array([parameters.index(material.scaled_by) for material in design.material])
+    region_number = region_of % len(regions)  # -1 becomes the number of no region, the last one
+    pair_of_cell = np.column_stack((parameter_of_material[material_of], region_number))
+    pairs, part_of = np.unique(pair_of_cell, axis=0, return_inverse=True)
+    names = tuple((parameters[parameter], regions[region]) for parameter, region in pairs.tolist())
+    return _StiffnessParts(part_of, names)
 
 
 def load_and_assemble(
@@ -112,102 +164,158 @@ def load_and_assemble(
     file : Path or str
         The structure file.
     memory_limit : float, optional
-        Bytes that assembly and factorisation may take; what the machine has left by default.
+        Bytes that assembly and factorisation may take; by default what the machine has free.
     mass_as_stiffness : bool
-        Integrate the mass at the points of the stiffness, as CalculiX does: not exact for tetrahedra.
+        Integrate the mass at the points of the stiffness, as CalculiX does; this is not exact for
+        tetrahedra.
 
     Raises
     ------
     DesignFileError, InvalidDesignError
-        If the structure file cannot be read, or is no structure.
+        If the structure file cannot be read, or does not describe a structure from a mesh.
     MeshError
-        If the mesh cannot be read, is faulty or does not hold what the design names, or would take too much
-        memory.
+        If the mesh cannot be read, is faulty, does not hold what the design names, or would take too
+        much memory.
     """
     file = Path(file)
     design = load_structure(file)
     if isinstance(design, MatrixDesign):
-        raise InvalidDesignError(said("design.without_mesh", file=file))
+        raise InvalidDesignError(
+            f"{file} is a structure from matrices: without a mesh there is no field to draw, and nothing "
+            "that CalculiX could solve."
+        )
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
-    material_of = _owners(mesh, design, "material", "material")
-    bare = np.flatnonzero(material_of < 0)
-    if len(bare):
-        counts = {"count": len(bare), "all": len(mesh.cells)}
-        raise MeshError(said("mesh.bare", mesh=mesh, cell=mesh.cell(bare[0]), **counts))
-    region_of = _owners(mesh, design, "damage", "damage region")
-    parameters, regions = ([*(part.name for part in own), None] for own in (design.parameter, design.damage))
-    scaled = np.array([parameters.index(part.scaled_by) for part in design.material])
-    pairs, part = np.unique(
-        np.column_stack((scaled[material_of], region_of % len(regions))), axis=0, return_inverse=True
+    # what each cell belongs to
+    material_of = _part_of_cells(mesh, list(design.numbered("material")), "material")
+    _check_materials(mesh, material_of)
+    region_of = _part_of_cells(mesh, list(design.numbered("damage")), "damage region")
+    # the body, its loads and outputs
+    body = _body(design, mesh, material_of, region_of, mass_as_stiffness=mass_as_stiffness)
+    gauges, gauges_moved = gauge_rows(mesh, design.gauge)
+    outputs = OutputRows(
+        gauge=gauges,
+        displacement=_point_rows(mesh, list(design.numbered("displacement"))),
+        acceleration=_point_rows(mesh, list(design.numbered("acceleration"))),
+        port=_port_rows(mesh, list(design.numbered("port"))),
     )
-    body = Body(
-        mesh,
-        supported(design, mesh),
-        np.array([own.elasticity for own in design.material])[material_of],
-        np.array([own.density for own in design.material])[material_of],
-        part,
-        tuple((parameters[first], regions[second]) for first, second in pairs.tolist()),
-        tuple(
-            PointMass(own.name, own.mass, point_shares(mesh, own.point, where)[None])
-            for where, own in design.numbered("mass")
-        ),
-        mass_rule=mesh.kind.stiffness_rule if mass_as_stiffness else None,
-    )
-    gauges, moved = gauge_rows(mesh, design.gauge)
-    loads = (nodal_load(mesh, load, where).ravel() for where, load in design.numbered("load"))
-    points = {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")}
-    ports = [port_row(mesh, port, where).ravel() for where, port in design.numbered("port")]
-    port_rows = sparse.csr_array(np.reshape(ports, (-1, mesh.unknowns)))
+    loads = (nodal_load(mesh, load, label).ravel() for label, load in design.numbered("load"))
     return Structure(
-        **body.assembled(design, loads, {"gauge": gauges, **points, "port": port_rows}),
+        design=design,
+        **body.affine_fields(design, loads, outputs),
+        stiffness_terms=body.stiffness_terms,
+        body=body,
         design_hash=structure_hash(design, file.parent),
         material_of=material_of,
         region_of=region_of,
-        gauges_moved=moved,
+        gauges_moved=gauges_moved,
+    )
+
+
+def _check_materials(mesh: StructureMesh, material_of: IntArray) -> None:
+    """Raise `MeshError` if a cell has no material."""
+    bare = np.flatnonzero(material_of < 0)
+    if len(bare):
+        raise MeshError(
+            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among them "
+            f"{mesh.cell(bare[0])}."
+        )
+
+
+def _body(
+    design: MeshDesign,
+    mesh: StructureMesh,
+    material_of: IntArray,
+    region_of: IntArray,
+    *,
+    mass_as_stiffness: bool,
+) -> Body[StructureMesh]:
+    """Return the body of a design, from material and region (nc,) of each cell."""
+    parts = _stiffness_parts(design, material_of, region_of)
+    elasticities = np.array([material.elasticity for material in design.material])
+    densities = np.array([material.density for material in design.material])
+    return Body(
+        mesh=mesh,
+        supports=supports_of_design(design, mesh),
+        elasticity=elasticities[material_of],
+        density=densities[material_of],
+        part=parts.part_of,
+        parts=parts.names,
+        masses=tuple(
+            PointMass(mass.name, mass.mass, point_weights(mesh, mass.point, label)[None])
+            for label, mass in design.numbered("mass")
+        ),
+        mass_rule=mesh.kind.stiffness_rule if mass_as_stiffness else None,
     )
 
 
 def assemble_structure(file: Path | str, memory_limit: float | None = None) -> AffineStructure:
-    """Read a structure file with its mesh or matrices; parameters and errors as of `load_and_assemble`."""
-    design, folder = load_structure(file), Path(file).parent
+    """Read a structure file with its mesh or its matrices, and assemble the affine operators.
+
+    Parameters
+    ----------
+    file : Path or str
+        The structure file.
+    memory_limit : float, optional
+        Bytes that assembly and factorisation may take; by default what the machine has free.
+
+    Raises
+    ------
+    DesignFileError, InvalidDesignError
+        If the structure file cannot be read, or does not describe a structure.
+    MeshError
+        If mesh or matrices cannot be read, are faulty, or do not hold what the design names.
+    """
+    design = load_structure(file)
+    folder = Path(file).parent
     if isinstance(design, MatrixDesign):
         return assemble_matrices(design, folder, structure_hash(design, folder))
     return load_and_assemble(file, memory_limit)
 
 
-def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr_array:
-    """Rows (m, full) of the displacements of points along directions."""
-    rows = [
-        np.outer(point_shares(mesh, part.point, where), unit_vector(part.direction)).ravel()
-        for where, part in design.numbered(key)
-    ]
+def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) -> sparse.csr_array:
+    """Return rows (m, full) of the displacements of points along directions, each with its label."""
+    rows = []
+    for label, output in labelled:
+        weights = point_weights(mesh, output.point, label)
+        rows.append(np.outer(weights, unit_vector(output.direction)).ravel())
     return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
 
 
-def weighed(structure: Structure) -> tuple[float, FloatArray]:
-    """Mass [kg] with the nominal point masses, and the centre of gravity (3,) [m]."""
-    shares, points = structure.body.nodal_mass, structure.mesh.points
-    mass = float(shares.sum())
-    return mass, shares @ points / mass if mass > 0.0 else points.mean(axis=0)
+def _port_rows(mesh: StructureMesh, labelled: list[tuple[str, Port]]) -> sparse.csr_array:
+    """Return rows (ports, full) of the displacements of ports, each with its label."""
+    rows = [port_row(mesh, port, label).ravel() for label, port in labelled]
+    return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
+
+
+def mass_and_centre(structure: Structure) -> tuple[float, FloatArray]:
+    """Return the mass [kg] with the nominal point masses, and the centre of gravity (3,) [m].
+
+    Without mass the centre is the mean of the nodes.
+    """
+    nodal_mass = structure.body.nodal_mass
+    points = structure.mesh.points
+    mass = float(nodal_mass.sum())
+    centre = nodal_mass @ points / mass if mass > 0.0 else points.mean(axis=0)
+    return mass, centre
 
 
 def write_structure_vtu(
     path: Path | str, structure: Structure, values: Mapping[str, float] | None = None
 ) -> None:
-    """Solve the full model and write its field, whole or not at all.
+    """Solve the full model and write its field as a VTU file, whole or not at all.
 
-    Point data: `displacement` [m]. Cell data: `strain` at the centres, `material` and `region` (their numbers
-    in the file from 1, 0 for no region), `stiffness_loss`.
+    Point data is `displacement` [m]. Cell data are `strain` at the centres, `material` and `region`
+    (their numbers in the file from 1, 0 for no region) and `stiffness_loss`.
 
     Parameters
     ----------
     path : Path or str
-        Where to write.
+        The file to write.
     structure : Structure
         The structure.
     values : mapping of str to float, optional
-        Parameters, losses, free masses and controls by name; what is left out is nominal, and healthy.
+        Parameters, losses, free masses and controls by name; the others are nominal, and healthy.
 
     Raises
     ------
@@ -216,32 +324,53 @@ def write_structure_vtu(
     FileNotWrittenError
         If the file cannot be written.
     """
-    mesh, given = structure.mesh, dict(values or {})
-    displacement = structure.full_displacement(static_response(structure, given).displacement)
-    lost = [*(given.get(name, 0.0) for name in structure.regions), 0.0]  # the last one is that of no region
+    mesh = structure.mesh
+    chosen = dict(values or {})
+    response = static_response(structure, chosen)
+    displacement = structure.full_displacement(response.displacement)
+    losses = [chosen.get(name, 0.0) for name in structure.regions]
+    losses.append(0.0)  # of no region, whose number is -1
     write_vtu(
         path,
         mesh.points,
         (mesh.kind.file_type, mesh.cells),
-        {"displacement": displacement},
-        {
-            "strain": mesh.strains(displacement)[:, 0],
+        point_data={"displacement": displacement},
+        cell_data={
+            "strain": mesh.strains(displacement).squeeze(axis=1),
             "material": structure.material_of + 1,
             "region": structure.region_of + 1,
-            "stiffness_loss": np.array(lost)[structure.region_of],
+            "stiffness_loss": np.array(losses)[structure.region_of],
         },
     )
 
 
-Data = dict[str, NDArray[Any]]
-"""What is written of points or cells, by name."""
+Data = Mapping[str, npt.ArrayLike]
+"""Values of points or cells, by name."""
 
 
 def write_vtu(
     path: Path | str, points: FloatArray, cells: tuple[str, IntArray], point_data: Data, cell_data: Data
 ) -> None:
-    """Write a VTU file, whole or not at all; `cells` are their kind in meshio and their nodes."""
-    meshio, values = meshio_with_wedges(), {name: [value] for name, value in cell_data.items()}
-    mesh = meshio.Mesh(points, [cells], point_data=point_data, cell_data=values)
+    """Write a VTU file, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+    points : (nn, 3) array
+        Positions of the nodes [m].
+    cells : (str, (nc, k) array of int)
+        The kind of the cells in meshio, and their nodes.
+    point_data, cell_data : mapping of str to array
+        Values of the nodes and of the cells.
+
+    Raises
+    ------
+    FileNotWrittenError
+        If the file cannot be written.
+    """
+    meshio = meshio_with_wedges()
+    cell_blocks = {name: [values] for name, values in cell_data.items()}
+    mesh = meshio.Mesh(points, [cells], point_data=point_data, cell_data=cell_blocks)
     with atomic_file(path) as temporary:
         meshio.write(temporary, mesh, file_format="vtu")

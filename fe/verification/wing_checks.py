@@ -1,10 +1,10 @@
-"""Checks of a wing's model: what its rigid motions call forth, sums that must agree, convergence."""
+"""Checks of a wing's model: rigid motions, sums that must agree, convergence, CalculiX."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,102 +14,198 @@ from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.state import DigitalState
 from fe.structure.affine import static_response
-from fe.structure.mesh import rigid_motions
-from fe.verification.calculix_comparison import agreement, calculix_program, wing_deck
+from fe.structure.supports import rigid_motions
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, assemble, eigenmodes
 from reporting.progress import stage
 
-DAMAGED = (0.4, 0.6)
-REFINEMENTS, QUICK_REFINEMENTS = (0.5, 1.0, 2.0), (0.25, 0.5, 1.0)
+from .calculix_comparison import agreement
+from .calculix_deck import wing_deck
+from .calculix_run import calculix_program
+
+DAMAGED_LOSSES = (0.4, 0.6)
+"""Stiffness losses of the damage regions, in turn, in the damaged state that is checked."""
+REFINEMENTS = (0.5, 1.0, 2.0)
+QUICK_REFINEMENTS = (0.25, 0.5, 1.0)
+RIGID_FORCE_LIMIT = 1e-12
+"""Largest force of a rigid motion, relative to the terms of its sum."""
+MASS_LIMIT = 1e-10
+BALANCE_LIMIT = 1e-5
+CONVERGENCE_LIMIT = 0.01
+"""Largest change between the two finest meshes."""
+CALCULIX_LIMIT = 1e-5
 
 
-def _rigid_motions(operators: AffineOperators) -> FloatArray:
-    """Free unknowns (n, 3) of the rigid motions that the root allows: heave, flap and yaw."""
-    full = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)[:, [2, 3, 5]]
-    return np.vstack((full[operators.body.supports.alone], np.eye(3)))
+class RootMotions(NamedTuple):
+    """Free unknowns (n,) of the rigid motions that the root allows."""
+
+    heave: FloatArray
+    flap: FloatArray
+    yaw: FloatArray
 
 
-def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[str, tuple[float, float, str]]:
-    """Return sums that must agree for the wing at a load factor, each with the other and their unit.
+def _root_motions(operators: AffineOperators) -> RootMotions:
+    """Return the rigid motions that the root allows; its own unknowns are the last three."""
+    motions = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)
+    nodal = motions[operators.body.supports.free_displacements]
+    _, _, along_z, about_x, _, about_z = nodal.T
+    heave, flap, yaw = np.vstack((np.column_stack((along_z, about_x, about_z)), np.eye(3))).T
+    return RootMotions(heave, flap, yaw)
 
-    The mass of the matrix and of the volumes; the force of the root spring and the net load; the moment of
-    the flap spring and that of the load about the root; the elastic energy and half the work of the load.
+
+class Balance(NamedTuple):
+    """Two sums that must agree.
+
+    Attributes
+    ----------
+    value, expected : float
+        The sums.
+    unit : str
+        Their unit.
     """
-    mesh, design = operators.wing_mesh, operators.wing_mesh.design
-    heave, flap, _ = _rigid_motions(operators).T
-    local, weight = gauss_points(2)
-    volume = gradients(mesh.kind, mesh.nodes, local)[1] @ weight
-    u = static_response(operators, {"load_factor": load_factor}).displacement
-    load = operators.turn(load_factor)
-    lift = design.lift.force * load_factor / design.lift.load_factor
-    energy = 0.5 * u @ (operators.stiffness() @ u)
-    return {
-        "mass": (
-            float(heave @ (operators.mass_terms[0] @ heave)),
-            float(volume @ operators.body.density),
-            "kg",
-        ),
-        "reaction": (float(design.root.transverse_spring * u[-3]), lift, "N"),
-        "root moment": (float(design.root.flap_spring * u[-2]), float(flap @ load), "N m"),
-        "energy and work": (float(energy), float(0.5 * load @ u), "J"),
-    }
+
+    value: float
+    expected: float
+    unit: str
 
 
-def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> dict[str, FloatArray]:
-    """Results of the healthy wing at e = 1 on a sequence of meshes; nothing is refitted.
+def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[str, Balance]:
+    """Return sums that must agree for the wing at a load factor.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The wing.
+    load_factor : float
+        The load factor.
 
     Returns
     -------
-    dict of str to (meshes, ...)
-        Free `unknowns`; `tip stiffness` [N/m]; frequencies of `first bending` and `second bending` at the
-        design's nominal masses [Hz]; `strain` (meshes, gauges) at the load factor of the design's lift.
+    dict of str to Balance
+        The mass of the matrix and that of the volumes; the force of the root spring and the net
+        load; the moment of the flap spring and that of the load about the root; the elastic energy
+        and half the work of the load.
+    """
+    mesh = operators.wing_mesh
+    root = mesh.design.root
+    lift = mesh.design.lift
+    motions = _root_motions(operators)
+    # mass of matrix and volumes
+    rule = gauss_points(2)
+    _, determinants = gradients(mesh.kind, mesh.nodes, rule.points)
+    volume = determinants @ rule.weights
+    matrix_mass = motions.heave @ (operators.mass_terms[0] @ motions.heave)
+    # forces and energy of the solution
+    u = static_response(operators, {"load_factor": load_factor}).displacement
+    root_heave, root_flap, _ = u[-3:]
+    load = operators.turn(load_factor)
+    net_lift = lift.force * load_factor / lift.load_factor
+    energy = 0.5 * u @ (operators.stiffness() @ u)
+    return {
+        "mass": Balance(float(matrix_mass), float(volume @ operators.body.density), "kg"),
+        "reaction": Balance(float(root.transverse_spring * root_heave), net_lift, "N"),
+        "root moment": Balance(
+            float(root.flap_spring * root_flap), float(motions.flap @ load), "N m"
+        ),
+        "energy and work": Balance(float(energy), float(0.5 * load @ u), "J"),
+    }
+
+
+class MeshResults(NamedTuple):
+    """Results of the healthy wing at e = 1 on one mesh, with nominal masses.
+
+    Attributes
+    ----------
+    unknowns : int
+        Number of free unknowns.
+    tip_stiffness : float
+        Stiffness at the point of the static test [N/m].
+    first_bending, second_bending : float
+        Frequencies of flapwise bending [Hz].
+    strain : (gauges,) array
+        Strains at the load factor of the design's lift.
+    """
+
+    unknowns: int
+    tip_stiffness: float
+    first_bending: float
+    second_bending: float
+    strain: FloatArray
+
+
+def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[MeshResults]:
+    """Return the results on a sequence of meshes; nothing is fitted again.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    refinements : sequence of float
+        The refinements of the meshes.
 
     Raises
     ------
     InvalidDesignError
         If a refinement lies outside the range of the design.
     """
-    names = ("unknowns", "tip stiffness", "first bending", "second bending", "strain")
-    found: list[tuple[Any, ...]] = []
+    results = []
     for refinement in refinements:
         operators = assemble(design.changed(mesh={"refinement": refinement}))
         loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
-        turn, bent = Factorisation(operators.stiffness()).solve(loads).T
-        modes = eigenmodes(operators, 1.0, (), design.masses.servo, design.masses.pitot, 4)
-        first, second = modes.frequency[modes.flapwise_bending].tolist()
-        stiffness = 1.0 / float(operators.load_tip @ bent)
-        found.append((operators.unknowns, stiffness, first, second, operators.gauge_output @ turn))
-    return dict(zip(names, map(np.array, zip(*found, strict=True)), strict=True))
+        under_lift, under_tip_force = Factorisation(operators.stiffness()).solve(loads).T
+        masses = design.masses
+        modes = eigenmodes(operators, 1.0, (), masses.servo, masses.pitot, 4)
+        first_bending, second_bending = modes.frequency[modes.flapwise_bending].tolist()
+        results.append(
+            MeshResults(
+                unknowns=operators.unknowns,
+                tip_stiffness=1.0 / float(operators.load_tip @ under_tip_force),
+                first_bending=first_bending,
+                second_bending=second_bending,
+                strain=operators.gauge_output @ under_lift,
+            )
+        )
+    return results
 
 
 def observed_order(ratio: float, values: Sequence[float]) -> float:
-    """Order p of v = v_0 + c h^p through the last three of values on meshes, h each `ratio` times less.
+    """Return the order p of v = v_0 + c h^p through the last three of values on meshes.
+
+    Parameters
+    ----------
+    ratio : float
+        The ratio of the mesh sizes h of successive meshes.
+    values : sequence of float
+        The values.
 
     Returns
     -------
     float
-        The order; NaN where the values do not approach a limit from one side with an order of 0.05 to 12.
+        The order; NaN if the values do not approach a limit from one side with an order of 0.05 to
+        12.
     """
-    first, second = values[-2] - values[-3], values[-1] - values[-2]
-    order = math.log(first / second) / math.log(ratio) if first * second > 0.0 else math.nan
+    earlier_change = values[-2] - values[-3]
+    last_change = values[-1] - values[-2]
+    if earlier_change * last_change <= 0.0:
+        return math.nan
+    order = math.log(earlier_change / last_change) / math.log(ratio)
     return order if 0.05 < order < 12.0 else math.nan
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the verification: what, what came, and the limit that it must keep, if it has one.
+    """One line of the verification: a figure, and the limit that it must keep, if it has one.
 
     Attributes
     ----------
     group, name : str
         What is checked.
     value : float
-        What came.
+        The figure.
     limit : float, optional
         Largest allowed value; None for a figure that is only reported.
     note : str
-        What stands beside the figure.
+        Text beside the figure.
     """
 
     group: str
@@ -125,7 +221,7 @@ class Check:
 
 
 def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[Check]:
-    """Return every check of a design; those against CalculiX where it is installed.
+    """Return every check of a design; those against CalculiX if it is installed.
 
     Parameters
     ----------
@@ -134,46 +230,54 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
     jobs : Path
         Where CalculiX works.
     quick : bool
-        Coarser meshes.
+        Use coarser meshes.
     """
     checks: list[Check] = []
 
-    def run(title: str, found: Iterable[Check]) -> None:
-        with stage(title) as shown:
-            for check in found:
+    def run(title: str, results: Iterable[Check]) -> None:
+        with stage(title) as progress:
+            for check in results:
                 checks.append(check)
-                shown.advance(detail=check.name)
+                progress.advance(detail=check.name)
 
-    with stage("Meshing the wing"):
-        mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
-    run("Balances of the wing", balance_checks(mesh))
     refinements = QUICK_REFINEMENTS if quick else REFINEMENTS
+    with stage("Meshing the wing"):
+        checked = design.changed(mesh={"refinement": refinements[0]}) if quick else design
+        operators = assemble(checked)
+    run("Balances of the wing", balance_checks(operators))
     run("Convergence of the mesh", convergence_checks(design, refinements, limited=not quick))
     if calculix_program() is not None:
-        run("CalculiX on the same mesh", calculix_checks(mesh, jobs))
+        run("CalculiX on the same mesh", calculix_checks(operators, jobs))
     return checks
 
 
 def balance_checks(operators: AffineOperators) -> Iterator[Check]:
     """Yield the sums that must agree for the wing at the load factor of its lift.
 
-    First the largest force that a rigid motion calls forth, over the sum of its terms; the forces of the
-    springs are left out.
+    The first check is the largest force of a rigid motion without the forces of the springs,
+    relative to the sum of the magnitudes of its terms.
     """
-    free, stiffness = _rigid_motions(operators), operators.stiffness()
-    force = np.abs((stiffness - operators.body.supports.stiffness) @ free).max()
-    share = force / (abs(stiffness) @ np.abs(free)).max()
-    yield Check("wing", "force of a rigid motion", float(share), 1e-12)
-    balance = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
-    for name, (found, expected, unit) in balance.items():
-        limit = 1e-10 if name == "mass" else 1e-5
-        yield Check("wing", name, abs(found / expected - 1.0), limit, f"({found:.5g} {unit})")
+    motions = np.column_stack(_root_motions(operators))
+    stiffness = operators.stiffness()
+    without_springs = stiffness - operators.body.supports.stiffness
+    force = np.abs(without_springs @ motions).max()
+    magnitude = (abs(stiffness) @ np.abs(motions)).max()
+    yield Check("wing", "force of a rigid motion", float(force / magnitude), RIGID_FORCE_LIMIT)
+    balances = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
+    for name, balance in balances.items():
+        yield Check(
+            group="wing",
+            name=name,
+            value=abs(balance.value / balance.expected - 1.0),
+            limit=MASS_LIMIT if name == "mass" else BALANCE_LIMIT,
+            note=f"({balance.value:.5g} {balance.unit})",
+        )
 
 
 def convergence_checks(
     design: WingDesign, refinements: tuple[float, ...], *, limited: bool = True
 ) -> Iterator[Check]:
-    """Yield the change between the two finest meshes and the observed order of every result.
+    """Yield the change of every result between the two finest meshes, and its observed order.
 
     Parameters
     ----------
@@ -182,38 +286,55 @@ def convergence_checks(
     refinements : tuple of float
         At least three, from coarse to fine, with equal ratios.
     limited : bool
-        Hold the changes to their bars, which are made for `REFINEMENTS`.
+        Hold the changes to their limits, which are made for `REFINEMENTS`.
     """
-    columns = mesh_convergence(design, refinements)
+    results = mesh_convergence(design, refinements)
     middle, fine = refinements[-2:]
     group = f"mesh x{middle:g} to x{fine:g}"
+    limit = CONVERGENCE_LIMIT if limited else None
 
-    def order(values: list[float]) -> str:
-        found = observed_order(fine / middle, values)
-        return "not monotone" if math.isnan(found) else f"order {found:.2f}"
+    def order_in_words(values: list[float]) -> str:
+        order = observed_order(fine / middle, values)
+        return "not monotone" if math.isnan(order) else f"order {order:.2f}"
 
-    limit = 0.01 if limited else None
-    for name, unit in (("tip stiffness", "N/m"), ("first bending", "Hz"), ("second bending", "Hz")):
-        values = columns[name].tolist()
-        note = f"({values[-1]:.5g} {unit}, {order(values)})"
+    by_name = {
+        "tip stiffness": ("N/m", [result.tip_stiffness for result in results]),
+        "first bending": ("Hz", [result.first_bending for result in results]),
+        "second bending": ("Hz", [result.second_bending for result in results]),
+    }
+    for name, (unit, values) in by_name.items():
+        note = f"({values[-1]:.5g} {unit}, {order_in_words(values)})"
         yield Check(group, name, abs(values[-1] / values[-2] - 1.0), limit, note)
-    strain = columns["strain"]
+    strain = np.array([result.strain for result in results])
     change = np.abs(strain[-1] / strain[-2] - 1.0)
     yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), limit)
-    for gauge, value in enumerate(change, start=1):
-        own = strain[:, gauge - 1].tolist()
-        note = f"({1e6 * own[-1]:.0f} microstrain, {order(own)})"
-        yield Check(group, f"gauge {gauge}", float(value), None, note)
-    yield Check(group, "unknowns of the finest mesh", int(columns["unknowns"][-1]))
+    for number, (gauge_change, readings) in enumerate(
+        zip(change, strain.T.tolist(), strict=True), start=1
+    ):
+        note = f"({1e6 * readings[-1]:.0f} microstrain, {order_in_words(readings)})"
+        yield Check(group, f"gauge {number}", float(gauge_change), None, note)
+    yield Check(group, "unknowns of the finest mesh", results[-1].unknowns)
 
 
 def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
-    """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
-    damaged = tuple(DAMAGED[number % 2] for number in range(len(operators.regions)))
-    for health, loss in (("healthy", ()), ("damaged", damaged)):
+    """Yield the differences to CalculiX on the identical mesh: statics and six modes.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The wing.
+    jobs : Path
+        Where CalculiX works.
+    """
+    damaged = tuple(
+        DAMAGED_LOSSES[number % len(DAMAGED_LOSSES)] for number in range(len(operators.regions))
+    )
+    for health, losses in (("healthy", ()), ("damaged", damaged)):
         group = f"CalculiX, {health}"
-        found = agreement(wing_deck(operators, DigitalState(stiffness_loss=loss)), jobs / health)
-        for load, differences in found.loads.items():
-            for what, value in differences.items():
-                yield Check(group, f"{load}: {what}", value, 1e-5)
-        yield Check(group, f"frequencies 1 to {len(found.ours)}", found.modal, 1e-5)
+        deck = wing_deck(operators, DigitalState(stiffness_loss=losses))
+        comparison = agreement(deck, jobs / health)
+        for load, differences in comparison.loads.items():
+            for quantity, difference in differences.items():
+                yield Check(group, f"{load}: {quantity}", difference, CALCULIX_LIMIT)
+        frequencies = f"frequencies 1 to {len(comparison.ours)}"
+        yield Check(group, frequencies, comparison.modal, CALCULIX_LIMIT)

@@ -1,8 +1,8 @@
 """The wing as its designer describes it: a TOML file, checked, in SI units.
 
-Lengths are in metres, moduli in pascals, densities in kg/m^3, masses in kg, forces in newtons, spring
-constants in N/m and N m/rad. Stations along the span of ribs and point masses are fractions of the
-semi-span, chordwise places are fractions of the local chord measured from the leading edge.
+Lengths are in metres, moduli in pascals, densities in kg/m^3, masses in kg, forces in newtons,
+spring constants in N/m and N m/rad. Stations of ribs and point masses along the span are fractions
+of the semi-span. Positions along the chord are fractions of the local chord from the leading edge.
 """
 
 import hashlib
@@ -16,7 +16,6 @@ from pydantic import Field
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
-from fe.sentences import said
 from fe.structure.tables import Part, StructureDesign
 from reporting.toml_file import Fault, read_toml, validate
 from reporting.words import brief
@@ -29,16 +28,26 @@ _NAMES = Path(__file__).with_name("names.toml")
 
 
 def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
-    """Return a wing as a structure: by name what can be chosen, from where to where, and what can be read."""
+    """Return a wing as a structure: the names and ranges of what can be chosen and read.
+
+    Parameters
+    ----------
+    regions : tuple of str
+        Names of the damage regions.
+    gauges : int
+        Number of gauges.
+    """
     content = read_toml(_NAMES, DesignFileError) | {
         "damage": [{"name": name} for name in regions],
         "gauge": [{"name": f"gauge_{number}"} for number in range(1, gauges + 1)],
     }
-    return validate(StructureDesign, content, str(_NAMES), InvalidDesignError, what="a wing's names")
+    return validate(
+        StructureDesign, content, str(_NAMES), InvalidDesignError, what="a wing's names"
+    )
 
 
-TAKEN_NAMES = frozenset((*wing_names(()), "skin", "webs", "ribs"))
-"""Names that mean something else where the names of damage regions stand."""
+RESERVED_NAMES = frozenset((*wing_names(()), "skin", "webs", "ribs"))
+"""Names that damage regions cannot have, because they mean something else beside these."""
 
 
 class WingDesign(Part):
@@ -47,7 +56,7 @@ class WingDesign(Part):
     Raises
     ------
     InvalidDesignError
-        From `parse_design` and `load_design`, with one sentence that names the place in the design.
+        From `parse_design` and `load_design`, with one sentence that names the key in the design.
     """
 
     name: str = Field(min_length=1)
@@ -69,35 +78,48 @@ class WingDesign(Part):
 
     def __repr__(self) -> str:
         return brief(
-            self, name=self.name, regions=self.regions, gauges=len(self.gauges.positions), hash=self.hash
+            self,
+            name=self.name,
+            regions=self.regions,
+            gauges=len(self.gauges.positions),
+            hash=self.hash,
         )
 
     def faults(self) -> Iterator[Fault]:
-        """Yield parts that do not fit together."""
-        for wrong in (_wrong_webs, _wrong_ribs, _wrong_regions, _wrong_gauges, _wrong_places):
-            yield from wrong(self)
+        """Yield the faults of parts that do not fit together."""
+        yield from _web_faults(self)
+        yield from _skin_faults(self)
+        yield from _rod_faults(self)
+        yield from _rib_faults(self)
+        yield from _region_faults(self)
+        yield from _added_density_faults(self)
+        yield from _gauge_faults(self)
+        yield from _point_faults(self)
 
     @property
     def regions(self) -> tuple[str, ...]:
         """Names of the damage regions, those of `defects`, in their order."""
         numbered = region_names(len(self.defects))
-        return tuple(defect.name or name for defect, name in zip(self.defects, numbered, strict=True))
+        return tuple(
+            defect.name or name for defect, name in zip(self.defects, numbered, strict=True)
+        )
 
     @property
     def geometry(self) -> Geometry:
         """Planform as the `Geometry` of a digital state [m]."""
-        plan = self.planform
-        return Geometry(plan.semi_span, plan.root_chord, plan.tip_chord)
+        planform = self.planform
+        return Geometry(planform.semi_span, planform.root_chord, planform.tip_chord)
 
     @property
     def hash(self) -> str:
         """SHA-256 of the content, 64 hexadecimal digits; comments and key order do not count."""
-        whole = self.model_dump(mode="json")
-        for defect, name in zip(whole["defects"], region_names(len(self.defects)), strict=True):
-            if defect["name"] in (None, name):  # a name that says nothing does not count
+        content = self.model_dump(mode="json")
+        default_names = region_names(len(self.defects))
+        for defect, default_name in zip(content["defects"], default_names, strict=True):
+            if defect["name"] in (None, default_name):  # a default name does not count
                 del defect["name"]
-        content = json.dumps(whole, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(content.encode()).hexdigest()
+        text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
 
     @property
     def front_chord(self) -> float:
@@ -110,12 +132,13 @@ class WingDesign(Part):
         return self.webs[-1].chord
 
     def changed(self, **sections: Any) -> "WingDesign":
-        """Copy with other contents, checked: `design.changed(mesh={"refinement": 2.0})`.
+        """Return a checked copy with other contents: `design.changed(mesh={"refinement": 2.0})`.
 
         Parameters
         ----------
         **sections
-            For each top-level key a mapping whose items replace those of the section, or a new value.
+            For each top-level key a mapping whose entries replace those of the section, or a new
+            value.
 
         Raises
         ------
@@ -131,98 +154,183 @@ class WingDesign(Part):
         return parse_design(content, source="the changed design")
 
 
-def _wrong_webs(design: WingDesign) -> Iterator[Fault]:
-    smallest = min(design.planform.root_chord, design.planform.tip_chord)
-    for index, (before, after) in enumerate(itertools.pairwise(design.webs), start=1):
-        room = (after.chord - before.chord) * smallest - before.thickness - after.thickness
-        told = said("wing.webs", index=index, web=after, other=index - 1, before=before)
-        yield room <= 0.0, told
-    outside = design.front_chord <= 0.0 or design.rear_chord >= 1.0
-    yield outside, "webs[0] and the last web must lie inside the chord, between 0 and 1"
+def _smallest_chord(design: WingDesign) -> float:
+    """Return the chord at the root or at the tip [m], whichever is smaller."""
+    return min(design.planform.root_chord, design.planform.tip_chord)
+
+
+def _web_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield webs that are not in order, or lie outside the chord."""
+    smallest_chord = _smallest_chord(design)
+    for index, (web, next_web) in enumerate(itertools.pairwise(design.webs)):
+        distance = (next_web.chord - web.chord) * smallest_chord
+        room = distance - web.thickness - next_web.thickness
+        yield (
+            room <= 0.0,
+            f"webs[{index + 1}] at chord {next_web.chord:g} must lie behind webs[{index}] at chord "
+            f"{web.chord:g} with room for the thickness of both",
+        )
+    is_outside = design.front_chord <= 0.0 or design.rear_chord >= 1.0
+    yield is_outside, "webs[0] and the last web must lie inside the chord, between 0 and 1"
+
+
+def _skin_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield a skin that is too thick for the section at a web."""
+    smallest_chord = _smallest_chord(design)
+    thickness = design.skin.thickness
     for web in design.webs:
-        half = float(parts.four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)) * smallest
-        thick = half <= 1.5 * design.skin.thickness
-        yield thick, said("wing.skin", skin=design.skin, web=web, half=half)
-    last = len(design.webs) - 1
+        ratio = parts.four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)
+        half_height = float(ratio) * smallest_chord
+        yield (
+            half_height <= 1.5 * thickness,
+            f"the skin of {thickness:g} m does not fit into the section at chord {web.chord:g}, "
+            f"whose half height is {half_height:.2g} m at the smallest chord",
+        )
+
+
+def _rod_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield rods in webs that do not exist."""
+    last_web = len(design.webs) - 1
     for index, rod in enumerate(design.rods):
-        yield rod.web > last, said("wing.rods", index=index, rod=rod, last=last)
+        yield (
+            rod.web > last_web,
+            f"rods[{index}] lies in web {rod.web}, but there are only webs 0 to {last_web}",
+        )
 
 
-def _wrong_ribs(design: WingDesign) -> Iterator[Fault]:
+def _rib_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield ribs that overlap."""
     intervals = sorted((*rib_interval(design, index), index) for index in range(len(design.ribs)))
     for (_, end, first), (start, _, second) in itertools.pairwise(intervals):
-        yield start < end, f"ribs[{first}] and ribs[{second}] overlap at {start:.4g} m from the root"
+        yield (
+            start < end,
+            f"ribs[{first}] and ribs[{second}] overlap at {start:.4g} m from the root",
+        )
 
 
-def _off_box(design: WingDesign, what: str, front: float, rear: float) -> Fault:
-    inside = design.front_chord <= front <= rear <= design.rear_chord
-    return not inside, said("wing.box", what=what, design=design)
+def _box_fault(design: WingDesign, subject: str, front: float, rear: float) -> Fault:
+    """Return whether chord fractions lie outside the box, with the sentence about the subject."""
+    is_inside = design.front_chord <= front <= rear <= design.rear_chord
+    return not is_inside, (
+        f"{subject} lies outside the skin of the box from chord {design.front_chord:g} to "
+        f"{design.rear_chord:g}"
+    )
 
 
-def _wrong_regions(design: WingDesign) -> Iterator[Fault]:
+def _region_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield damage regions that lie off the box, overlap, or have names that cannot be."""
     span = design.planform.semi_span
     for index, defect in enumerate(design.defects):
-        where, ends = f"defects[{index}]", (defect.chord_start, defect.chord_end)
-        turned = defect.span_end <= defect.span_start or ends[1] <= ends[0]
-        yield turned, f"{where} must end behind its start, along the span and along the chord"
-        far = f"{where} ends {defect.span_end:g} m from the root, off the wing of {span:g} m"
-        yield defect.span_end > span, far
-        yield _off_box(design, f"{where}, from chord {ends[0]:g} to {ends[1]:g},", *ends)
-    for (first, one), (second, two) in itertools.combinations(enumerate(design.defects), 2):
-        along = min(one.span_end, two.span_end) > max(one.span_start, two.span_start)
-        across = min(one.chord_end, two.chord_end) > max(one.chord_start, two.chord_start)
-        yield along and across, f"defects[{first}] and defects[{second}] overlap"
-        name, other = design.regions[first], design.regions[second]
-        both = {"first": f"defects[{first}]", "second": f"defects[{second}]"}
-        yield name == other, said("design.names", name=name, **both)
+        label = f"defects[{index}]"
+        is_reversed = defect.span_end <= defect.span_start or defect.chord_end <= defect.chord_start
+        yield is_reversed, f"{label} must end behind its start, along the span and along the chord"
+        yield (
+            defect.span_end > span,
+            f"{label} ends {defect.span_end:g} m from the root, off the wing of {span:g} m",
+        )
+        subject = f"{label}, from chord {defect.chord_start:g} to {defect.chord_end:g},"
+        yield _box_fault(design, subject, defect.chord_start, defect.chord_end)
+    for first, second in itertools.combinations(range(len(design.defects)), 2):
+        labels = f"defects[{first}] and defects[{second}]"
+        yield _overlap(design.defects[first], design.defects[second]), f"{labels} overlap"
+        name = design.regions[first]
+        yield (
+            name == design.regions[second],
+            f"{labels} are both named {name!r}; give each a name of its own",
+        )
     for index, name in enumerate(design.regions):
-        taken = f"defects[{index}] is named {name!r}, which is taken; give it another name"
-        yield name in TAKEN_NAMES, taken
+        yield (
+            name in RESERVED_NAMES,
+            f"defects[{index}] is named {name!r}, which is taken; give it another name",
+        )
+
+
+def _overlap(defect: parts.Defect, other: parts.Defect) -> bool:
+    """Return whether two damage regions overlap, along the span and along the chord."""
+    along_span = min(defect.span_end, other.span_end) > max(defect.span_start, other.span_start)
+    along_chord = min(defect.chord_end, other.chord_end) > max(
+        defect.chord_start, other.chord_start
+    )
+    return along_span and along_chord
+
+
+def _added_density_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield intervals of added density that end before they begin."""
     for index, added in enumerate(design.added_density):
         yield added.end <= added.start, f"added_density[{index}] must end behind its start"
 
 
-def _wrong_gauges(design: WingDesign) -> Iterator[Fault]:
-    span = design.planform.semi_span
-    along, across = 0.5 * design.gauges.averaging_spanwise, 0.5 * design.gauges.averaging_chordwise
-    for index, (distance, chord) in enumerate(design.gauges.positions):
-        inside = along <= distance <= span - along
-        yield not inside, said("wing.gauge", index=index, distance=distance, span=span)
-        for end in (distance - along, distance + along):
-            local = design.planform.chord(end / span)
-            middle = chord * design.planform.chord(distance / span)
-            where = f"gauges.positions[{index}] at chord {chord:g}, with its averaging length,"
-            yield _off_box(design, where, (middle - across) / local, (middle + across) / local)
+def _gauge_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield gauges that reach off the wing or off the box."""
+    planform = design.planform
+    half_length = 0.5 * design.gauges.averaging_spanwise
+    half_width = 0.5 * design.gauges.averaging_chordwise
+    for index, (distance, chord_fraction) in enumerate(design.gauges.positions):
+        label = f"gauges.positions[{index}]"
+        is_on_wing = half_length <= distance <= planform.semi_span - half_length
+        yield (
+            not is_on_wing,
+            f"{label} is {distance:g} m from the root, with its averaging length off the wing of "
+            f"{planform.semi_span:g} m",
+        )
+        middle = chord_fraction * planform.chord(distance / planform.semi_span)
+        for end in (distance - half_length, distance + half_length):
+            chord = planform.chord(end / planform.semi_span)
+            yield _box_fault(
+                design,
+                f"{label} at chord {chord_fraction:g}, with its averaging length,",
+                (middle - half_width) / chord,
+                (middle + half_width) / chord,
+            )
 
 
-def _wrong_places(design: WingDesign) -> Iterator[Fault]:
-    places = [(f"point_masses[{i}]", place.chord) for i, place in enumerate(design.point_masses)]
-    for where, chord in [*places, ("tip_load", design.tip_load.chord)]:
-        yield _off_box(design, f"{where} at chord {chord:g}", chord, chord)
-    beyond = design.tip_load.distance_from_tip >= design.planform.semi_span
-    yield beyond, "tip_load.distance_from_tip reaches beyond the root"
+def _point_faults(design: WingDesign) -> Iterator[Fault]:
+    """Yield point masses and a test load that lie off the box."""
+    chords = [(f"point_masses[{i}]", mass.chord) for i, mass in enumerate(design.point_masses)]
+    chords.append(("tip_load", design.tip_load.chord))
+    for label, chord in chords:
+        yield _box_fault(design, f"{label} at chord {chord:g}", chord, chord)
+    is_beyond_root = design.tip_load.distance_from_tip >= design.planform.semi_span
+    yield is_beyond_root, "tip_load.distance_from_tip reaches beyond the root"
 
 
 def rib_interval(design: WingDesign, index: int) -> tuple[float, float]:
-    """Start and end [m from the root] of a rib's thickness; ribs at the ends lie inside the span."""
-    rib, span = design.ribs[index], design.planform.semi_span
-    start = min(max(rib.station * span - 0.5 * rib.thickness, 0.0), span - rib.thickness)
+    """Return start and end of a rib's thickness [m from the root], moved inside the span."""
+    rib = design.ribs[index]
+    span = design.planform.semi_span
+    start = rib.station * span - 0.5 * rib.thickness
+    start = min(max(start, 0.0), span - rib.thickness)
     return start, start + rib.thickness
 
 
 def parse_design(content: dict[str, Any], source: str = "the design") -> WingDesign:
-    """Check the content of a design file.
+    """Return the design in the content of a design file.
+
+    Parameters
+    ----------
+    content : dict
+        The content of the file.
+    source : str
+        Its name in sentences.
 
     Raises
     ------
     InvalidDesignError
-        One sentence that names `source`, the place, what came and what was expected.
+        If the content is not a wing that can be built; the sentence names `source`, the key, what
+        was found and what was expected.
     """
-    return validate(WingDesign, content, source, InvalidDesignError, what="a wing design", first_index=0)
+    return validate(
+        WingDesign, content, source, InvalidDesignError, what="a wing design", first_index=0
+    )
 
 
 def load_design(path: Path | str | None = None) -> WingDesign:
     """Read a design file; without a path, the shipped design of the UAV wing.
+
+    Parameters
+    ----------
+    path : Path or str, optional
+        The file.
 
     Raises
     ------

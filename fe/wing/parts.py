@@ -1,17 +1,17 @@
 """The parts of a wing design: the sections of its TOML file, in SI units, each checked on its own.
 
-The shape of the section is of the symmetric four-digit family of NACA Report 460 (Jacobs, Ward and Pinkerton,
-1933). Also the lift along the span: the shape of the lift of a symmetrically loaded wing as a function that
-integrates to one over the half-wing; the amount is the design's.
+This module also has the shape of the section, of the symmetric four-digit family of NACA Report 460
+(Jacobs, Ward and Pinkerton, 1933), and the distribution of lift along the span of a symmetrically
+loaded wing, as a function that integrates to one over the half-wing.
 
 References
 ----------
-O. Schrenk, "A simple approximation method for obtaining the spanwise lift distribution", NACA TM 948 (1940).
-H. Glauert, "The Elements of Aerofoil and Airscrew Theory" (1926), chapter XI.
+O. Schrenk, "A simple approximation method for obtaining the spanwise lift distribution", NACA TM
+948 (1940). H. Glauert, "The Elements of Aerofoil and Airscrew Theory" (1926), chapter XI.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
@@ -22,11 +22,11 @@ from fe.runtime.arrays import FloatArray
 from fe.structure.tables import Modulus, Part
 from reporting.toml_file import Fault
 
-_SHAPE = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
+_FOUR_DIGIT_COEFFICIENTS = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
 
 
 def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float) -> FloatArray:
-    """Half thickness of a symmetric four-digit section, as a fraction of the chord.
+    """Return the half thickness of a symmetric four-digit section, as a fraction of the chord.
 
     Parameters
     ----------
@@ -37,18 +37,19 @@ def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float)
 
     Returns
     -------
-    ndarray (...,)
+    (...,) array
+        The half thickness.
     """
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 0.0, 1.0)
-    a0, a1, a2, a3, a4 = _SHAPE
+    a0, a1, a2, a3, a4 = _FOUR_DIGIT_COEFFICIENTS
     polynomial = a0 * np.sqrt(xi) + xi * (a1 + xi * (a2 + xi * (a3 + xi * a4)))
     return np.asarray(5.0 * thickness_ratio * polynomial)
 
 
 def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> FloatArray:
-    """Slope of the upper surface, the derivative of `four_digit_half_thickness` (...,)."""
+    """Return the slope of the upper surface, the derivative of `four_digit_half_thickness`."""
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 1e-6, 1.0)
-    a0, a1, a2, a3, a4 = _SHAPE
+    a0, a1, a2, a3, a4 = _FOUR_DIGIT_COEFFICIENTS
     derivative = 0.5 * a0 / np.sqrt(xi) + a1 + xi * (2.0 * a2 + xi * (3.0 * a3 + 4.0 * xi * a4))
     return np.asarray(5.0 * thickness_ratio * derivative)
 
@@ -71,7 +72,7 @@ class Planform(Part):
     straight_chord_line: Fraction
 
     def chord(self, station: _Numbers) -> _Numbers:
-        """Chord (...,) [m] at fractions (...,) of the semi-span."""
+        """Return the chord (...,) [m] at fractions (...,) of the semi-span."""
         return self.root_chord + (self.tip_chord - self.root_chord) * station
 
 
@@ -82,7 +83,7 @@ class Airfoil(Part):
 
 
 class SkinBand(Part):
-    """Young's modulus [Pa] of the skin from the previous band's end to `end`, a fraction of the span."""
+    """Young's modulus [Pa] of the skin from the previous band's end to `end`, in spans."""
 
     end: Fraction
     young_modulus: Modulus
@@ -96,10 +97,10 @@ class SkinStation(Part):
 
 
 class Skin(Part):
-    """Shell of the wing; orthotropic with equal moduli, the shear moduli as ratios to Young's modulus.
+    """Shell of the wing, orthotropic with equal moduli; shear moduli are ratios to Young's modulus.
 
-    Young's modulus along the span is given either in `bands`, each of one modulus, or at `stations`, between
-    which it runs straight.
+    Young's modulus along the span is given either in `bands`, each of one modulus, or at
+    `stations`, between which it is linear.
     """
 
     thickness: Thickness
@@ -112,23 +113,35 @@ class Skin(Part):
     stations: tuple[SkinStation, ...] = ()
 
     def faults(self) -> Iterator[Fault]:
-        """Yield other than one course of the modulus."""
-        both = bool(self.bands) == bool(self.stations)
-        yield both, "Young's modulus must be given either in bands or at stations"
-        places = [place.station for place in self.stations]
-        off = places and (places != sorted({*places}) or (places[0], places[-1]) != (0.0, 1.0))
-        yield off, f"the stations must rise from 0 to 1, but are {places}"
+        """Yield the faults of Young's modulus along the span."""
+        has_both_or_none = bool(self.bands) == bool(self.stations)
+        yield has_both_or_none, "Young's modulus must be given either in bands or at stations"
+        stations = [place.station for place in self.stations]
+        yield (
+            bool(stations) and not _rises_from_0_to_1(stations),
+            f"the stations must rise from 0 to 1, but are {stations}",
+        )
         ends = [band.end for band in self.bands]
-        off = ends and ([0.0, *ends] != sorted({0.0, *ends}) or ends[-1] != 1.0)
-        yield off, f"the ends of the bands must rise from above 0 to 1, but are {ends}"
+        yield (
+            bool(ends) and not _rises_from_0_to_1([0.0, *ends]),
+            f"the ends of the bands must rise from above 0 to 1, but are {ends}",
+        )
 
     def young_modulus(self, station: FloatArray) -> FloatArray:
-        """Young's modulus (...,) [Pa] at fractions of the span (...,)."""
+        """Return Young's modulus (...,) [Pa] at fractions of the span (...,)."""
         if self.stations:
-            places = [place.station for place in self.stations]
-            return np.asarray(np.interp(station, places, [place.young_modulus for place in self.stations]))
-        moduli = np.array([band.young_modulus for band in self.bands])
-        return moduli[np.searchsorted([band.end for band in self.bands], station)]
+            stations = [place.station for place in self.stations]
+            moduli = [place.young_modulus for place in self.stations]
+            return np.asarray(np.interp(station, stations, moduli))
+        ends = [band.end for band in self.bands]
+        band_moduli = np.array([band.young_modulus for band in self.bands])
+        return band_moduli[np.searchsorted(ends, station)]
+
+
+def _rises_from_0_to_1(fractions: Sequence[float]) -> bool:
+    """Return whether fractions begin at 0, rise strictly, and end at 1."""
+    is_rising = list(fractions) == sorted({*fractions})
+    return is_rising and fractions[0] == 0.0 and fractions[-1] == 1.0
 
 
 class Wall(Part):
@@ -156,7 +169,7 @@ class Rib(Wall):
 class Rod(Part):
     """Solid round rod at mid-height of a web, from the root to `reach`, a fraction of the span.
 
-    Its flapwise bending stiffness and its mass are spread over the cells of that web.
+    Its flapwise bending stiffness and its mass are distributed over the cells of that web.
     """
 
     web: int = Field(ge=0)
@@ -167,7 +180,7 @@ class Rod(Part):
 
     @property
     def bending_stiffness(self) -> float:
-        """E I [N m^2]."""
+        """Bending stiffness E I [N m^2]."""
         return self.young_modulus * math.pi * self.diameter**4 / 64.0
 
     @property
@@ -177,7 +190,7 @@ class Rod(Part):
 
 
 class AddedDensity(Part):
-    """Density [kg/m^3] added to everything between two fractions of the span (glue, paint, wiring)."""
+    """Density [kg/m^3] of glue, paint or wiring, added between two fractions of the span."""
 
     start: Fraction
     end: Fraction
@@ -193,7 +206,7 @@ class Root(Part):
 
 
 class PointMassPlace(Part):
-    """Where a point mass of a kind sits; its mass is `masses.<kind>` until calibrated."""
+    """Location of a point mass of a kind; its mass is `masses.<kind>` until it is calibrated."""
 
     kind: Literal["servo", "pitot"]
     station: Fraction
@@ -210,9 +223,10 @@ class Masses(Part):
 class Gauges(Part):
     """Strain gauges on the upper skin, along the span.
 
-    Positions are (distance from the root [m], chord fraction); a gauge reads the strain averaged over a
-    patch of `averaging_chordwise` by `averaging_spanwise` [m], on the outer surface of the skin or in the
-    middle of its thickness, where the bending of the thin skin between its supports does not show.
+    Positions are (distance from the root [m], chord fraction). A gauge reads the strain averaged
+    over a rectangle of `averaging_chordwise` by `averaging_spanwise` [m], on the outer surface of
+    the skin, or in the middle of its thickness, where the bending of the thin skin between its
+    supports does not show.
     """
 
     averaging_chordwise: float = Field(ge=0.0, lt=1.0, description="m")
@@ -222,10 +236,10 @@ class Gauges(Part):
 
 
 class Defect(Part):
-    """Region of the upper skin that may lose stiffness: distances from the root [m], chord fractions.
+    """Region of the upper skin that may lose stiffness, between distances and chord fractions.
 
-    Its name is that of its loss everywhere: in states, FMU variables and scenarios. Without one it is z and
-    its number, from 1.
+    Its name is that of its loss everywhere: in states, FMU variables and scenarios. By default it
+    is z and the region's number, counted from 1.
     """
 
     name: str | None = Field(default=None, max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
@@ -238,10 +252,10 @@ class Defect(Part):
 class Lift(Part):
     """Net load of a level turn, linear in the load factor.
 
-    `force` [N] and `forward_force` [N] are the totals on the half-wing at `load_factor`. The lift is weighted
-    along the chord by (1 - xi)^`chordwise_exponent`, xi the chord fraction. With `inertia_relief` the weight
-    of the structure and of the nominal point masses, times the load factor, acts against the lift where it
-    lies; `force` stays the net total.
+    `force` [N] and `forward_force` [N] are the totals on the half-wing at `load_factor`. The lift
+    is weighted along the chord by (1 - xi)^`chordwise_exponent`, where xi is the chord fraction.
+    With `inertia_relief` the weight of the structure and of the nominal point masses, times the
+    load factor, acts against the lift where the masses are; `force` stays the net total.
     """
 
     distribution: Literal["schrenk", "lifting_line"]
@@ -253,16 +267,17 @@ class Lift(Part):
 
 
 class TipLoad(Part):
-    """Place of the static test load: distance from the tip [m] and chord fraction."""
+    """Point of the static test load: distance from the tip [m] and chord fraction."""
 
     distance_from_tip: float = Field(ge=0.0)
     chord: Fraction
 
 
 class MeshSettings(Part):
-    """Largest cell: along the span [m] and along the chord (fraction), and beside the edges of defects [m].
+    """Largest cells: along the span [m], along the chord (fraction), beside edges of defects [m].
 
-    All are divided by `refinement`. Without `edge_size` the cells beside the edges are like the others.
+    All are divided by `refinement`. Without `edge_size` the cells beside the edges are like the
+    others.
     """
 
     span_size: float = Field(gt=1e-3, lt=10.0)
@@ -272,7 +287,7 @@ class MeshSettings(Part):
 
 
 def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
-    """Mean of the chord and of the elliptic distribution of the same area.
+    """Return the mean of the chord and of an elliptic distribution of its area (Schrenk 1940).
 
     Parameters
     ----------
@@ -283,7 +298,7 @@ def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
 
     Returns
     -------
-    ndarray (...,)
+    (...,) array
         Lift per length over total lift [1/m].
     """
     eta = np.asarray(station, dtype=float)
@@ -293,22 +308,38 @@ def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
 
 
 def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> FloatArray:
-    """Prandtl's lifting line solved by Glauert's sine series, the lift slope of the section 2 pi.
+    """Return the lift of Prandtl's lifting line, solved by Glauert's sine series (Glauert 1926).
 
-    With y = -(b/2) cos(theta), the circulation is 2 b V sum A_n sin(n theta), n odd; collocation at
-    `terms` angles solves sum A_n sin(n theta) (n mu + sin theta) = mu alpha sin theta,
-    mu = c a0 / (4 b). The wing is untwisted and symmetric; `terms` is the number of odd harmonics, the rest
-    as of `schrenk`.
+    With y = -(b/2) cos(theta), the circulation is 2 b V sum A_n sin(n theta), n odd. Collocation at
+    `terms` angles solves sum A_n sin(n theta) (n mu + sin theta) = mu alpha sin theta with
+    mu = c a0 / (4 b) and the lift slope a0 = 2 pi. The wing is untwisted and symmetric.
+
+    Parameters
+    ----------
+    planform : Planform
+        The half-wing.
+    station : array_like (...,)
+        Fractions of the semi-span.
+    terms : int
+        Number of odd harmonics.
+
+    Returns
+    -------
+    (...,) array
+        Lift per length over total lift [1/m].
     """
-    theta = (np.arange(terms) + 1.0) * np.pi / (2.0 * terms)  # half-wing, tip excluded, root included
-    order = 2.0 * np.arange(terms) + 1.0
-    mu = (planform.chord(np.cos(theta)) * 2.0 * np.pi / (8.0 * planform.semi_span))[:, None]
-    sine = np.sin(np.outer(theta, order))
-    amplitude = np.linalg.solve(sine * (order * mu + np.sin(theta)[:, None]), mu[:, 0] * np.sin(theta))
-    # Integral of sum A_n sin(n theta) over the half-wing: only n = 1 contributes, A_1 pi/4 * semi-span.
+    # collocation on the half-wing, without the tip, with the root
+    theta = (np.arange(terms) + 1.0) * np.pi / (2.0 * terms)
+    n = 2.0 * np.arange(terms) + 1.0
+    chord = planform.chord(np.cos(theta))
+    mu = chord * 2.0 * np.pi / (8.0 * planform.semi_span)
+    sine = np.sin(np.outer(theta, n))
+    system = sine * (n * mu[:, None] + np.sin(theta)[:, None])
+    amplitude = np.linalg.solve(system, mu * np.sin(theta))
+    # Only n = 1 contributes to the integral over the half-wing, A_1 pi/4 times the semi-span.
     scale = 1.0 / (amplitude[0] * np.pi / 4.0 * planform.semi_span)
     angle = np.arccos(np.clip(np.asarray(station, dtype=float), 0.0, 1.0))
-    return np.asarray(scale * np.tensordot(np.sin(angle[..., None] * order), amplitude, axes=1))
+    return np.asarray(scale * np.tensordot(np.sin(angle[..., None] * n), amplitude, axes=1))
 
 
 DISTRIBUTIONS = {"schrenk": schrenk, "lifting_line": lifting_line}

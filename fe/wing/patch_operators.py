@@ -1,133 +1,292 @@
-"""Full operators of the primitives of `fe.runtime.patch`: what a missing effect does to the full model.
+"""Full operators of the primitives of `fe.runtime.patch`: effects on the full model.
 
-Stations are the sections of the mesh that hold nodes: its lines along the span and the middles between them.
-Forces and displacements of a section are those of lines along the span, the elastic line (the chord line of
-the static test) and the webs; between two of them the section moves as a straight line, beyond the outermost
-as the straight line through the last two, and a force goes to two lines by the law of the lever. A force
-between two webs therefore does not dent the thin skin; nor would one in a test, where a clamp or a cord
-around the section takes it.
+Stations are the sections of the mesh that hold nodes: its lines across the span and the middles
+between them. Forces and displacements of a section are those of lines along the span: the elastic
+line (the chord line of the static test) and the webs. Between two of them the section moves as a
+straight line, beyond the outermost as the straight line through the last two. A force goes to two
+lines by the law of the lever, so that a force between two webs does not dent the thin skin; nor
+would one in a test, where a clamp or a cord around the section takes it.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from scipy import sparse
 
-from fe.runtime.arrays import FloatArray
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import STANDARD_GRAVITY
 
-from . import operators as full
 from .design import WingDesign
+from .gauges import gauge_output
+from .mesh import WingMesh
+from .operators import AffineOperators, section_displacement, turn_load, upward
 
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
 
 
-class PatchOperators(NamedTuple):
-    """What `fe.runtime.wing_rows.PatchArrays` hold of a wing, on its n free unknowns, by the same names.
+class LineRows(NamedTuple):
+    """Displacements of lines along the span at P stations, as rows on the n free unknowns.
+
+    Attributes
+    ----------
+    elastic_x, elastic_y, elastic_z : csr (P, n)
+        The elastic line, along each axis.
+    others_z : tuple of csr (P, n)
+        The other lines, upwards.
+    """
+
+    elastic_x: sparse.csr_array
+    elastic_y: sparse.csr_array
+    elastic_z: sparse.csr_array
+    others_z: tuple[sparse.csr_array, ...]
+
+    @property
+    def stacked(self) -> tuple[sparse.csr_array, ...]:
+        """The rows in the order of `PatchArrays.line_rows`."""
+        return (self.elastic_x, self.elastic_y, self.elastic_z, *self.others_z)
+
+
+class StrainRows(NamedTuple):
+    """Strains at the G gauges as rows on the n free unknowns, positive as measured.
+
+    Attributes
+    ----------
+    along, across : csr (G, n)
+        Strain along the span, and across it.
+    shear : csr (G, n)
+        Engineering shear strain.
+    """
+
+    along: sparse.csr_array
+    across: sparse.csr_array
+    shear: sparse.csr_array
+
+
+class WingLayout(TypedDict):
+    """The fields of `fe.runtime.wing_rows.PatchArrays` that no basis changes."""
+
+    strip_lines: FloatArray
+    strip_of: IntArray
+    term_of: IntArray
+    flap_spring: float
+    semi_span: float
+    root_chord: float
+    tip_chord: float
+    straight_chord_line: float
+    load_place: float
+    stations: FloatArray
+    line_chord: FloatArray
+    station_weights: FloatArray
+    gauge_stations: FloatArray
+    gauge_length: float
+
+
+@dataclass(frozen=True)
+class PatchOperators:
+    """What `fe.runtime.wing_rows.PatchArrays` hold of a wing, on its n free unknowns.
 
     Attributes
     ----------
     operators : AffineOperators
-        The wing that they belong to.
-    rows : dict of str to csr (..., n), (n,), or a tuple of csr
-        What is multiplied with a basis; of `strain_rows` the first are `AffineOperators.gauge_output`.
-    plain : dict of str to array or float
+        The wing.
+    layout : WingLayout
         What has no unknowns.
-    strips : tuple of csr (n, n) N/m
-        Parts of the stiffness terms of the skin that lie in the strips.
+    line_rows : LineRows
+        Displacements of the lines along the span.
+    strain_rows : StrainRows
+        Strains at the gauges.
+    lift_rows : csr (P, n)
+        Lift of load factor 1 at each station, without the weight [N].
+    weight : (n,) array
+        Weight, downwards [N].
+    flap_row : (n,) array
+        Flapping rotation of the root [rad].
+    strips : tuple of csr (n, n)
+        The parts of the skin's stiffness terms that lie in the strips between mesh lines [N/m].
     """
 
-    operators: full.AffineOperators
-    rows: dict[str, Any]
-    plain: dict[str, Any]
+    operators: AffineOperators
+    layout: WingLayout
+    line_rows: LineRows
+    strain_rows: StrainRows
+    lift_rows: sparse.csr_array
+    weight: FloatArray
+    flap_row: FloatArray
     strips: tuple[sparse.csr_array, ...]
 
 
-def area_shares(stations: FloatArray, root_chord: float, tip_chord: float) -> FloatArray:
-    """Weights (P,) of the mean over the planform of what is quadratic between every other station."""
+class _SkinStrips(NamedTuple):
+    """The T parts of the skin's stiffness: a strip between mesh lines and a stiffness term each.
+
+    Attributes
+    ----------
+    strip_of, term_of : (T,) array of int
+        Strip and stiffness term of each part.
+    stiffness : tuple of csr (n, n)
+        The stiffness of each part [N/m].
+    """
+
+    strip_of: IntArray
+    term_of: IntArray
+    stiffness: tuple[sparse.csr_array, ...]
+
+
+def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> FloatArray:
+    """Return the weights of the mean over the planform, by Simpson's rule along the span.
+
+    Parameters
+    ----------
+    stations : (P,) array
+        Distances from the root [m]. Every other station ends an interval; the one between is its
+        middle.
+    root_chord, tip_chord : float
+        The chords [m].
+
+    Returns
+    -------
+    (P,) array
+        The weights; they sum to one.
+    """
     length = stations[2::2] - stations[:-2:2]
+    last_offset = len(stations) - 2
     weights = np.zeros(len(stations))
-    for offset, share in enumerate((1.0, 4.0, 1.0)):  # Simpson's rule
-        weights[offset : len(stations) - 2 + offset : 2] += share * length
+    for offset, simpson_weight in enumerate((1.0, 4.0, 1.0)):
+        weights[offset : last_offset + offset : 2] += simpson_weight * length
     weights *= root_chord + (tip_chord - root_chord) * stations / stations[-1]
     return np.asarray(weights / weights.sum())
 
 
 def section_lines(design: WingDesign) -> tuple[float, ...]:
-    """Return the chord fractions of the elastic line and of the webs that are other lines, ascending."""
-    elastic = design.tip_load.chord
-    webs = sorted((web.chord for web in design.webs), key=lambda chord: abs(chord - elastic))
-    lines = [elastic]
-    for chord in webs:  # the nearest first: what is too near to one gives no lever
+    """Return the chord fractions of the elastic line, then of the webs that are other lines.
+
+    The webs are in ascending order. A web that is too near to another line gives no lever; of two
+    such webs the one nearer to the elastic line is a line.
+    """
+    elastic_chord = design.tip_load.chord
+    web_chords = sorted(
+        (web.chord for web in design.webs), key=lambda chord: abs(chord - elastic_chord)
+    )
+    lines = [elastic_chord]
+    for chord in web_chords:
         if min(abs(chord - line) for line in lines) >= LEAST_LINE_DISTANCE:
             lines.append(chord)
-    return elastic, *sorted(lines[1:])
+    return elastic_chord, *sorted(lines[1:])
 
 
-def assemble_patch_operators(operators: full.AffineOperators) -> PatchOperators:
-    """Assemble the operators of the primitives for a wing.
+def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:
+    """Assemble the operators of the primitives of patches for a wing.
 
     Parameters
     ----------
     operators : AffineOperators
         The wing.
     """
-    mesh, design, expansion = operators.wing_mesh, operators.wing_mesh.design, operators.expansion
-    restriction = expansion.T.tocsr()
+    mesh = operators.wing_mesh
+    design = mesh.design
+    planform = design.planform
     lines = mesh.span_lines
     stations = np.sort(np.concatenate([lines, 0.5 * (lines[1:] + lines[:-1])]))
-    plan, chords = design.planform, section_lines(design)
-
-    def rows(chord: float, component: int) -> sparse.csr_array:
-        nodal = np.array([full.section_displacement(mesh, place, chord) for place in stations])
-        return sparse.csr_array(sparse.csr_array(nodal) @ expansion[component::3])
-
-    weight = -STANDARD_GRAVITY * full.upward(operators.body.nodal_mass)
-    lift = full.turn_load(operators.body)
-    if design.lift.inertia_relief:  # the load holds the weight
-        lift = lift - weight
-    node_station = np.abs(mesh.points[:, 1:2] - stations).argmin(axis=1)
-    by_station = sparse.coo_array(
-        (lift, (np.repeat(node_station, 3), np.arange(mesh.unknowns))), shape=(len(stations), len(lift))
-    ).tocsr()
-
-    along = operators.gauge_output
-    across, diagonal = (full.gauge_output(mesh, angle) @ expansion for angle in (0.5 * np.pi, 0.25 * np.pi))
-    strips = np.searchsorted(lines, mesh.centres[:, 1]) - 1
-    skin = np.flatnonzero(mesh.stiffness_term <= len(design.regions))
-    found, part_of = np.unique(
-        np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
-    )
-    flap = np.zeros(operators.unknowns)
-    flap[-2] = 1.0
+    line_chords = section_lines(design)
+    strips = _skin_strips(operators)
+    weight = -STANDARD_GRAVITY * upward(operators.body.nodal_mass)
+    flap_row = np.zeros(operators.unknowns)
+    flap_row[-2] = 1.0  # the last three unknowns are heave, flap and yaw of the root
     return PatchOperators(
         operators,
-        rows={
-            "flap_row": flap,
-            "line_rows": (
-                *(rows(chords[0], component) for component in range(3)),
-                *(rows(chord, 2) for chord in chords[1:]),
-            ),
-            "load_tip": operators.load_tip,
-            "load_lift": operators.load_lift,
-            "lift_rows": sparse.csr_array(by_station @ expansion),
-            "weight": np.asarray(restriction @ weight),
-            "strain_rows": (along, across, sparse.csr_array(2.0 * diagonal - along - across)),
-            "tip_row": operators.tip_row,
-        },
-        plain={
+        layout={
             "strip_lines": np.array(lines),
-            "strip_of": found[:, 0],
-            "term_of": found[:, 1],
+            "strip_of": strips.strip_of,
+            "term_of": strips.term_of,
             "flap_spring": design.root.flap_spring,
-            **plan.model_dump(),
-            "load_place": plan.semi_span - design.tip_load.distance_from_tip,
+            "semi_span": planform.semi_span,
+            "root_chord": planform.root_chord,
+            "tip_chord": planform.tip_chord,
+            "straight_chord_line": planform.straight_chord_line,
+            "load_place": planform.semi_span - design.tip_load.distance_from_tip,
             "stations": stations,
-            "line_chord": np.array(chords),
-            "station_weights": area_shares(stations, plan.root_chord, plan.tip_chord),
-            "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
+            "line_chord": np.array(line_chords),
+            "station_weights": area_weights(stations, planform.root_chord, planform.tip_chord),
+            "gauge_stations": np.array([distance for distance, _ in design.gauges.positions]),
             "gauge_length": design.gauges.averaging_spanwise,
         },
-        strips=tuple(operators.body.stiffness(skin[part_of == number]) for number in range(len(found))),
+        line_rows=_line_rows(mesh, stations, line_chords, operators.expansion),
+        strain_rows=_strain_rows(operators),
+        lift_rows=_lift_rows(operators, weight, stations),
+        weight=np.asarray(operators.expansion.T.tocsr() @ weight),
+        flap_row=flap_row,
+        strips=strips.stiffness,
     )
+
+
+def _line_rows(
+    mesh: WingMesh, stations: FloatArray, chords: tuple[float, ...], expansion: sparse.csr_array
+) -> LineRows:
+    """Return the displacements of the elastic line and of the other lines at stations (P,)."""
+
+    def rows(chord: float, component: int) -> sparse.csr_array:
+        nodal_weights = np.array(
+            [section_displacement(mesh, station, chord) for station in stations]
+        )
+        return sparse.csr_array(sparse.csr_array(nodal_weights) @ expansion[component::3])
+
+    elastic_chord, *other_chords = chords
+    return LineRows(
+        elastic_x=rows(elastic_chord, 0),
+        elastic_y=rows(elastic_chord, 1),
+        elastic_z=rows(elastic_chord, 2),
+        others_z=tuple(rows(chord, 2) for chord in other_chords),
+    )
+
+
+def _strain_rows(operators: AffineOperators) -> StrainRows:
+    """Return the strains of the gauges along the span, across it, and in shear.
+
+    The shear strain follows from the strain along the diagonal, as in a rosette.
+    """
+    mesh = operators.wing_mesh
+    along = operators.gauge_output
+    across = gauge_output(mesh, 0.5 * np.pi) @ operators.expansion
+    diagonal = gauge_output(mesh, 0.25 * np.pi) @ operators.expansion
+    return StrainRows(along, across, sparse.csr_array(2.0 * diagonal - along - across))
+
+
+def _lift_rows(
+    operators: AffineOperators, weight: FloatArray, stations: FloatArray
+) -> sparse.csr_array:
+    """Return the lift of load factor 1 by the station nearest to each node, csr (P, n) [N].
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The wing.
+    weight : (full,) array
+        Its weight at the nodes, downwards [N].
+    stations : (P,) array
+        Distances of the stations from the root [m].
+    """
+    mesh = operators.wing_mesh
+    lift = turn_load(operators.body)
+    if mesh.design.lift.inertia_relief:  # the load contains the weight
+        lift = lift - weight
+    _, span_position, _ = mesh.points.T
+    nearest_station = np.abs(span_position[:, np.newaxis] - stations).argmin(axis=1)
+    entries = (np.repeat(nearest_station, 3), np.arange(mesh.unknowns))
+    by_station = sparse.coo_array((lift, entries), shape=(len(stations), len(lift))).tocsr()
+    return sparse.csr_array(by_station @ operators.expansion)
+
+
+def _skin_strips(operators: AffineOperators) -> _SkinStrips:
+    """Return the stiffness of the skin, parted by strips between mesh lines and by terms."""
+    mesh = operators.wing_mesh
+    _, centre_position, _ = mesh.centres.T
+    strip_of_cell = np.searchsorted(mesh.span_lines, centre_position) - 1
+    skin = np.flatnonzero(mesh.stiffness_term <= len(mesh.design.regions))
+    pairs = np.stack((strip_of_cell, mesh.stiffness_term), axis=1)[skin]
+    parts, part_of_cell = np.unique(pairs, axis=0, return_inverse=True)
+    strip_of, term_of = parts.T
+    stiffness = tuple(
+        operators.body.stiffness(skin[part_of_cell == number]) for number in range(len(parts))
+    )
+    return _SkinStrips(strip_of, term_of, stiffness)

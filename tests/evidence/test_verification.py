@@ -76,7 +76,7 @@ def test_mass_and_sums_are_those_of_the_box(plate, coarse_design, coarse_operato
     """The net force of a turn stays; its moment falls, because the weight lies further out than the lift."""
     (heave, flap), lift, masses = rigid(plate), coarse_design.lift, coarse_design.masses
     # The box's section is straight between mesh lines, its skin cells are as thick as they stand upright.
-    box = wing_balance(coarse_operators)["mass"][0]
+    box = wing_balance(coarse_operators)["mass"].value
     assert heave @ (plate.mass_terms[0] @ heave) == pytest.approx(box, rel=0.02)
     assert heave @ (plate.mass_terms[1] @ heave) == pytest.approx(2.0)  # two servos of 1 kg
     assert heave @ (plate.mass_terms[2] @ heave) == pytest.approx(1.0)

@@ -12,7 +12,7 @@ from fmpy.validation import validate_fmu
 from calibration.errors import CalibrationRecordError
 from fe.full.factorisation import Factorisation
 from fe.structure.operators import load_and_assemble
-from fe.verification.calculix_comparison import calculix_program
+from fe.verification.calculix_run import calculix_program
 from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.progress import SilentProgress
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure

@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 
 from fe.runtime.errors import InvalidDesignError
 from fe.structure.design import Gauge, Gauged, MeshDesign, load_structure, parse_structure
-from fe.structure.location import gauge_rows, spread_rosettes
+from fe.structure.gauges import evenly_placed_rosettes, gauge_rows
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from reporting.arrays import Float, Index
@@ -267,7 +267,7 @@ def _joined(file: Path, candidates: str) -> MeshDesign:
 
 def _gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
     if candidates.isdecimal():
-        spread = spread_rosettes(mesh, int(candidates))
+        spread = evenly_placed_rosettes(mesh, int(candidates))
         return tuple(gauge for one in spread for gauge in one.gauges())
     content = read_toml(candidates, InvalidDesignError)
     found = validate(Gauged, content, candidates, InvalidDesignError, what="a file of gauges").gauge

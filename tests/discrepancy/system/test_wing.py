@@ -20,7 +20,7 @@ from discrepancy.fmu_models.model import FmuModel
 from discrepancy.system.structures import StructureModel, WingModel
 from discrepancy.system.system_model import State, SystemModel
 from fe.reduction.built_once import cache_folder
-from fe.reduction.model_cache import entry
+from fe.reduction.model_cache import cache_file
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, RootCompliance
 from fe.runtime.wing_rows import PatchArrays
@@ -116,7 +116,7 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     design = load_design().changed(mesh={"refinement": 0.25})
     cache_folder().mkdir()
-    entry("patches", design.hash, None).write_bytes(coarse_patch_arrays.to_bytes())
+    cache_file("patches", design.hash, None).write_bytes(coarse_patch_arrays.to_bytes())
     result = replace(make_calibration(), design=design, design_hash=design.hash)
     save_calibration(result, tmp_path / "wing.nc")
     model = WingModel.of_calibration(tmp_path / "wing.nc")

@@ -9,7 +9,7 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
-from fe.full import factorisation
+from fe.full import fronts
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.full.subspace import OrthonormalBasis
 from fe.runtime.errors import SolutionError
@@ -44,7 +44,7 @@ def test_solutions_are_those_of_a_general_solver(leaf, seed, size, share, copies
     right = np.random.default_rng(seed).standard_normal(shape)
     given_side = right.copy()
     with pytest.MonkeyPatch.context() as other:
-        other.setattr(factorisation, "LEAF_UNKNOWNS", leaf)
+        other.setattr(fronts, "LEAF_UNKNOWNS", leaf)
         found = Factorisation(matrix).riesz(right)
     assert np.array_equal(right, given_side)
     assert found.shape == shape

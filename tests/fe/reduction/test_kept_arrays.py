@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 from fe.compilation import compiled
 from fe.reduction import model_cache
 from fe.reduction.built_once import built_once, cache_folder
-from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
+from fe.reduction.model_cache import MODELLING_PACKAGES, cache_file, patch_arrays, reduced_model, wing_fields
 from fe.runtime import arrays as array_records
 from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
@@ -194,7 +194,7 @@ def test_what_is_unchanged_is_built_once_and_what_is_changed_anew(
 )
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "missing"])
 def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, kind, make, damage):
-    good, path = make(coarse_design).to_bytes(), entry(kind, coarse_design.hash, None)
+    good, path = make(coarse_design).to_bytes(), cache_file(kind, coarse_design.hash, None)
     content = bytearray(path.read_bytes())
     if damage == "flipped":
         content[len(content) // 3] ^= 0x55
@@ -223,7 +223,7 @@ def test_every_file_that_shapes_the_model_counts_for_the_key():
     words = [sys.executable, "-c", code]
     result = subprocess.run(words, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
     rooms = {name.split(".")[1] for name in result.stdout.split()}
-    assert rooms - {"designs", "sentences"} == set(MODELLING_ROOMS)
+    assert rooms - {"designs", "sentences"} == set(MODELLING_PACKAGES)
 
 
 @pytest.mark.slow

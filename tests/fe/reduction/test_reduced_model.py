@@ -197,7 +197,7 @@ def test_pymor_reduces_and_bounds_alike(beam):
         product=NumpyMatrixOperator(affine_sum(reference["theta"], terms.stiffness_terms)),
         coercivity_estimator=MinThetaParameterFunctional(coefficients, reference),
     ).reduce()
-    for state in terms.training()[::17]:
+    for state in terms.training_states()[::17]:
         theta = terms.theta(state)
         mu = reduced.parameters.parse({"theta": theta})
         given = dict(zip(("e", "z1", "z2"), state, strict=True))

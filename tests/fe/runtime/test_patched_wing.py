@@ -17,10 +17,10 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
 from fe.runtime.wing_rows import PatchArrays
+from fe.wing.gauges import gauge_output
 from fe.wing.operators import (
     AffineOperators,
     assemble,
-    gauge_output,
     lift_load,
     point_masses,
     section_displacement,
@@ -317,7 +317,7 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     state = motion.at_rest(model.load_coefficients(vector))
     for _ in range(3):
         state = motion.advance(state, 2e-3, model.load_coefficients(let_go))
-    stiffness, mass, load = beam.at({**values, "push": 100.0})
+    stiffness, mass, load = beam.system_at({**values, "push": 100.0})
     stiffness, inverse, n = stiffness.toarray(), np.linalg.inv(mass.toarray()), len(load)
     start = np.linalg.solve(stiffness, load)
     damping = model.damping[0] * np.eye(n) + model.damping[1] * inverse @ stiffness

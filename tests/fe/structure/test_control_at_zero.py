@@ -8,7 +8,8 @@ import pytest
 from fe.runtime.errors import MeshError, SolutionError
 from fe.structure.affine import static_responses
 from fe.structure.operators import load_and_assemble
-from fe.verification.calculix_comparison import agreement, structure_deck
+from fe.verification.calculix_comparison import agreement
+from fe.verification.calculix_deck import structure_deck
 from tests.calculix_decks import needs_calculix
 from tests.meshes import box
 

@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fe.elements import cells as assembly
+from fe.elements.cells import CellMesh
+from fe.elements.elasticity import isotropic_compliance
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime import errors
 from fe.structure.affine import static_responses
 from fe.structure.design import Gauge, Material
-from fe.structure.location import attach, gauge_rows, on_surface
+from fe.structure.gauges import gauge_rows
+from fe.structure.location import attach, on_surface
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import memory_estimate, read_mesh
-from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
-from fe.verification.calculix_comparison import agreement, structure_deck
+from fe.structure.operators import Structure, load_and_assemble, mass_and_centre, write_structure_vtu
+from fe.verification.calculix_comparison import agreement
+from fe.verification.calculix_deck import structure_deck
 from tests.calculix_decks import needs_calculix
 from tests.meshes import box
 from tests.refusals import Inputs, refused
@@ -60,7 +63,7 @@ def distorted(request: pytest.FixtureRequest, write: Callable[..., Path]) -> Str
 def test_patch_test_and_gauges(distorted):
     gradient = 1e-3 * np.array([[1.0, 2.0, -0.5], [0.3, -1.5, 0.8], [0.6, -0.2, 0.9]])
     exact = distorted.points @ gradient.T
-    elasticity = np.linalg.inv(assembly.isotropic_compliance(7e10, 0.3))
+    elasticity = np.linalg.inv(isotropic_compliance(7e10, 0.3))
     K = distorted.stiffness(np.arange(len(distorted.cells)), elasticity)
     inner = ((distorted.points > 1e-9) & (distorted.points < np.array([1, 2, 0.5]) - 1e-9)).all(axis=1)
     assert inner.any()
@@ -83,7 +86,7 @@ def test_patch_test_and_gauges(distorted):
 
 def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted):
     points, cells = box(distorted.kind.file_type, (1, 1, 1))
-    mass = assembly.CellMesh(distorted.kind, points, cells).mass(np.arange(len(cells)), 1.0)
+    mass = CellMesh(distorted.kind, points, cells).mass(np.arange(len(cells)), 1.0)
     power = np.array(PRODUCTS[distorted.kind.file_type])
     field = (points**power).prod(axis=1)
     assert field @ (mass @ field) == pytest.approx((1.0 / (2.0 * power + 1.0)).prod())
@@ -185,7 +188,7 @@ def test_a_thick_ring_under_pressure_converges_to_lame(kind, order, error, made)
         # The work of the pressure converges with twice the order of the strains.
         work = float(structure.load("p") @ found.displacement)
         errors.append(abs(work / (1e6 * wanted * 0.5 * np.pi * INNER * 0.1) - 1.0))
-        lost.append(abs(weighed(structure)[0] / mass - 1.0))
+        lost.append(abs(mass_and_centre(structure)[0] / mass - 1.0))
         if kind == "hexahedron20":
             assert found.strain[0] == pytest.approx(wanted / INNER, rel=0.05 / count**2)
     assert errors[1] < error
@@ -216,7 +219,7 @@ def test_a_cantilever_has_the_figures_of_a_beam(made):
         assert found[name].output[0] == pytest.approx(wanted, rel=1e-3)
     strain = 2.0 * 0.5 * 0.005 / stiffness
     np.testing.assert_allclose(found["tip"].strain, [-strain, strain], rtol=1e-6)
-    mass, centre = weighed(structure)
+    mass, centre = mass_and_centre(structure)
     assert mass == pytest.approx(area_mass + 0.4)
     np.testing.assert_allclose(centre, [0.5, 0.03, 0.005], atol=1e-12)
 

@@ -14,10 +14,13 @@ from fe.elements.cells import jacobians
 from fe.elements.kinds import gauss_points
 from fe.runtime.errors import CalculixError, InvalidDesignError, MeshError
 from fe.runtime.state import STANDARD_GRAVITY, DigitalState
-from fe.verification import calculix_comparison as comparison
 from fe.verification import wing_checks
+from fe.verification.calculix_comparison import agreement
+from fe.verification.calculix_deck import wing_deck
+from fe.verification.calculix_run import read_frequencies, read_tables, run_calculix
 from fe.wing import operators as modelled
 from fe.wing.design import SHIPPED_DESIGN, parse_design
+from fe.wing.gauges import gauge_output
 from fe.wing.mesh import build_mesh
 from fe.wing.operators import assemble, eigenmodes, lift_load
 from fe.wing.parts import DISTRIBUTIONS, Planform, lifting_line
@@ -161,7 +164,7 @@ def test_a_gauge_in_the_middle_does_not_see_the_bending_of_the_skin(coarse_desig
     for surface in ("outer", "middle"):
         mesh = build_mesh(coarse_design.changed(gauges={"surface": surface}))
         _, y, z = mesh.points.T
-        readings.append(modelled.gauge_output(mesh) @ np.stack((0.0 * y, -2.0 * y * z, y**2), axis=1).ravel())
+        readings.append(gauge_output(mesh) @ np.stack((0.0 * y, -2.0 * y * z, y**2), axis=1).ravel())
     # The plane sections turn about z = 0: the surface reads more by the curvature times half the thickness.
     assert readings[0] - readings[1] == pytest.approx(np.full(24, coarse_design.skin.thickness), rel=0.15)
 
@@ -224,13 +227,14 @@ def test_sums_agree_and_every_gauge_converges_by_name(coarse_design, coarse_oper
 
 @pytest.mark.long
 def test_the_mesh_converges(shipped_design):
-    found = wing_checks.mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
-    assert (np.diff(found["unknowns"]) > 0).all()
-    for name in ("tip stiffness", "first bending", "second bending"):
-        coarse, half, one = found[name]
+    meshes = wing_checks.mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
+    assert (np.diff([mesh.unknowns for mesh in meshes]) > 0).all()
+    for name in ("tip_stiffness", "first_bending", "second_bending"):
+        coarse, half, one = (getattr(mesh, name) for mesh in meshes)
         assert one == pytest.approx(half, rel=0.025)
         assert half == pytest.approx(coarse, rel=0.025)
-    assert np.sqrt(np.mean((found["strain"][2] / found["strain"][1] - 1.0) ** 2)) < 0.05
+    _, half, one = (mesh.strain for mesh in meshes)
+    assert np.sqrt(np.mean((one / half - 1.0) ** 2)) < 0.05
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0, 3.7])
@@ -266,7 +270,7 @@ PLACES = {"nodal displacements": 1e-5, "displacement outputs": 1e-5, "strains at
 )
 def test_statics_and_frequencies_agree(state, changes, coarse_design, tmp_path):
     wing = assemble(coarse_design.changed(mesh=FEW_CELLS, **changes))
-    found = comparison.agreement(comparison.wing_deck(wing, DigitalState(**state)), tmp_path, 6)
+    found = agreement(wing_deck(wing, DigitalState(**state)), tmp_path, 6)
     assert list(found.loads) == ["tip force", "lift"]
     for differences in found.loads.values():
         assert all(differences[name] < most for name, most in PLACES.items())
@@ -278,23 +282,23 @@ def test_statics_and_frequencies_agree(state, changes, coarse_design, tmp_path):
 @needs_calculix
 def test_an_input_that_calculix_refuses_is_one_sentence(tmp_path):
     with pytest.raises(CalculixError, match=r"did not finish .*bad\.inp.*bad\.log"):
-        comparison.run_calculix("*NONSENSE\n*STEP\n*STATIC\n*END STEP\n", tmp_path, "bad")
+        run_calculix("*NONSENSE\n*STEP\n*STATIC\n*END STEP\n", tmp_path, "bad")
 
 
 def test_calculix_that_is_not_there_is_one_sentence(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CalculixError, match="apt-get install calculix-ccx"):
-        comparison.run_calculix("", tmp_path, "job")
+        run_calculix("", tmp_path, "job")
 
 
 TABLES, EIGENVALUES = (INPUTS.text(f"{name}.dat") for name in ("tables", "eigenvalues"))
 
 
 def test_printed_tables_are_read_or_refused():
-    tables = {name: [rows.tolist() for rows in own] for name, own in comparison.read_tables(TABLES).items()}
+    tables = {name: [rows.tolist() for rows in own] for name, own in read_tables(TABLES).items()}
     assert tables == {"NALL": [[[1, 0.1, -2, 0], [2, 0.3, 4, 5]]], "E0": [[[1, 1, 2.5]]]}
-    assert comparison.read_frequencies(EIGENVALUES).tolist() == [5.632151, 15.09876]
+    assert read_frequencies(EIGENVALUES).tolist() == [5.632151, 15.09876]
     with pytest.raises(CalculixError, match="not a row of numbers"):
-        comparison.read_tables(TABLES.replace("-2.000000E+00", "*************"))
+        read_tables(TABLES.replace("-2.000000E+00", "*************"))
     with pytest.raises(CalculixError, match="no eigenvalues"):
-        comparison.read_frequencies(TABLES)
+        read_frequencies(TABLES)

@@ -1,0 +1,94 @@
+"""Compliance and elasticity of materials, and their axes.
+
+Strains are in Voigt order 11, 22, 33, 23, 13, 12 with engineering shear strains.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fe.runtime.arrays import FloatArray
+
+VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+"""Indices ij of the strains in Voigt order."""
+_VOIGT_NUMBER = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
+"""Number in Voigt order of the strain ij."""
+
+
+def orthotropic_compliance(
+    moduli: ArrayLike, ratios: ArrayLike, shear_moduli: ArrayLike
+) -> FloatArray:
+    """Return the compliance of an orthotropic material in its axes.
+
+    Parameters
+    ----------
+    moduli : (3,) array or float
+        Young's moduli along the axes [Pa].
+    ratios : (3,) array or float
+        Poisson's ratios 12, 13, 23; ratio ij is the contraction along j under tension along i.
+    shear_moduli : (3,) array or float
+        Shear moduli 12, 13, 23 [Pa].
+
+    Returns
+    -------
+    (6, 6) array
+        The compliance [1/Pa].
+    """
+    young, ratio, shear = (np.broadcast_to(values, 3) for values in (moduli, ratios, shear_moduli))
+    compliance = np.diag(1.0 / np.concatenate((young, shear[::-1])))
+    for (i, j), ratio_ij in zip(((0, 1), (0, 2), (1, 2)), ratio, strict=True):
+        compliance[i, j] = -ratio_ij / young[i]
+        compliance[j, i] = compliance[i, j]
+    return compliance
+
+
+def isotropic_compliance(young_modulus: float, poisson_ratio: float) -> FloatArray:
+    """Return the compliance (6, 6) [1/Pa] of an isotropic material."""
+    shear_modulus = young_modulus / (2.0 * (1.0 + poisson_ratio))
+    return orthotropic_compliance(young_modulus, poisson_ratio, shear_modulus)
+
+
+def unit_vector(vectors: ArrayLike) -> FloatArray:
+    """Return vectors (..., 3) of length one along vectors (..., 3)."""
+    values = np.asarray(vectors, dtype=np.float64)
+    return np.asarray(values / np.linalg.norm(values, axis=-1, keepdims=True))
+
+
+def axes_of(first: ArrayLike, second: ArrayLike) -> FloatArray:
+    """Return orthonormal axes from two vectors that span a plane.
+
+    Parameters
+    ----------
+    first, second : (3,) array
+        The vectors.
+
+    Returns
+    -------
+    (3, 3) array
+        Rows: along the first vector, at right angles to it in the plane, normal to the plane.
+    """
+    along = np.asarray(first, dtype=np.float64)
+    normal = np.cross(along, np.asarray(second, dtype=np.float64))
+    return unit_vector([along, np.cross(normal, along), normal])
+
+
+def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return elasticity in space from elasticity in local axes.
+
+    Parameters
+    ----------
+    elasticity : (n, 6, 6) array
+        Elasticity in the local axes [Pa].
+    axes : (n, 3, 3) array
+        The local axes, as rows.
+
+    Returns
+    -------
+    (n, 6, 6) array
+        Elasticity in space [Pa].
+    """
+    tensor = elasticity[:, _VOIGT_NUMBER[:, :, None, None], _VOIGT_NUMBER]
+    rotated = np.einsum(
+        "nabcd,nai,nbj,nck,ndl->nijkl", tensor, axes, axes, axes, axes, optimize=True
+    )
+    i, j = np.transpose(VOIGT)
+    return np.asarray(rotated[:, i, j][:, :, i, j])

@@ -1,0 +1,143 @@
+"""Symbolic analysis of a sparse matrix: the order of elimination, and the fronts.
+
+A front is a small dense matrix of two kinds of unknowns: those that a leaf or separator of a nested
+dissection holds (its pivots), and those that the pivots are coupled to later (its boundary).
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from fe.runtime.arrays import IntArray
+
+from .dissection import elimination_blocks
+
+LEAF_UNKNOWNS = 120
+"""Parts of the mesh with up to so many unknowns are eliminated as one dense front."""
+
+
+class Front(NamedTuple):
+    """Unknowns that are eliminated together, by their positions in the order of elimination.
+
+    Attributes
+    ----------
+    start, end : int
+        The pivots are at positions start to end - 1.
+    boundary : (b,) array of int
+        Later positions that the pivots are coupled to, ascending.
+    parent : int
+        Number of the front that receives the Schur complement; -1 if the boundary is empty.
+    """
+
+    start: int
+    end: int
+    boundary: IntArray
+    parent: int
+
+
+def analyse(matrix: sparse.csr_array) -> tuple[IntArray, tuple[Front, ...]]:
+    """Find an order of elimination by nested dissection, and the fronts that follow from it.
+
+    Parameters
+    ----------
+    matrix : csr (n, n)
+        A symmetric pattern with a full diagonal; the values do not count.
+
+    Returns
+    -------
+    order : (n,) array of int
+        The unknown at each position of the order.
+    fronts : tuple of Front
+        The fronts in the order of elimination.
+    """
+    # unknowns with equal rows, such as those of a node, are ordered as one group
+    first, group_of_unknown = _groups_of_equal_rows(matrix)
+    graph = matrix[first][:, first]
+    sizes = np.bincount(group_of_unknown)
+    block = elimination_blocks(graph, sizes.astype(np.float64), LEAF_UNKNOWNS)
+    order = np.argsort(block, kind="stable")
+    block_starts = np.unique(block)
+    position = np.empty(len(order), dtype=np.int64)
+    position[order] = np.arange(len(order))
+    # from positions of groups to positions of unknowns
+    sizes = sizes[order]
+    offsets = np.concatenate(([0], np.cumsum(sizes)))
+    fronts = tuple(
+        Front(
+            start=int(offsets[front.start]),
+            end=int(offsets[front.end]),
+            boundary=_positions_of_unknowns(front.boundary, sizes, offsets),
+            parent=front.parent,
+        )
+        for front in _fronts_of_groups(graph[order], position, block_starts)
+    )
+    return np.argsort(position[group_of_unknown], kind="stable"), fronts
+
+
+def _groups_of_equal_rows(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]:
+    """Group the unknowns that are coupled to the same unknowns.
+
+    Rows are compared by the sum of random 64-bit keys of their columns. If two different rows ever
+    had the same sum, the order of elimination would still be valid, only less efficient.
+
+    Returns
+    -------
+    first : (g,) array of int
+        The first unknown of each group.
+    group : (n,) array of int
+        The group of each unknown.
+    """
+    keys = np.random.default_rng(1973).integers(2**63, size=matrix.shape[0], dtype=np.int64)
+    sums = np.add.reduceat(keys[matrix.indices], matrix.indptr[:-1])
+    _, first, group = np.unique(sums, return_index=True, return_inverse=True)
+    return first.astype(np.int64), group.astype(np.int64)
+
+
+def _fronts_of_groups(
+    graph: sparse.csr_array, position: IntArray, starts: IntArray
+) -> Iterator[Front]:
+    """Yield the fronts in positions of the groups of unknowns.
+
+    Parameters
+    ----------
+    graph : csr (g, g)
+        The graph of groups, its rows in the order of elimination.
+    position : (g,) array of int
+        The position of each group.
+    starts : (f,) array of int
+        The first position of each front.
+    """
+    ends = np.append(starts[1:], graph.shape[0])
+    front_of_position = np.repeat(np.arange(len(starts)), ends - starts)
+    coupled_positions = position[graph.indices]
+    boundaries_of_children: list[list[IntArray]] = [[] for _ in starts]
+    for start, end, child_boundaries in zip(
+        starts.tolist(), ends.tolist(), boundaries_of_children, strict=True
+    ):
+        coupled = coupled_positions[graph.indptr[start] : graph.indptr[end]]
+        positions = np.unique(np.concatenate((coupled, *child_boundaries)))
+        boundary = positions[np.searchsorted(positions, end) :]
+        parent = int(front_of_position[boundary[0]]) if len(boundary) else -1
+        if parent >= 0:
+            boundaries_of_children[parent].append(boundary)
+        yield Front(start, end, boundary, parent)
+
+
+def _positions_of_unknowns(groups: IntArray, sizes: IntArray, offsets: IntArray) -> IntArray:
+    """Return the positions of all unknowns of some groups.
+
+    Parameters
+    ----------
+    groups : (b,) array of int
+        Positions of the groups.
+    sizes : (g,) array of int
+        The number of unknowns of each group.
+    offsets : (g + 1,) array of int
+        The position of the first unknown of each group.
+    """
+    counts = sizes[groups]
+    counts_before = np.cumsum(counts) - counts
+    first_positions = np.repeat(offsets[groups] - counts_before, counts)
+    return np.asarray(first_positions + np.arange(counts.sum()))

@@ -1,0 +1,171 @@
+"""Approximate dual solutions of the outputs, on which the sharpness of the error bound rests.
+
+At each anchor, a few dual solutions of each output span a reduced basis of that output, in which
+they are combined for each state (Rozza, Huynh and Patera 2008). Displacements and loads are
+whitened, see `fe.full.subspace`.
+"""
+
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+
+from fe.full.subspace import solve_near
+from fe.runtime.arrays import FloatArray
+from reporting.progress import Stage
+
+from .terms import ReductionTerms
+
+OUTPUTS_PER_BATCH = 8
+"""Outputs whose dual solutions are evaluated together."""
+DUAL_TOLERANCE = 0.01
+"""Relative residual of approximate dual solutions at their own states."""
+LEAST_DUAL_RESIDUAL = 1e-5
+"""Rounding allowance for the residual of a dual solution, relative to its output."""
+LEAST_DUAL_LENGTH = 1e-3
+"""Shorter directions of an output's dual solutions are dropped, relative to the longest."""
+
+
+class DualSolutions(NamedTuple):
+    """Reduced bases of the dual solutions of O outputs at A anchors, each of M functions.
+
+    Attributes
+    ----------
+    functions : (A, M, O, n) array
+        The functions in whitened coordinates, orthonormal for each output, zero where there are
+        fewer than M.
+    residual : (A, O, R, R) array
+        Field `dual_residual` of `ReducedArrays`.
+    stiffness : (A, O, T, M, M) array
+        Field `dual_stiffness` of `ReducedArrays`.
+    output : (A, O, M) array
+        Field `dual_output` of `ReducedArrays`.
+    """
+
+    functions: FloatArray
+    residual: FloatArray
+    stiffness: FloatArray
+    output: FloatArray
+
+
+def dual_solutions(terms: ReductionTerms, outputs: FloatArray, stage: Stage) -> DualSolutions:
+    """Solve K psi = l for each output l roughly, and compute the norms of the residuals.
+
+    Parameters
+    ----------
+    terms : ReductionTerms
+        The full model, with n free unknowns.
+    outputs : (n, O) array
+        Its outputs, whitened.
+    stage : Stage
+        Advances after each state.
+
+    Raises
+    ------
+    SolutionError
+        If conjugate gradients do not converge.
+    """
+    functions: list[FloatArray] = []
+    residuals: list[FloatArray] = []
+    stiffness: list[FloatArray] = []
+    for anchor in terms.anchors():
+        solutions = []
+        for theta in anchor:
+            solutions.append(_solve_duals(terms, theta, outputs))
+            stage.advance(1, "dual solutions")
+        directions = _dual_directions(solutions)
+        functions.append(directions.transpose(2, 0, 1))
+        for residual, projected in _project_duals(terms, outputs, directions):
+            residuals.append(residual)
+            stiffness.append(projected)
+    duals = np.array(functions)
+    shape = (len(duals), outputs.shape[1])
+    return DualSolutions(
+        functions=duals,
+        residual=np.array(residuals).reshape(*shape, *residuals[0].shape),
+        stiffness=np.array(stiffness).reshape(*shape, *stiffness[0].shape),
+        output=np.einsum("no,amon->aom", outputs, duals),
+    )
+
+
+def _solve_duals(terms: ReductionTerms, theta: FloatArray, outputs: FloatArray) -> FloatArray:
+    """Return approximate dual solutions (n, O) of outputs (n, O) at coefficients (T,)."""
+    return solve_near(
+        terms.factors,
+        terms.stiffness_terms,
+        np.tile(theta[:, np.newaxis], outputs.shape[1]),
+        outputs,
+        start=outputs,
+        tolerance=DUAL_TOLERANCE,
+    )
+
+
+def _dual_directions(solutions: list[FloatArray]) -> FloatArray:
+    """Return the directions (O, n, M) that M dual solutions (n, O) of each output span."""
+    by_output = np.stack(solutions, axis=2).swapaxes(0, 1)
+    directions, lengths, _ = np.linalg.svd(by_output, full_matrices=False)
+    longest = lengths[:, :1]
+    is_long = lengths > LEAST_DUAL_LENGTH * longest
+    directions *= is_long[:, np.newaxis]
+    return np.asarray(directions)
+
+
+def _project_duals(
+    terms: ReductionTerms, outputs: FloatArray, directions: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the residual factor and the projected stiffness (T, M, M) of each output's directions.
+
+    Parameters
+    ----------
+    terms : ReductionTerms
+        The full model.
+    outputs : (n, O) array
+        The outputs, whitened.
+    directions : (O, n, M) array
+        The directions of each output, whitened.
+    """
+    factors = terms.factors
+    size, count = outputs.shape
+    displacements = factors.unwhitened(directions.swapaxes(0, 1).reshape(size, -1))
+    displacements = displacements.reshape(size, count, -1)
+    projections = []
+    # the outputs in batches, which limits the memory of the images
+    for batch in np.array_split(np.arange(count), ceil(count / OUTPUTS_PER_BATCH)):
+        flat = displacements[:, batch].reshape(size, -1)
+        images = np.stack(
+            [(term @ flat).reshape(size, len(batch), -1) for term in terms.stiffness_terms]
+        )
+        # the images as whitened forces, all terms of an output side by side
+        forces = factors.whitened(np.moveaxis(images, 0, 2).reshape(size, -1))
+        forces_by_output = forces.reshape(size, len(batch), -1).swapaxes(0, 1)
+        projected_terms = np.einsum(
+            "nom,tnok->otmk", displacements[:, batch], images, optimize=True
+        )
+        for output, projected, force in zip(
+            outputs[:, batch].T, projected_terms, forces_by_output, strict=True
+        ):
+            # A dropped direction is zero; a one on the diagonal keeps the system solvable.
+            is_dropped = np.diagonal(projected.sum(axis=0)) == 0.0
+            projected[-1] += np.diag(is_dropped)
+            projections.append((_residual_factor(output, force), projected))
+    return projections
+
+
+def _residual_factor(output: FloatArray, force: FloatArray) -> FloatArray:
+    """Return a triangular factor whose columns have the inner products of output and forces.
+
+    Parameters
+    ----------
+    output : (n,) array
+        The output.
+    force : (n, T M) array
+        The stiffness terms times the directions of its dual solutions.
+
+    Returns
+    -------
+    (2 + T M, 1 + T M) array
+        The factor; its last row is the allowance for rounding.
+    """
+    columns = np.column_stack((output, force))
+    allowance = LEAST_DUAL_RESIDUAL * np.linalg.norm(output) * np.eye(1, columns.shape[1])
+    return np.concatenate((np.linalg.qr(columns, mode="r"), allowance))

@@ -1,0 +1,247 @@
+"""The modal basis of a reduced model, in which the first eigenmodes are accurate for every state.
+
+A working basis is grown by Davidson corrections until the modes of sampled states have small
+residuals in it. The modes of many states, computed in the working basis, are then compressed by
+singular values. `docs/reduced_model.md` describes the method and its accuracy.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.linalg import eigh
+
+from fe.full.factorisation import most_compliant_modes
+from fe.full.subspace import ProjectedBasis, affine_product, project_terms
+from fe.runtime.arrays import BoolArray, FloatArray
+from fe.runtime.errors import ReductionError
+from reporting.progress import Stage
+
+from .certified_basis import STATES_PER_ROUND, fewest_directions
+from .model_fields import ModalReduction
+from .terms import ModalState, ReductionTerms
+
+START_ITERATIONS = 4
+"""Inverse iterations that start the working basis of the modes."""
+START_EXTRA_VECTORS = 4
+"""Vectors of these iterations beyond the modes that are computed."""
+EXTRA_MODES = 2
+"""Modes that are computed beyond those that are wanted, because modes change their order."""
+MODAL_DROP = 1e-6
+"""Shorter directions are dropped from the working basis, relative to the vectors of their block."""
+RESIDUAL_TOLERANCE = 3e-3
+"""Relative residual of the sampled modes in the working basis; frequencies err by about its
+square."""
+FREQUENCY_TOLERANCE = 1e-5
+"""Relative error of a frequency that compression may add."""
+MOST_CORRECTIONS = 12
+"""Limit of Davidson corrections for one state."""
+
+
+def projected_modes(
+    stiffness_terms: FloatArray, mass_terms: FloatArray, state: ModalState, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the first modes of a projected model at a state.
+
+    Parameters
+    ----------
+    stiffness_terms : (T, k, k) array
+        The projected stiffness terms.
+    mass_terms : (Q, k, k) array
+        The projected mass terms.
+    state : ModalState
+        The coefficients of both.
+    count : int
+        The number of modes.
+
+    Returns
+    -------
+    squares : (count,) array
+        The squared angular frequencies.
+    shapes : (k, count) array
+        The mass-normalised shapes.
+    """
+    stiffness = np.tensordot(state.stiffness, stiffness_terms, 1)
+    mass = np.tensordot(state.mass, mass_terms, 1)
+    squares, shapes = eigh(stiffness, mass, subset_by_index=[0, count - 1])
+    return np.asarray(squares), np.asarray(shapes)
+
+
+def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalReduction:
+    """Make a basis for the first modes of a structure, and the modal fields of its reduced model.
+
+    Parameters
+    ----------
+    terms : ReductionTerms
+        The full model.
+    count : int
+        The number of modes.
+    stage : Stage
+        Advances after each sampled state.
+
+    Raises
+    ------
+    ReductionError
+        If the modes of a sampled state do not converge, the structure has too few unknowns for
+        the modes, or its masses move in too few ways.
+    """
+    structure = terms.structure
+    mode_count = count + EXTRA_MODES
+    if structure.unknowns <= 2 * mode_count:
+        raise ReductionError(
+            f"{count} modes cannot be had from {structure.unknowns} unknowns; ask for fewer or "
+            "refine."
+        )
+    working = _start_basis(terms, mode_count)
+    try:
+        _refine(terms, working, mode_count, stage)
+        directions = _compressed_directions(working, terms.compression_states(), count)
+    except np.linalg.LinAlgError:
+        raise ReductionError(
+            f"The masses of {structure.design.name} move in fewer ways than the {mode_count} modes "
+            "that are looked for; give its materials a density."
+        ) from None
+    return _projected_on(terms, working, directions, count)
+
+
+def _start_basis(terms: ReductionTerms, mode_count: int) -> ProjectedBasis:
+    """Return a working basis from a few inverse iterations on a block of vectors.
+
+    The iterations are not converged: the refinement corrects what they leave.
+    """
+    structure = terms.structure
+    factors = terms.factors
+    middle_masses = np.append(1.0, terms.masses.mean(axis=1))
+    shape = (structure.unknowns, mode_count + START_EXTRA_VECTORS)
+    vectors = np.random.default_rng(1).normal(size=shape)
+    for _ in range(START_ITERATIONS):
+        shapes = factors.unwhitened(vectors)
+        inertia = affine_product(structure.mass_terms, middle_masses, shapes)
+        vectors = np.linalg.qr(factors.whitened(inertia))[0]
+    working = ProjectedBasis(factors, terms.stiffness_terms, structure.mass_terms, drop=MODAL_DROP)
+    working.add(vectors)
+    return working
+
+
+def _refine(terms: ReductionTerms, working: ProjectedBasis, mode_count: int, stage: Stage) -> None:
+    """Grow the working basis until the modes of all sampled states have small residuals in it."""
+    states = terms.refinement_states()
+    for first in range(0, len(states), STATES_PER_ROUND):
+        batch = states[first : first + STATES_PER_ROUND]
+        for _ in _refine_states(terms, working, batch, mode_count):
+            stage.advance()
+
+
+def _refine_states(
+    terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], mode_count: int
+) -> Iterator[ModalState]:
+    """Add Davidson corrections X^-1 (K - omega^2 M) phi; yield each state whose modes converged."""
+    largest = np.inf
+    for _ in range(MOST_CORRECTIONS):
+        corrections, sizes = _davidson_corrections(terms, working, states, mode_count)
+        is_large = sizes > RESIDUAL_TOLERANCE
+        needs_correction: BoolArray = np.any(is_large.reshape(len(states), -1), axis=1)
+        by_state = list(zip(states, needs_correction, strict=True))
+        yield from (state for state, corrected in by_state if not corrected)
+        if not needs_correction.any():
+            return
+        largest = float(sizes.max())
+        working.add(corrections[:, is_large])
+        states = [state for state, corrected in by_state if corrected]
+    raise ReductionError(
+        f"The modes of a sampled state reached a residual of {largest:.2g} only in "
+        f"{MOST_CORRECTIONS} corrections, but {RESIDUAL_TOLERANCE:g} is needed."
+    )
+
+
+def _davidson_corrections(
+    terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], mode_count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the corrections of the modes of S states, whitened, and the relative residuals.
+
+    Returns
+    -------
+    corrections : (n, S M) array
+        The residuals r = (K - omega^2 M) phi, whitened.
+    sizes : (S M,) array
+        The square root of (r, X^-1 r) / (phi, K phi), where phi is mass-normalised.
+    """
+    modes = [
+        projected_modes(working.stiffness, working.mass, state, mode_count) for state in states
+    ]
+    squares = np.concatenate([mode_squares for mode_squares, _ in modes])
+    projected_shapes = np.concatenate([mode_shapes for _, mode_shapes in modes], axis=1)
+    shapes = working.displacements @ projected_shapes
+    stiffness = np.repeat([state.stiffness for state in states], mode_count, axis=0).T
+    mass = np.repeat([state.mass for state in states], mode_count, axis=0).T
+    residuals = affine_product(terms.stiffness_terms, stiffness, shapes)
+    residuals -= affine_product(terms.structure.mass_terms, mass * squares, shapes)
+    corrections = working.factors.whitened(residuals)
+    return corrections, np.linalg.norm(corrections, axis=0) / np.sqrt(squares)
+
+
+def _compressed_directions(
+    working: ProjectedBasis, states: list[ModalState], count: int
+) -> FloatArray:
+    """Return the fewest singular directions (k, Nm) of the modes that keep every frequency.
+
+    Parameters
+    ----------
+    working : ProjectedBasis
+        The working basis.
+    states : list of ModalState
+        The states whose modes are compressed.
+    count : int
+        The number of modes of each state.
+    """
+    modes = [projected_modes(working.stiffness, working.mass, state, count) for state in states]
+    squares = np.array([mode_squares for mode_squares, _ in modes])
+    shapes = np.concatenate([mode_shapes for _, mode_shapes in modes], axis=1)
+
+    def keeps_frequencies(directions: FloatArray) -> bool:
+        stiffness = project_terms(working.stiffness, directions)
+        mass = project_terms(working.mass, directions)
+        compressed = [projected_modes(stiffness, mass, state, count)[0] for state in states]
+        largest_ratio = np.max(np.array(compressed) / squares)
+        return bool(0.5 * (largest_ratio - 1.0) <= FREQUENCY_TOLERANCE)
+
+    # The error falls with the number of directions, because the spaces are nested.
+    return fewest_directions(shapes, count, keeps_frequencies)
+
+
+def _projected_on(
+    terms: ReductionTerms, working: ProjectedBasis, directions: FloatArray, count: int
+) -> ModalReduction:
+    """Return the modal reduction on directions (k, Nm) of the working basis."""
+    structure = terms.structure
+    stiffness = project_terms(working.stiffness, directions)
+    mass = project_terms(working.mass, directions)
+    basis = working.displacements @ directions
+    load = terms.loads.T @ basis
+    if structure.followed_load is None:
+        followed_shapes: FloatArray = np.empty((0, basis.shape[1]))
+    else:
+        squares, shapes = projected_modes(stiffness, mass, _nominal_state(terms), count)
+        followed_modes = most_compliant_modes(load[structure.followed_load], squares, shapes)
+        followed_shapes = shapes[:, followed_modes].T
+    output = np.concatenate((terms.outputs.T @ basis, structure.acceleration_output @ basis))
+    return ModalReduction(
+        basis,
+        {
+            "mode_count": count,
+            "modal_stiffness": stiffness,
+            "modal_mass": mass,
+            "modal_load": load,
+            "modal_output": output,
+            "followed_shapes": followed_shapes,
+        },
+    )
+
+
+def _nominal_state(terms: ReductionTerms) -> ModalState:
+    """Return the state with nominal parameters and masses, and without damage."""
+    structure = terms.structure
+    no_losses = np.zeros(len(terms.losses))
+    return ModalState(
+        stiffness=terms.theta((*structure.parameters.values(), *no_losses)),
+        mass=np.array((1.0, *structure.masses.values())),
+    )

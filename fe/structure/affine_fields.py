@@ -1,0 +1,142 @@
+"""The fields of an affine model that follow from its design and from matrices on all unknowns."""
+
+from collections.abc import Iterable
+from typing import NamedTuple, TypedDict
+
+from scipy import sparse
+
+from fe.runtime.arrays import FloatArray
+from fe.runtime.errors import InvalidDesignError
+
+from .affine import LoadTerm
+from .tables import StructureDesign
+
+
+class OutputRows(NamedTuple):
+    """Outputs as rows on all unknowns.
+
+    Attributes
+    ----------
+    gauge : csr (gauges, full)
+        Strains [1/m].
+    displacement, acceleration : csr (m, full)
+        Displacements, or with second derivatives accelerations [1].
+    port : csr (ports, full)
+        Displacements of the ports [1]; transposed, a force of 1 N at each.
+    """
+
+    gauge: sparse.csr_array
+    displacement: sparse.csr_array
+    acceleration: sparse.csr_array
+    port: sparse.csr_array
+
+
+class AffineFields(TypedDict):
+    """The fields of `AffineStructure` without design, stiffness terms and hash."""
+
+    parameters: dict[str, float]
+    masses: dict[str, float]
+    controls: dict[str, float]
+    control_units: dict[str, str]
+    ranges: dict[str, tuple[float, float]]
+    regions: tuple[str, ...]
+    mass_terms: tuple[sparse.csr_array, ...]
+    loads: dict[str, str | None]
+    load_terms: tuple[LoadTerm, ...]
+    gauges: tuple[str, ...]
+    displacements: tuple[str, ...]
+    accelerations: tuple[str, ...]
+    ports: tuple[str, ...]
+    gauge_output: sparse.csr_array
+    displacement_output: sparse.csr_array
+    acceleration_output: sparse.csr_array
+    port_output: sparse.csr_array
+    expansion: sparse.csr_array
+
+
+def affine_fields(
+    design: StructureDesign,
+    expansion: sparse.csr_array,
+    mass: sparse.csr_array,
+    point_masses: Iterable[sparse.csr_array],
+    loads: Iterable[FloatArray],
+    outputs: OutputRows,
+) -> AffineFields:
+    """Return the fields of the affine model of a design, without design, stiffness terms and hash.
+
+    Parameters
+    ----------
+    design : StructureDesign
+        The design.
+    expansion : csr (full, n)
+        Free unknowns to all unknowns.
+    mass : csr (full, full)
+        Mass without point masses [kg].
+    point_masses : iterable of csr (full, full)
+        Mass of 1 kg at each of the point masses of the design [1].
+    loads : iterable of (full,) array
+        For each load of the design the forces [N], or the field [m/s^2] of an acceleration, which
+        acts on the free masses, too.
+    outputs : OutputRows
+        Rows of the design's gauges, displacements, accelerations and ports.
+
+    Raises
+    ------
+    InvalidDesignError
+        If a port lies where nothing can move.
+    """
+    restriction = expansion.T.tocsr()
+    masses = _masses_by_name(design, mass, point_masses)
+    load_terms = []
+    for load, vector in zip(design.load, loads, strict=True):
+        if load.acceleration is None:
+            load_terms.append(LoadTerm(load.name, restriction @ vector))
+            continue
+        for mass_name, matrix in masses.items():
+            load_terms.append(LoadTerm(load.name, restriction @ (matrix @ vector), mass_name))
+    port_output = (outputs.port @ expansion).tocsr()
+    _check_ports_can_move(design, port_output)
+    return {
+        "parameters": {parameter.name: parameter.nominal for parameter in design.parameter},
+        "masses": {part.name: part.mass for part in design.mass if part.free},
+        "controls": {control.name: control.nominal for control in design.control},
+        "control_units": {control.name: control.unit for control in design.control},
+        "ranges": design.ranges,
+        "regions": tuple(region.name for region in design.damage),
+        "mass_terms": tuple((restriction @ (matrix @ expansion)).tocsr() for matrix in masses.values()),
+        "loads": {load.name: load.control for load in design.load},
+        "load_terms": tuple(load_terms),
+        "gauges": tuple(gauge.name for gauge in design.gauge),
+        "displacements": tuple(output.name for output in design.displacement),
+        "accelerations": tuple(output.name for output in design.acceleration),
+        "ports": tuple(port.name for port in design.port),
+        "gauge_output": (outputs.gauge @ expansion).tocsr(),
+        "displacement_output": (outputs.displacement @ expansion).tocsr(),
+        "acceleration_output": (outputs.acceleration @ expansion).tocsr(),
+        "port_output": port_output,
+        "expansion": expansion,
+    }
+
+
+def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array) -> None:
+    """Raise `InvalidDesignError` if a row (n,) of a port is zero: the supports hold all that it moves."""
+    for (label, port), row in zip(design.numbered("port"), port_output.toarray(), strict=True):
+        if not row.any():
+            raise InvalidDesignError(
+                f"{label} ({port.name}): the supports hold all that a force there would move; put the port "
+                "where the structure can move."
+            )
+
+
+def _masses_by_name(
+    design: StructureDesign, mass: sparse.csr_array, point_masses: Iterable[sparse.csr_array]
+) -> dict[str | None, sparse.csr_array]:
+    """Return the mass with the fixed point masses by None, then 1 kg of each free mass by its name."""
+    fixed = mass
+    free: dict[str | None, sparse.csr_array] = {}
+    for part, matrix in zip(design.mass, point_masses, strict=True):
+        if part.free:
+            free[part.name] = matrix
+        else:
+            fixed = fixed + part.mass * matrix
+    return {None: fixed} | free

@@ -1,0 +1,130 @@
+"""The body that a mesh becomes: cells with materials, and what holds them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from scipy import sparse
+
+from fe.elements.cells import CellMesh
+from fe.elements.kinds import Rule
+from fe.runtime.arrays import FloatArray, IntArray
+
+from .affine import StiffnessTerm
+from .affine_fields import AffineFields, OutputRows, affine_fields
+from .supports import Supports
+from .tables import StructureDesign
+
+Mesh = TypeVar("Mesh", bound=CellMesh, covariant=True)
+
+
+class PointMass(NamedTuple):
+    """The same mass at each of k points.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    mass : float
+        The mass at each point [kg].
+    weights : (k, nodes) array
+        Weights of the nodes in the displacement of each point.
+    """
+
+    name: str
+    mass: float
+    weights: FloatArray
+
+
+@dataclass(frozen=True)
+class Body(Generic[Mesh]):
+    """A mesh with materials, supports and point masses.
+
+    Attributes
+    ----------
+    mesh : CellMesh
+        Nodes and nc cells.
+    supports : Supports
+        What is held, sprung and rigid; n unknowns are free.
+    elasticity : (nc, 6, 6) array
+        Elasticity of the cells in space, nominal and undamaged [Pa].
+    density : (nc,) array
+        Density of the cells [kg/m^3].
+    part : (nc,) array of int
+        Part of the stiffness that each cell belongs to.
+    parts : tuple of (str or None, str or None)
+        Parameter and damage region of each part.
+    masses : tuple of PointMass
+        Point masses with their nominal values.
+    variation : (nc, q) or (1, 1) array
+        Elasticity at the points of the stiffness rule over that of the cell.
+    mass_rule : Rule, optional
+        Integration of the mass; by default that of the kind of the cells.
+    """
+
+    mesh: Mesh
+    supports: Supports
+    elasticity: FloatArray
+    density: FloatArray
+    part: IntArray
+    parts: tuple[tuple[str | None, str | None], ...]
+    masses: tuple[PointMass, ...]
+    variation: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    mass_rule: Rule | None = None
+
+    def stiffness(self, cells: IntArray) -> sparse.csr_array:
+        """Return the stiffness (n, n) [N/m] of some cells on the free unknowns."""
+        points = len(self.mesh.kind.stiffness_rule.weights)
+        factor = np.broadcast_to(self.variation, (len(self.part), points))
+        stiffness = self.mesh.stiffness(cells, self.elasticity[cells], factor[cells])
+        expansion = self.supports.expansion
+        return (expansion.T @ (stiffness @ expansion)).tocsr()
+
+    @property
+    def stiffness_terms(self) -> tuple[StiffnessTerm, ...]:
+        """The parts in their order; springs are with the part of no parameter and no region."""
+        terms = {}
+        for number, pair in enumerate(self.parts):
+            terms[pair] = self.stiffness(np.flatnonzero(self.part == number))
+        if self.supports.springs.any():
+            constant = (None, None)
+            springs = self.supports.stiffness
+            terms[constant] = terms[constant] + springs if constant in terms else springs
+        return tuple(
+            StiffnessTerm(matrix, parameter, region) for (parameter, region), matrix in terms.items()
+        )
+
+    @cached_property
+    def cell_mass(self) -> sparse.csr_array:
+        """Mass (nodes, nodes) [kg] of the cells, of one component."""
+        return self.mesh.mass(np.arange(len(self.part)), self.density, self.mass_rule)
+
+    @property
+    def nodal_mass(self) -> FloatArray:
+        """Mass (nodes,) [kg] of cells and nominal point masses that each node carries."""
+        total: FloatArray = np.asarray(self.cell_mass.sum(axis=1))
+        for point_mass in self.masses:
+            total = total + point_mass.mass * point_mass.weights.sum(axis=0)
+        return total
+
+    def affine_fields(
+        self, design: StructureDesign, loads: Iterable[FloatArray], outputs: OutputRows
+    ) -> AffineFields:
+        """Return the fields of the affine model, without design, stiffness terms and hash.
+
+        Parameters
+        ----------
+        design : StructureDesign
+            The design of the structure.
+        loads : iterable of (full,) array
+            Its loads, as in `fe.structure.affine_fields.affine_fields`.
+        outputs : OutputRows
+            Rows of its gauges, displacements, accelerations and ports.
+        """
+        components = sparse.eye_array(3)
+        weights = (sparse.csr_array(point_mass.weights) for point_mass in self.masses)
+        point_masses = (sparse.kron(rows.T @ rows, components, format="csr") for rows in weights)
+        mass = sparse.kron(self.cell_mass, components, format="csr")
+        return affine_fields(design, self.supports.expansion, mass, point_masses, loads, outputs)

@@ -1,0 +1,213 @@
+"""Strain gauges on the surface of a mesh as rows on the nodal displacements."""
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from fe.elements.elasticity import unit_vector
+from fe.runtime.arrays import FloatArray
+from fe.runtime.errors import InvalidDesignError
+
+from .design import Gauge, Rosette
+from .location import SurfacePoint, on_surface
+from .mesh import StructureMesh
+
+STEEPEST = 30.0
+"""Largest angle [degrees] between a gauge's direction and the surface; below it, the direction is
+projected on the surface."""
+_POINTS_ALONG = 20
+"""Points along a gauge that has a length."""
+_POINTS_ACROSS = 10
+"""Points across a gauge that has a width."""
+
+
+class _GaugeStrain(NamedTuple):
+    """A strain that a gauge reads.
+
+    Attributes
+    ----------
+    gauge : int
+        Number of the gauge.
+    weight : float
+        Weight of the strain in the mean of the gauge.
+    cell : int
+        The cell.
+    local : (3,) array
+        The local position in the cell.
+    direction : (3,) array
+        Unit vector along which the strain is.
+    """
+
+    gauge: int
+    weight: float
+    cell: int
+    local: FloatArray
+    direction: FloatArray
+
+
+def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.csr_array, FloatArray]:
+    """Return the strains of gauges as rows on the displacements.
+
+    A gauge without a length reads the strain at its point, the mean of the cells that meet there.
+    One with a length reads the mean of 20 points along it, one with a width of 10 points across it,
+    each projected on the surface.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    gauges : tuple of Gauge
+        The gauges.
+
+    Returns
+    -------
+    rows : csr (gauges, full)
+        The rows, positive in tension [1/m].
+    moved : (gauges,) array
+        The distance of each gauge from its point [m].
+
+    Raises
+    ------
+    InvalidDesignError
+        If a gauge lies off the surface, reaches over its edge, or points out of it.
+    """
+    if not gauges:
+        return sparse.csr_array((0, mesh.unknowns)), np.empty(0)
+    strains: list[_GaugeStrain] = []
+    moved = []
+    for number, gauge in enumerate(gauges):
+        where = f"gauge[{number + 1}] ({gauge.name})"
+        point = mesh.unit * np.asarray(gauge.point)
+        middle = on_surface(mesh, point, f"{where}: the point {mesh.place(point)}")
+        direction = _projected_direction(np.asarray(gauge.direction), middle.normal, where)
+        surface_points = [middle]
+        if gauge.length or gauge.width:
+            surface_points = _averaging_points(mesh, gauge, point, direction, middle.normal, where)
+        for surface_point in surface_points:
+            local_direction = _projected_direction(direction, surface_point.normal, where)
+            # the mean of the points, and of the cells that meet at each of them
+            weight = 1.0 / (len(surface_points) * len(surface_point.cell))
+            for cell, local in zip(surface_point.cell, surface_point.local, strict=True):
+                strains.append(_GaugeStrain(number, weight, cell, local, local_direction))
+        moved.append(middle.distance)
+    rows = mesh.strain_rows(
+        row=np.array([strain.gauge for strain in strains]),
+        weight=np.array([strain.weight for strain in strains]),
+        cells=np.array([strain.cell for strain in strains]),
+        local=np.array([strain.local for strain in strains]),
+        direction=np.array([strain.direction for strain in strains]),
+    )
+    return rows, np.array(moved)
+
+
+def _averaging_points(
+    mesh: StructureMesh,
+    gauge: Gauge,
+    point: FloatArray,
+    direction: FloatArray,
+    normal: FloatArray,
+    where: str,
+) -> list[SurfacePoint]:
+    """Return the points of the surface over which a gauge averages.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    gauge : Gauge
+        The gauge.
+    point, direction, normal : (3,) array
+        Its middle [m], and unit vectors along it and normal to the surface.
+    where : str
+        Its name in sentences.
+
+    Raises
+    ------
+    InvalidDesignError
+        If the gauge reaches over the edge of the surface.
+    """
+    length = mesh.unit * gauge.length
+    width = mesh.unit * gauge.width
+    across = np.cross(normal, direction)
+    width_words = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
+    over_edge = (
+        f"{where}: {gauge.length:g} {mesh.unit_name} long{width_words}, the gauge reaches over the edge; its "
+        "point"
+    )
+
+    def project_grid(along_fractions: FloatArray, across_fractions: FloatArray) -> list[SurfacePoint]:
+        points = []
+        for across_fraction, along_fraction in product(
+            across_fractions if width else np.zeros(1), along_fractions if length else np.zeros(1)
+        ):
+            offset = along_fraction * length * direction + across_fraction * width * across
+            position = point + offset
+            points.append(on_surface(mesh, position, f"{over_edge} {mesh.place(position)}"))
+        return points
+
+    averaged = project_grid(_middles(_POINTS_ALONG), _middles(_POINTS_ACROSS))
+    ends = np.array([-0.5, 0.5])
+    project_grid(ends, ends)  # refuses corners that lie over the edge
+    return averaged
+
+
+def _middles(count: int) -> FloatArray:
+    """Return the middles (count,) of equal intervals of -0.5 to 0.5."""
+    return (np.arange(count) + 0.5) / count - 0.5
+
+
+def _projected_direction(direction: FloatArray, normal: FloatArray, where: str) -> FloatArray:
+    """Return a direction (3,) projected on the surface with a unit normal (3,), of length one.
+
+    Raises
+    ------
+    InvalidDesignError
+        If the direction points out of the surface by more than `STEEPEST`.
+    """
+    direction = unit_vector(direction)
+    sine = min(1.0, abs(float(direction @ normal)))
+    angle = float(np.degrees(np.arcsin(sine)))
+    if angle > STEEPEST:
+        normal_words = ", ".join(f"{value + 0.0:.3g}" for value in normal)
+        raise InvalidDesignError(
+            f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal there is "
+            f"({normal_words}); at most {STEEPEST:g} degrees are allowed."
+        )
+    return unit_vector(direction - (direction @ normal) * normal)
+
+
+def evenly_placed_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
+    """Return rosettes that are distributed evenly over the faces of the surface.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    count : int
+        The largest number of rosettes; there are fewer if several would lie on one face.
+
+    Returns
+    -------
+    list of Rosette
+        The rosettes `spread_1`, `spread_2` and so on.
+    """
+    from scipy.cluster.vq import kmeans2, vq
+
+    face_centres = mesh.face_spheres.centre
+    cluster_count = min(count, len(face_centres))
+    cluster_centres, _ = kmeans2(face_centres, cluster_count, minit="++", rng=0)
+    nearest_faces, _ = vq(cluster_centres, face_centres)
+    rosettes = []
+    for number, face in enumerate(np.unique(nearest_faces).tolist(), start=1):
+        centre = face_centres[face]
+        normal = on_surface(mesh, centre, "a face").normal
+        # the coordinate axis that is most tangential, projected on the surface
+        first_axis = np.eye(3)[np.argmin(np.abs(normal))]
+        first_axis -= (first_axis @ normal) * normal
+        second_axis = np.cross(normal, first_axis)
+        axes = tuple(first_axis.tolist()), tuple(second_axis.tolist())
+        point = tuple((centre / mesh.unit).tolist())
+        rosettes.append(Rosette(name=f"spread_{number}", point=point, axes=axes))
+    return rosettes

@@ -1,0 +1,155 @@
+"""Nodal loads of forces, pressures and accelerations, and the displacement of points and ports."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fe.elements.cells import CellMesh
+from fe.elements.elasticity import unit_vector
+from fe.runtime.arrays import FloatArray
+
+from .design import Load, Port
+from .location import attach
+from .mesh import StructureMesh, Surface
+
+
+class FaceAreas(NamedTuple):
+    """Integrals of the shape functions over faces.
+
+    Attributes
+    ----------
+    vectors : (nodes, 3) array
+        Integrals with the outward normal [m^2].
+    areas : (nodes,) array
+        Integrals alone [m^2]; their sum is the area.
+    """
+
+    vectors: FloatArray
+    areas: FloatArray
+
+
+def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
+    """Return the integrals of each node's shape function over faces.
+
+    Parameters
+    ----------
+    mesh : CellMesh
+        The mesh.
+    surface : Surface
+        The faces.
+    """
+    kind = mesh.kind
+    frames = kind.face_frames
+    vectors = np.zeros((len(mesh.points), 3))
+    areas = np.zeros(len(mesh.points))
+    for number in np.unique(surface.face).tolist():
+        cells = surface.cell[surface.face == number]
+        rule = kind.face_rule(number)
+        tangents = frames.tangents[number]
+        local = frames.corner[number] + rule.points @ tangents
+        values, gradients = kind.shape_functions(local)
+        edges = np.einsum("nai,qaj,tj->nqti", mesh.nodes[cells], gradients, tangents, optimize=True)
+        along_first, along_second = np.moveaxis(edges, 2, 0)
+        normals = np.cross(along_first, along_second) * rule.weights[:, None]
+        # The shape function of a node off the face is zero on it, up to rounding.
+        off_face = [node for node in range(kind.node_count) if node not in kind.face_nodes[number]]
+        values[:, off_face] = 0.0
+        np.add.at(vectors, mesh.cells[cells], np.einsum("nqi,qa->nai", normals, values))
+        np.add.at(areas, mesh.cells[cells], np.linalg.norm(normals, axis=2) @ values)
+    return FaceAreas(vectors, areas)
+
+
+def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
+    """Return the nodal values of a load.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    load : Load
+        The load.
+    where : str
+        Its name in sentences.
+
+    Returns
+    -------
+    (nodes, 3) array
+        Forces [N], or an acceleration [m/s^2].
+
+    Raises
+    ------
+    MeshError
+        If the set of the load is missing, empty or holds no face.
+    InvalidDesignError
+        If the point of the load lies outside.
+    """
+    if load.acceleration is not None:
+        return np.tile(load.acceleration, (len(mesh.points), 1))
+    if load.pressure is not None:
+        surface = mesh.faces_of(str(load.set), where)
+        return -load.pressure * face_areas(mesh, surface).vectors
+    return np.outer(_force_weights(mesh, load, where), np.asarray(load.force))
+
+
+def port_row(mesh: StructureMesh, port: Port, where: str) -> FloatArray:
+    """Return the row (nodes, 3) that reads the displacement of a port.
+
+    Transposed, the row is a force of 1 N at the port.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    port : Port
+        The port.
+    where : str
+        Its name in sentences.
+
+    Raises
+    ------
+    MeshError
+        If the set of the port is missing or empty.
+    InvalidDesignError
+        If the point of the port lies outside.
+    """
+    return np.outer(_force_weights(mesh, port, where), unit_vector(port.direction))
+
+
+def _force_weights(mesh: StructureMesh, part: Load | Port, where: str) -> FloatArray:
+    """Return the weights (nodes,) of the nodes in a force at a point or on a set; their sum is one."""
+    if part.point is not None:
+        return point_weights(mesh, part.point, where)
+    # a force on a set: by area if it holds faces, else equally among the nodes
+    nodes = mesh.nodes_of(str(part.set), where)
+    surface = mesh.faces_between(str(part.set), nodes)
+    if len(surface):
+        weights = face_areas(mesh, surface).areas
+    else:
+        weights = np.zeros(len(mesh.points))
+        weights[nodes] = 1.0
+    return np.asarray(weights / weights.sum())
+
+
+def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where: str) -> FloatArray:
+    """Return the weights (nodes,) of the nodes in the displacement of a point.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    point : (float, float, float)
+        The point, in the unit of length of the mesh.
+    where : str
+        What it is of, for sentences.
+
+    Raises
+    ------
+    InvalidDesignError
+        If the point lies outside.
+    """
+    position = mesh.unit * np.asarray(point)
+    cell, local = attach(mesh, position, f"{where}: the point {mesh.place(position)}")
+    (values,), _ = mesh.kind.shape_functions(local[None])
+    weights = np.zeros(len(mesh.points))
+    weights[mesh.cells[cell]] = values
+    return weights

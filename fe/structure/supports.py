@@ -1,0 +1,255 @@
+"""Supports of a mesh: what is held, sprung and rigid, and whether the structure is free to move."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
+from fe.runtime.errors import MeshError
+
+from .design import MeshDesign, Support
+from .mesh import StructureMesh
+from .tables import MOTIONS
+
+_FREE = 1e-8
+"""A rigid motion that the supports resist by less than this fraction of the stiffest one is free."""
+
+
+class RigidSet(NamedTuple):
+    """Nodes that move as a rigid body.
+
+    Attributes
+    ----------
+    nodes : (m,) array of int
+        Numbers of the nodes.
+    point : (3,) array
+        The point about which it turns [m].
+    held : (6,) array of bool
+        Whether each motion, along x, y, z and about them, is held.
+    springs : (6,) array
+        Springs to the ground [N/m, N m/rad].
+    """
+
+    nodes: IntArray
+    point: FloatArray
+    held: BoolArray
+    springs: FloatArray
+
+
+class Supports(NamedTuple):
+    """The n free unknowns: free displacements, then the motions of rigid sets by 1 m and 1 rad.
+
+    Attributes
+    ----------
+    expansion : csr (full, n)
+        Free unknowns to the displacements of all nodes (3 node + component).
+    free_displacements : (f,) array of int
+        Displacements that are free unknowns themselves, the first of these.
+    springs : (n,) array
+        Springs to the ground [N/m, N m/rad].
+    """
+
+    expansion: sparse.csr_array
+    free_displacements: IntArray
+    springs: FloatArray
+
+    @property
+    def stiffness(self) -> sparse.csr_array:
+        """Stiffness (n, n) of the springs."""
+        return sparse.diags_array(self.springs).tocsr()
+
+
+def supports(
+    points: FloatArray, held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
+) -> Supports:
+    """Return the free unknowns of nodes, of which some are held, sprung or rigid.
+
+    Parameters
+    ----------
+    points : (nodes, 3) array
+        Positions of the nodes [m].
+    held : (nodes, 3) array of bool
+        Whether each displacement is held.
+    springs : (nodes, 3) array
+        Springs to the ground of nodes that belong to no rigid set [N/m].
+    bodies : iterable of RigidSet
+        The rigid sets.
+    """
+    is_free = ~held
+    body_expansions = []
+    body_springs = []
+    for body in bodies:
+        is_free[body.nodes] = False
+        body_expansions.append(_body_expansion(points, body))
+        body_springs.append(body.springs[~body.held])
+    free_displacements = np.flatnonzero(is_free)
+    identity = sparse.eye_array(is_free.size, format="csc")
+    expansion = sparse.hstack((identity[:, free_displacements], *body_expansions))
+    all_springs = np.concatenate((springs.ravel()[free_displacements], *body_springs))
+    return Supports(expansion.tocsr(), free_displacements, all_springs)
+
+
+def _body_expansion(points: FloatArray, body: RigidSet) -> sparse.coo_array:
+    """Return the displacements (3 nodes, m) of all nodes by the m motions of a body that are not held."""
+    motions = rigid_motions(points[body.nodes], body.point, 2.0)
+    moving = sparse.coo_array(motions[:, ~body.held])
+    node = body.nodes[moving.row // 3]
+    component = moving.row % 3
+    entries = (3 * node + component, moving.col)
+    return sparse.coo_array((moving.data, entries), (points.size, moving.shape[1]))
+
+
+@dataclass
+class _NodeSupports:
+    """Supports of nodes that belong to no rigid set.
+
+    Attributes
+    ----------
+    held : (nodes, 3) array of bool
+        Whether each displacement is held.
+    springs : (nodes, 3) array
+        Springs to the ground [N/m].
+    """
+
+    held: BoolArray
+    springs: FloatArray
+
+    @property
+    def resists(self) -> BoolArray:
+        """Whether each displacement (nodes, 3) is held or sprung."""
+        return np.asarray(self.held | (self.springs > 0.0))
+
+
+def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
+    """Return the supports of a design.
+
+    Parameters
+    ----------
+    design : MeshDesign
+        The design.
+    mesh : StructureMesh
+        Its mesh.
+
+    Raises
+    ------
+    MeshError
+        If a set is missing or empty, a rigid set lies on a line or shares nodes with another
+        support, or the supports leave a rigid motion of the structure free.
+    """
+    bodies: dict[str, RigidSet] = {}
+    shape = (len(mesh.points), 3)
+    nodal = _NodeSupports(np.zeros(shape, dtype=bool), np.zeros(shape))
+    for label, support in design.numbered("support"):
+        nodes = mesh.nodes_of(support.set, label)
+        if support.rigid_about is not None:
+            bodies[label] = _rigid_set(support, mesh, nodes, label)
+            continue
+        nodal.held[nodes] |= np.isin(MOTIONS[:3], support.hold)
+        if support.springs is not None:
+            nodal.springs[nodes] += np.asarray(support.springs) / len(nodes)
+    nodal.springs[nodal.held] = 0.0
+    _check_no_shared_nodes(mesh, nodal, bodies)
+    rigid_sets = tuple(bodies.values())
+    _check_rigid_motions(mesh, nodal, rigid_sets)
+    return supports(mesh.points, nodal.held, nodal.springs, rigid_sets)
+
+
+def _check_no_shared_nodes(mesh: StructureMesh, nodal: _NodeSupports, bodies: dict[str, RigidSet]) -> None:
+    """Raise `MeshError` if a node of a rigid set, by its label, belongs to another support, too."""
+    is_supported = np.any(nodal.resists, axis=1)
+    for label, body in bodies.items():
+        shared = body.nodes[is_supported[body.nodes]]
+        if len(shared):
+            place = mesh.place(mesh.points[shared[0]])
+            raise MeshError(
+                f"{label}: {len(shared)} nodes of the rigid set belong to another support, too, such as that "
+                f"at {place}; say what holds it in its own table."
+            )
+        is_supported[body.nodes] = True
+
+
+def _rigid_set(support: Support, mesh: StructureMesh, nodes: IntArray, label: str) -> RigidSet:
+    """Return the rigid set of a support; raises `MeshError` if its nodes lie on a line."""
+    point = mesh.unit * np.asarray(support.rigid_about)
+    motions = rigid_motions(mesh.points[nodes], point, 2.0)
+    rank = np.linalg.matrix_rank(motions, _FREE * np.linalg.norm(motions))
+    if rank < len(MOTIONS):
+        raise MeshError(
+            f"{label}: the nodes of the rigid set {support.set!r} lie on a line, about which it could turn."
+        )
+    springs = np.zeros(len(MOTIONS))
+    if support.springs is not None:
+        springs[: len(support.springs)] = support.springs
+    return RigidSet(nodes, point, held=np.isin(MOTIONS, support.hold), springs=springs)
+
+
+def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatArray:
+    """Return the displacements of points in six rigid motions.
+
+    Parameters
+    ----------
+    points : (m, 3) array
+        Positions of the points [m].
+    centre : (3,) array
+        The point about which the motions turn [m].
+    size : float
+        Turns are scaled by 2 / size [m].
+
+    Returns
+    -------
+    (3 m, 6) array
+        Displacements, along and about x, y, z.
+    """
+    arm = (points - centre) / (0.5 * size)
+    motions = np.zeros((len(points), 3, 6))
+    for axis in range(3):
+        motions[:, axis, axis] = 1.0
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
+    return motions.reshape(-1, 6)
+
+
+def _check_rigid_motions(mesh: StructureMesh, nodal: _NodeSupports, bodies: tuple[RigidSet, ...]) -> None:
+    """Raise `MeshError` if supports resist fewer than six rigid motions; it says which one is free.
+
+    Every resisting displacement counts alike: what matters is whether it resists, not how stiff it is.
+    """
+    # what each rigid motion of the structure does to the displacements that are resisted
+    centre = mesh.points.mean(axis=0)
+    motions = rigid_motions(mesh.points, centre, mesh.size)
+    resisted = [motions[nodal.resists.ravel()]]
+    for body in bodies:
+        # a rigid set shifts with its point, and turns with the structure
+        shifts = rigid_motions(body.point[None], centre, mesh.size)
+        turns = np.eye(6)[3:]
+        body_resists = body.held | (body.springs > 0.0)
+        resisted.append(np.vstack((shifts, turns))[body_resists])
+    # Motions with a singular value of zero are free. Rows of zeros make the decomposition return
+    # all six directions.
+    rows = np.vstack((*resisted, np.zeros((6, 6))))
+    _, values, directions = np.linalg.svd(rows, full_matrices=False)
+    free = directions[values <= _FREE * max(float(values[0]), 1e-300)]
+    if len(free):
+        raise MeshError(
+            f"{mesh.source}: the supports leave {len(free)} of the six rigid motions free, among them "
+            f"{_motion_in_words(free[0], mesh, centre)}; hold further directions."
+        )
+
+
+def _motion_in_words(motion: FloatArray, mesh: StructureMesh, centre: FloatArray) -> str:
+    """Return a rigid motion (6,) about a centre (3,) [m] as it stands in a sentence."""
+    shift, scaled_turn = np.split(motion, 2)
+    if np.linalg.norm(scaled_turn) < 1e-6:
+        return f"a shift along ({_components(shift / np.linalg.norm(shift))})"
+    turn = scaled_turn / (0.5 * mesh.size)
+    axis = turn / np.linalg.norm(turn)
+    point_on_axis = centre + np.cross(turn, shift) / (turn @ turn)
+    rounded_point = mesh.size * np.round(point_on_axis / mesh.size, 9)
+    return f"a turn about the axis along ({_components(axis)}) through {mesh.place(rounded_point)}"
+
+
+def _components(vector: FloatArray) -> str:
+    """Return the components of a vector (3,) as text, without negative zeros."""
+    return ", ".join(f"{value + 0.0:.3g}" for value in np.round(vector, 9))

@@ -1,0 +1,391 @@
+"""Input of CalculiX for structures and the wing.
+
+CalculiX (`ccx`, Debian package calculix-ccx) is an independent finite element code. It gets nodes,
+cells, local material constants with their orientations, supports and springs, rigid sets as
+equations on two reference nodes, and point masses as blocks tied to the structure. It integrates,
+assembles and solves on its own, and applies pressures and acceleration fields itself. The results
+that are read are displacements of probe nodes, which equations make equal to a strain or a
+displacement, because printed displacements have seven digits only.
+"""
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import resources
+from typing import NamedTuple
+
+import numpy as np
+from jinja2 import StrictUndefined, Template
+from numpy.typing import ArrayLike
+from scipy import sparse
+
+from fe.elements.cells import CellMesh
+from fe.elements.kinds import HEXAHEDRA_20, WEDGES_6
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
+from fe.runtime.errors import CalculixError
+from fe.runtime.state import DigitalState
+from fe.structure.affine import AffineStructure
+from fe.structure.body import Body
+from fe.structure.design import Load
+from fe.structure.operators import Structure
+from fe.wing.operators import AffineOperators, wing_values
+
+CALCULIX_STRAINS = [0, 1, 2, 5, 4, 3]
+"""Numbers of our strains in the order of CalculiX: xx, yy, zz, xy, xz, yz."""
+# CalculiX's 21 anisotropic constants are the upper triangle of the elasticity, column by column.
+_COLUMNS, _ROWS = np.tril_indices(6)
+_ANISOTROPIC_ROWS = np.array(CALCULIX_STRAINS)[_ROWS]
+_ANISOTROPIC_COLUMNS = np.array(CALCULIX_STRAINS)[_COLUMNS]
+TEST_FORCE = 10.0
+"""Upward force of the static test of a wing, and before its ring-down [N]."""
+_BLOCK_SIDE = 0.01
+"""Side of the block that represents a point mass [m]."""
+
+
+class Term(NamedTuple):
+    """A nodal force, or a term of an equation.
+
+    Attributes
+    ----------
+    node, direction : int
+        Node and direction, both from 1.
+    value : float
+        The force [N] or the factor.
+    """
+
+    node: int
+    direction: int
+    value: float
+
+
+class Step(NamedTuple):
+    """A step of a job.
+
+    Attributes
+    ----------
+    load : (n,) array
+        The load [N], which replaces that of the step before; empty if that stays.
+    lines : iterable of str
+        Loads that CalculiX applies itself, and what is printed.
+    nodal : bool
+        Whether the load is given as nodal forces, and not by lines.
+    procedure : tuple of str
+        Lines that say what is solved.
+    """
+
+    load: FloatArray = np.empty(0)
+    lines: Iterable[str] = ()
+    nodal: bool = True
+    procedure: tuple[str, ...] = ("*STATIC",)
+
+
+class Grading(NamedTuple):
+    """Elasticity that changes inside cells, given as a function of a nodal temperature.
+
+    Attributes
+    ----------
+    course : list of (float, float)
+        Temperatures, ascending, each with the factor on the elasticity.
+    temperatures : (nodes,) array
+        Temperatures of the nodes.
+    cells : (nc,) array of bool
+        The cells where the elasticity changes; elsewhere the factor is one.
+    """
+
+    course: list[tuple[float, float]]
+    temperatures: FloatArray
+    cells: BoolArray
+
+
+class Material(NamedTuple):
+    """A material of a deck.
+
+    Attributes
+    ----------
+    constants : list of (float, (21,) array)
+        Temperatures, each with the anisotropic constants of CalculiX [Pa].
+    density : float
+        Density [kg/m^3].
+    cells : (m,) array of int
+        The cells of the material.
+    """
+
+    constants: list[tuple[float, FloatArray]]
+    density: float
+    cells: IntArray
+
+
+class MassBlock(NamedTuple):
+    """A block that represents a point mass.
+
+    Attributes
+    ----------
+    mass : float
+        The mass [kg].
+    weights : (nodes,) array
+        Weights of the nodes in the displacement of the point.
+    corners : list of int
+        Numbers of the eight corner nodes, from 1.
+    """
+
+    mass: float
+    weights: FloatArray
+    corners: list[int]
+
+
+@dataclass(frozen=True)
+class CalculixDeck:
+    """A model in one state, as input for CalculiX.
+
+    Attributes
+    ----------
+    title : str
+        The title of the job.
+    structure : AffineStructure
+        The model.
+    body : Body
+        Its mesh with materials and supports; the n free unknowns are in the order of its supports.
+    values : mapping of str to float
+        Its state by name; the other values are nominal, and healthy.
+    loads : mapping of str to Step
+        Static steps of its loads, each alone.
+    grading : Grading, optional
+        Elasticity that changes inside cells.
+    damping : (float, float)
+        Rayleigh damping [1/s] and [s] of a step in time.
+    """
+
+    title: str
+    structure: AffineStructure
+    body: Body[CellMesh]
+    values: Mapping[str, float]
+    loads: Mapping[str, Step]
+    grading: Grading | None = None
+    damping: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def _materials(self) -> Iterator[Material]:
+        """The materials of the deck in this state: equal cells share one."""
+        chosen = self.structure.split_values(self.values)
+        theta = self.structure.theta(chosen.parameters, chosen.losses)
+        constants = self.body.elasticity[:, _ANISOTROPIC_ROWS, _ANISOTROPIC_COLUMNS]
+        scaled = theta[self.body.part][:, None] * constants
+        no_cells = np.zeros(len(scaled))
+        graded = no_cells if self.grading is None else self.grading.cells
+        properties = np.column_stack((scaled, self.body.density, graded))
+        rows, material_of_cell = np.unique(properties, axis=0, return_inverse=True)
+        for number, (*material_constants, density, is_graded) in enumerate(rows):
+            course = [(0.0, 1.0)]
+            if self.grading is not None and is_graded:
+                course = self.grading.course
+            at_temperatures = [
+                (temperature, factor * np.array(material_constants))
+                for temperature, factor in course
+            ]
+            cells = np.flatnonzero(material_of_cell == number)
+            yield Material(at_temperatures, density, cells)
+
+    @cached_property
+    def probes(self) -> FloatArray:
+        """Rows (m, n) of the results that are read, on the free unknowns."""
+        rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
+        return np.asarray(rows.toarray())
+
+    @property
+    def _motion_count(self) -> int:
+        """Number of free unknowns that are motions of rigid sets."""
+        supports = self.body.supports
+        return len(supports.springs) - len(supports.free_displacements)
+
+    def text(self, *steps: Step) -> str:
+        """Return the input of a job: the model, then its steps.
+
+        Behind the nodes of the mesh there are those of rigid motions, three motions each, then
+        eight of each point mass, then the probes, three each.
+        """
+        mesh = self.body.mesh
+        supports = self.body.supports
+        first_motion_node = len(mesh.points) + 1
+        first_corner = first_motion_node + _groups_of_three(self._motion_count)
+        blocks = self._mass_blocks(first_corner)
+        first_probe = first_corner + 8 * len(blocks)
+        last_probe = first_probe + _groups_of_three(len(self.probes)) - 1
+        # displacements without a free unknown, and unused directions of motion nodes
+        is_held = np.diff(supports.expansion.indptr) == 0
+        unused = range(mesh.unknowns + self._motion_count, 3 * (first_corner - 1))
+        numbered_cells = np.column_stack((np.arange(len(mesh.cells)), mesh.cells)) + 1
+        return _template().render(
+            deck=self,
+            numbers=number_line,
+            materials=self._materials,
+            cells=numbered_cells,
+            motion_nodes=range(first_motion_node, first_corner),
+            held=map(_node_and_direction, (*np.flatnonzero(is_held), *unused)),
+            springs=[*self.terms(supports.springs)],
+            blocks=[(block.mass, self._corner_positions(block)) for block in blocks],
+            block_side=_BLOCK_SIDE,
+            probe_nodes=range(first_probe, last_probe + 1),
+            equations=self._equations(blocks, first_probe),
+            steps=steps,
+        )
+
+    def _mass_blocks(self, first_corner: int) -> list[MassBlock]:
+        """Return the blocks of the point masses that are not zero."""
+        blocks: list[MassBlock] = []
+        for point_mass in self.body.masses:
+            mass = self.values.get(point_mass.name, point_mass.mass)
+            if mass > 0.0:
+                for weights in point_mass.weights:
+                    start = first_corner + 8 * len(blocks)
+                    blocks.append(MassBlock(mass, weights, list(range(start, start + 8))))
+        return blocks
+
+    def _corner_positions(self, block: MassBlock) -> list[tuple[int, FloatArray]]:
+        """Return the corner nodes of a block with their positions (3,) [m]."""
+        point = block.weights @ self.body.mesh.points
+        corners = HEXAHEDRA_20.node_positions[:8] * _BLOCK_SIDE
+        return [*zip(block.corners, point + corners, strict=True)]
+
+    def _equations(self, blocks: Iterable[MassBlock], first_probe: int) -> Iterator[list[Term]]:
+        """Yield sums that are zero, whose first term depends on the others."""
+        yield from self._rigid_equations()
+        for block in blocks:
+            yield from _block_equations(block)
+        for number, row in enumerate(self.probes):
+            node, direction = divmod(number, 3)
+            yield [Term(first_probe + node, direction + 1, -1.0), *self.terms(row)]
+
+    def _rigid_equations(self) -> Iterator[list[Term]]:
+        """Yield the equations of displacements that follow the motions of a rigid set."""
+        supports = self.body.supports
+        moving = np.flatnonzero(np.diff(supports.expansion.indptr))
+        for unknown in np.setdiff1d(moving, supports.free_displacements).tolist():
+            (row,) = supports.expansion[[unknown]].toarray()
+            node, direction = _node_and_direction(unknown)
+            yield [Term(node, direction, -1.0), *self.terms(row)]
+
+    @cached_property
+    def places(self) -> list[tuple[int, int]]:
+        """Node and direction of each free unknown."""
+        first_motion = self.body.mesh.unknowns
+        motions = range(first_motion, first_motion + self._motion_count)
+        unknowns = (*self.body.supports.free_displacements.tolist(), *motions)
+        return [_node_and_direction(unknown) for unknown in unknowns]
+
+    def terms(self, values: FloatArray) -> Iterator[Term]:
+        """Yield the values (n,) on the free unknowns that are not zero."""
+        for unknown in np.flatnonzero(values).tolist():
+            node, direction = self.places[unknown]
+            yield Term(node, direction, float(values[unknown]))
+
+
+def _template() -> Template:
+    """Return the template of the input."""
+    file = resources.files("fe.verification").joinpath("templates/calculix.inp.jinja")
+    template: Template = Template(
+        file.read_text(encoding="utf-8"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    return template
+
+
+def _block_equations(block: MassBlock) -> Iterator[list[Term]]:
+    """Yield the equations by which the corners of a block move with the point of its mass."""
+    nodes = np.flatnonzero(block.weights).tolist()
+    for corner, direction in itertools.product(block.corners, (1, 2, 3)):
+        weighted = [Term(node + 1, direction, float(block.weights[node])) for node in nodes]
+        yield [Term(corner, direction, -1.0), *weighted]
+
+
+def _groups_of_three(count: int) -> int:
+    """Return the number of nodes that have enough directions for a number of values."""
+    return -(-count // 3)
+
+
+def _node_and_direction(unknown: int) -> tuple[int, int]:
+    """Return node and direction, both from 1, of an unknown."""
+    return unknown // 3 + 1, unknown % 3 + 1
+
+
+def number_line(values: ArrayLike) -> str:
+    """Return numbers with the digits of a double, at most 20 characters each, for CalculiX."""
+    return ",".join(f"{value:.13E}" for value in np.asarray(values).ravel().tolist())
+
+
+def structure_deck(structure: Structure) -> CalculixDeck:
+    """Return the deck of a structure, undamaged, with nominal parameters and masses.
+
+    Parameters
+    ----------
+    structure : Structure
+        The structure.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX has no element that is integrated in the same way.
+    """
+    kind = structure.mesh.kind
+    if kind is WEDGES_6:  # C3D6 is integrated at two points
+        raise CalculixError(
+            f"CalculiX integrates {kind.name} ({kind.calculix}) in another way, so that nothing "
+            "can be compared; tetrahedra and hexahedra can."
+        )
+    loads = {load.name: _load_step(structure, load) for load in structure.design.load}
+    return CalculixDeck("structure", structure, structure.body, {}, loads)
+
+
+def _load_step(structure: Structure, load: Load) -> Step:
+    """Return the static step of a load, with the value of `control_value_alone`."""
+    factor = structure.control_value_alone(load.name)
+    lines = ["*DLOAD, OP=NEW"]
+    if load.acceleration is not None:
+        size = float(np.linalg.norm(load.acceleration))
+        direction = np.sign(factor) * np.asarray(load.acceleration) / size
+        lines.append(f"EHEAVY,GRAV,{number_line([abs(factor) * size, *direction])}")
+    elif load.pressure is not None and load.set is not None:
+        surface = structure.mesh.faces_of(load.set, load.name)
+        for cell, face in zip(surface.cell, surface.face, strict=True):
+            lines.append(f"{cell + 1},P{face + 1},{number_line([factor * load.pressure])}")
+    else:
+        lines.append("EALL,GRAV,0.,0.,0.,1.")
+    return Step(structure.load(load.name, factor), lines, nodal=load.force is not None)
+
+
+def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
+    """Return the deck of the wing in one state.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The wing.
+    state : DigitalState
+        Its state.
+    """
+    mesh = operators.wing_mesh
+    design = mesh.design
+    skin = design.skin
+    body = operators.body
+    grading = None
+    if skin.stations:
+        # The temperature of a node is its station, on which the elasticity of the skin depends.
+        course = [(place.station, place.young_modulus) for place in skin.stations]
+        _, y, _ = mesh.points.T
+        grading = Grading(course, y / design.planform.semi_span, mesh.is_skin)
+        central_modulus = np.where(mesh.is_skin, skin.young_modulus(mesh.centre_stations), 1.0)
+        body = replace(body, elasticity=body.elasticity / central_modulus[:, None, None])
+    return CalculixDeck(
+        title="wing, design",
+        structure=operators,
+        body=body,
+        values=wing_values(operators, stiffness_loss=state.stiffness_loss, **state.values),
+        loads={
+            "tip force": Step(operators.turn(0.0, TEST_FORCE)),
+            "lift": Step(operators.turn(design.lift.load_factor)),
+        },
+        grading=grading,
+        damping=(state.damping_alpha, state.damping_beta),
+    )

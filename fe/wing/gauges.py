@@ -1,0 +1,161 @@
+"""Strain gauges of the wing as rows on the displacements."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from fe.elements.elasticity import unit_vector
+from fe.runtime.arrays import FloatArray, IntArray
+
+from .mesh import WingMesh
+
+
+class LinePoints(NamedTuple):
+    """Points on a line with the weights of a mean.
+
+    Attributes
+    ----------
+    positions : (p,) array
+        Positions on the line [m].
+    weights : (p,) array
+        Weights; they sum to one.
+    """
+
+    positions: FloatArray
+    weights: FloatArray
+
+
+def averaging_points(middle: float, length: float, lines: FloatArray) -> LinePoints:
+    """Return Gauss points of the mean over a length, interval by interval between mesh lines.
+
+    Strain jumps at the edge of a defect, which is a mesh line. Points that disregard the mesh lines
+    would misjudge how much of a gauge lies beyond the edge.
+
+    Parameters
+    ----------
+    middle : float
+        The middle of the length [m].
+    length : float
+        The length [m]; zero for a point.
+    lines : (k,) array
+        Positions of the mesh lines [m], ascending.
+    """
+    if length == 0.0:
+        return LinePoints(np.array([middle]), np.array([1.0]))
+    start = middle - 0.5 * length
+    end = middle + 0.5 * length
+    breaks = np.array([start, *lines[(lines > start) & (lines < end)], end])
+    roots, root_weights = np.polynomial.legendre.leggauss(3)
+    intervals = np.diff(breaks)[:, None]
+    positions = breaks[:-1, None] + 0.5 * (1.0 + roots) * intervals
+    weights = 0.5 * root_weights * intervals / length
+    return LinePoints(positions.ravel(), weights.ravel())
+
+
+class _SkinPoint(NamedTuple):
+    """A point of the skin at which a gauge reads the strain.
+
+    Attributes
+    ----------
+    gauge : int
+        Number of the gauge.
+    weight : float
+        Weight of the strain in the mean of the gauge.
+    cell : int
+        The cell of the point.
+    local : (3,) array
+        Its local position in the cell.
+    """
+
+    gauge: int
+    weight: float
+    cell: int
+    local: FloatArray
+
+
+def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
+    """Return the strain of each gauge as a row on the displacements, eq. (15).
+
+    The strain is that of the upper skin, on its outer surface or in the middle of its thickness,
+    averaged over the gauge interval by interval between the mesh lines.
+
+    Parameters
+    ----------
+    mesh : WingMesh
+        The mesh.
+    angle : float
+        Angle [rad] in the skin from the span towards the tip's rear, along which gauges read.
+
+    Returns
+    -------
+    csr (gauges, full)
+        Rows [1/m], positive in compression.
+    """
+    points: list[_SkinPoint] = []
+    for gauge in range(len(mesh.design.gauges.positions)):
+        points += _gauge_points(mesh, gauge)
+    cells = np.array([point.cell for point in points])
+    local = np.array([point.local for point in points])
+    weights = np.array([point.weight for point in points])
+    if mesh.design.gauges.surface == "middle":
+        local[:, -1] = 0.5
+    along, aft = _directions_in_skin(mesh, cells, local)
+    return mesh.strain_rows(
+        row=np.array([point.gauge for point in points]),
+        weight=-weights,
+        cells=cells,
+        local=local,
+        direction=np.cos(angle) * along + np.sin(angle) * aft,
+    )
+
+
+def _gauge_points(mesh: WingMesh, gauge: int) -> list[_SkinPoint]:
+    """Return the points over which a gauge averages: a rectangle around its middle.
+
+    The rectangle reaches the same distances fore and aft of the gauge's own chord line.
+    """
+    gauges = mesh.design.gauges
+    planform = mesh.design.planform
+    distance, chord_fraction = gauges.positions[gauge]
+    chord = planform.chord(distance / planform.semi_span)
+    behind_straight_line = (chord_fraction - planform.straight_chord_line) * chord
+    points = []
+    along = averaging_points(distance, gauges.averaging_spanwise, mesh.span_lines)
+    for station, station_weight in zip(*along, strict=True):
+        straight_line = planform.straight_chord_line * planform.chord(station / planform.semi_span)
+        across = averaging_points(
+            behind_straight_line + straight_line,
+            gauges.averaging_chordwise,
+            mesh.chord_positions(station),
+        )
+        for behind, chord_weight in zip(*across, strict=True):
+            cell, local = mesh.skin_point(station, behind)
+            points.append(_SkinPoint(gauge, station_weight * chord_weight, cell, local))
+    return points
+
+
+def _directions_in_skin(
+    mesh: WingMesh, cells: IntArray, local: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return unit directions in the skin, along the span and aft.
+
+    Parameters
+    ----------
+    mesh : WingMesh
+        The mesh.
+    cells : (p,) array of int
+        Cells.
+    local : (p, 3) array
+        One local position in each of them.
+
+    Returns
+    -------
+    along, aft : (p, 3) arrays
+        The directions.
+    """
+    along_chord, along_span, _ = np.moveaxis(mesh.jacobians_at(cells, local), 2, 0)
+    normal = unit_vector(np.cross(along_chord, along_span))
+    _, span_component, _ = np.split(normal, 3, axis=1)
+    along = unit_vector(np.array([0.0, 1.0, 0.0]) - span_component * normal)
+    return along, np.cross(along, normal)

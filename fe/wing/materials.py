@@ -1,0 +1,121 @@
+"""Elasticity and density of the cells of a wing."""
+
+import numpy as np
+
+from fe.elements.cells import jacobians
+from fe.elements.elasticity import (
+    isotropic_compliance,
+    orthotropic_compliance,
+    rotate_elasticity,
+    unit_vector,
+)
+from fe.elements.kinds import gauss_points
+from fe.runtime.arrays import FloatArray
+
+from .mesh import WingMesh
+
+
+def cell_elasticity(mesh: WingMesh) -> FloatArray:
+    """Return the elasticity (nc, 6, 6) [Pa] in space of every cell, at e = 1, without damage."""
+    local = np.empty((len(mesh.cells), 6, 6))
+    _set_skin_elasticity(mesh, local)
+    for index, web in enumerate(mesh.design.webs):
+        compliance = orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
+        local[mesh.web == index] = np.linalg.inv(compliance)
+    for index, rib in enumerate(mesh.design.ribs):
+        compliance = isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
+        local[mesh.rib == index] = np.linalg.inv(compliance)
+    _add_rod_stiffness(mesh, local)
+    return rotate_elasticity(local, cell_axes(mesh))
+
+
+def _set_skin_elasticity(mesh: WingMesh, local: FloatArray) -> None:
+    """Set the elasticity of the skin and of the leading-edge wall in local axes (nc, 6, 6) [Pa].
+
+    The thickness of the wall runs along the chord, so that its in-plane shear is that of axes 2, 3.
+    """
+    skin = mesh.design.skin
+    in_plane = skin.in_plane_shear_ratio
+    transverse = skin.transverse_shear_ratio
+
+    def unit_elasticity(shear_moduli: tuple[float, float, float]) -> FloatArray:
+        compliance = orthotropic_compliance(1.0, skin.poisson_ratio, shear_moduli)
+        return np.asarray(np.linalg.inv(compliance))
+
+    of_skin = unit_elasticity((in_plane, transverse, transverse))
+    of_wall = unit_elasticity((transverse, transverse, in_plane))
+    is_skin = mesh.is_skin
+    modulus = skin.young_modulus(mesh.centre_stations)[is_skin, None, None]
+    is_wall = mesh.leading_edge[is_skin, None, None]
+    local[is_skin] = np.where(is_wall, of_wall, of_skin) * modulus
+
+
+def _add_rod_stiffness(mesh: WingMesh, local: FloatArray) -> None:
+    """Add the flapwise bending stiffness of rods to their webs, in local axes (nc, 6, 6) [Pa]."""
+    for rod in mesh.design.rods:
+        has_rod = (mesh.web == rod.web) & (mesh.centre_stations < rod.reach)
+        thickness = mesh.design.webs[rod.web].thickness
+        second_moment = thickness * _web_height(mesh)[has_rod] ** 3 / 12.0
+        local[has_rod, 1, 1] += rod.bending_stiffness / second_moment
+
+
+def cell_axes(mesh: WingMesh) -> FloatArray:
+    """Return the local material axes (nc, 3, 3) of every cell.
+
+    The rows are chordwise, spanwise and across the surface of the cell.
+    """
+    centre = np.array([[0.5, 0.5, 0.5]])
+    jacobian = jacobians(mesh.kind, mesh.nodes, centre).squeeze(axis=1)
+    along_chord, along_span, _ = np.moveaxis(jacobian, 2, 0)
+    across = unit_vector(np.cross(along_chord, along_span))
+    spanwise = unit_vector(along_span)
+    return np.stack([np.cross(spanwise, across), spanwise, across], axis=1)
+
+
+def modulus_variation(mesh: WingMesh) -> FloatArray:
+    """Return Young's modulus at the points of `gauss_points(3)` over that at the cell's centre.
+
+    It differs from one if the skin's modulus is given at stations, and therefore changes inside a
+    cell.
+
+    Returns
+    -------
+    (nc, 27) array
+        The ratios.
+    """
+    rule = gauss_points(3)
+    factor = np.ones((len(mesh.cells), len(rule.weights)))
+    skin = mesh.design.skin
+    if not skin.stations:
+        return factor
+    skin_cells = np.flatnonzero(mesh.is_skin)
+    _, y, _ = np.moveaxis(mesh.positions(skin_cells, rule.points), 2, 0)
+    stations = y / mesh.design.planform.semi_span
+    central_modulus = skin.young_modulus(mesh.centre_stations[skin_cells])
+    factor[skin_cells] = skin.young_modulus(stations) / central_modulus[:, None]
+    return factor
+
+
+def _web_height(mesh: WingMesh) -> FloatArray:
+    """Return the height (nc,) [m] between the skins at each cell between them."""
+    _, _, z = np.moveaxis(mesh.corners, 2, 0)
+    cell_height = np.ptp(z, axis=1)
+    return np.asarray(cell_height * mesh.height_cells)
+
+
+def cell_density(mesh: WingMesh) -> FloatArray:
+    """Return the density (nc,) [kg/m^3] of every cell."""
+    design = mesh.design
+    density = np.full(len(mesh.cells), design.skin.density)
+    station = mesh.centre_stations
+    for index, web in enumerate(design.webs):
+        density[mesh.web == index] = web.density
+    for index, rib in enumerate(design.ribs):
+        density[mesh.rib == index] = rib.density
+    for added in design.added_density:
+        density[(station > added.start) & (station < added.end)] += added.density
+    for rod in design.rods:
+        has_rod = (mesh.web == rod.web) & (station < rod.reach)
+        web_area = design.webs[rod.web].thickness * _web_height(mesh)[has_rod]
+        density[has_rod] += rod.mass_per_length / web_area
+    return density

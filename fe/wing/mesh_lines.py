@@ -1,0 +1,288 @@
+"""Mesh lines of the wing: those that the parts of the wing ask for, and lines between them."""
+
+import itertools
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.errors import MeshError
+
+from .design import WingDesign, rib_interval
+
+SMALLEST_GAP = 2e-4
+"""Two mesh lines that the design asks for may not lie closer than this [m]."""
+_SAME = 1e-9
+
+
+class MeshLine(NamedTuple):
+    """A mesh line along the span, or across it.
+
+    Attributes
+    ----------
+    fraction : float
+        Its position as a fraction of the local chord; zero for a line across the span.
+    offset : float
+        Its distance from there [m].
+    label : str
+        Its name in sentences.
+    """
+
+    fraction: float
+    offset: float
+    label: str = "between"
+
+    def at(self, length: FloatArray | float) -> FloatArray:
+        """Return the distance (...,) [m] of the line where the chord is `length` [m].
+
+        It is measured from the leading edge; that of a line across the span from the root.
+        """
+        return np.asarray(self.fraction * length + self.offset)
+
+
+class OptionalLine(NamedTuple):
+    """A mesh line that is taken if it crosses no other and none is nearer than `room` [m]."""
+
+    line: MeshLine
+    room: float
+
+
+def _filled(
+    required: Iterable[MeshLine],
+    optional: Iterable[OptionalLine],
+    chords: FloatArray,
+    size: float,
+) -> list[MeshLine]:
+    """Return the required lines, optional ones that have room, and lines between them.
+
+    Parameters
+    ----------
+    required : iterable of MeshLine
+        What the design asks for; of two lines at the same position one is kept.
+    optional : iterable of OptionalLine
+        Lines that are taken if they have room.
+    chords : (k,) array
+        The chords at root and tip, where lines are compared [m].
+    size : float
+        The largest cell at the first chord [m].
+
+    Raises
+    ------
+    MeshError
+        If required lines nearly coincide or cross.
+    """
+    lines = _distinct_lines(required, chords)
+    for line, room in optional:
+        if _has_room(line, room, lines, chords):
+            lines.append(line)
+    lines.sort(key=lambda line: line.at(chords)[0])
+    filled = lines[:1]
+    for start, end in itertools.pairwise(lines):
+        filled += _lines_between(start, end, chords, size)
+        filled.append(end)
+    return filled
+
+
+def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[MeshLine]:
+    """Return required lines in their order, each once; raises `MeshError` if two are too close."""
+    lines: list[MeshLine] = []
+    for line in sorted(required, key=lambda line: (line.at(chords)[0], line.label)):
+        if lines:
+            previous = lines[-1]
+            gaps = line.at(chords) - previous.at(chords)
+            if np.abs(gaps).max() <= _SAME:
+                continue
+            if gaps.min() < SMALLEST_GAP:
+                raise MeshError(
+                    f"{line.label} and {previous.label} come closer than {SMALLEST_GAP * 1e3:g} mm "
+                    f"or cross between root and tip, at {line.at(chords)[0]:.5f} m; move one of "
+                    "them or put them on the same line."
+                )
+        lines.append(line)
+    return lines
+
+
+def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatArray) -> bool:
+    """Return whether a line lies between others, crosses none, and is farther than `room` [m]."""
+    gaps = line.at(chords) - np.array([other.at(chords) for other in lines])
+    is_behind = (gaps > 0.0).all(axis=1)
+    is_ahead = (gaps < 0.0).all(axis=1)
+    lies_between = bool(is_behind.any() and is_ahead.any())
+    crosses_none = bool((is_behind | is_ahead).all())
+    return lies_between and crosses_none and bool(np.abs(gaps).min() > room)
+
+
+def _lines_between(
+    start: MeshLine, end: MeshLine, chords: FloatArray, size: float
+) -> list[MeshLine]:
+    """Return evenly distributed lines between two, at most `size` [m] apart at the first chord."""
+    distance = (end.at(chords) - start.at(chords))[0]
+    count = max(1, int(np.ceil(distance / size - 1e-9)))
+    fraction_step = end.fraction - start.fraction
+    offset_step = end.offset - start.offset
+    return [
+        MeshLine(
+            start.fraction + number / count * fraction_step,
+            start.offset + number / count * offset_step,
+        )
+        for number in range(1, count)
+    ]
+
+
+def _lines_beside(design: WingDesign, edges: list[MeshLine]) -> list[OptionalLine]:
+    """Return lines on both sides of the edges of defects, if the design asks for small cells."""
+    if design.mesh.edge_size is None:
+        return []
+    distance = design.mesh.edge_size / design.mesh.refinement
+    lines = []
+    for edge in edges:
+        for offset in (-distance, distance):
+            line = MeshLine(edge.fraction, edge.offset + offset)
+            lines.append(OptionalLine(line, room=0.5 * distance))
+    return lines
+
+
+def span_lines(design: WingDesign) -> FloatArray:
+    """Return the mesh lines across the span: rib faces, edges of defects, ends of bands, others.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The design.
+
+    Returns
+    -------
+    (ny + 1,) array
+        Their distances from the root [m].
+
+    Raises
+    ------
+    MeshError
+        If two lines that the design asks for nearly coincide.
+    """
+    span = design.planform.semi_span
+    settings = design.mesh
+    edges = []
+    for index, defect in enumerate(design.defects):
+        edges.append(MeshLine(0.0, defect.span_start, f"the inner edge of defects[{index}]"))
+        edges.append(MeshLine(0.0, defect.span_end, f"the outer edge of defects[{index}]"))
+    rib_faces = []
+    for index in range(len(design.ribs)):
+        start, end = rib_interval(design, index)
+        rib_faces.append(MeshLine(0.0, start, f"the inner face of ribs[{index}]"))
+        rib_faces.append(MeshLine(0.0, end, f"the outer face of ribs[{index}]"))
+    ends = [
+        OptionalLine(MeshLine(0.0, fraction * span), room=0.1 * settings.span_size)
+        for fraction in _material_ends(design)
+    ]
+    root = MeshLine(0.0, 0.0, "the root")
+    tip = MeshLine(0.0, span, "the tip")
+    lines = _filled(
+        required=[root, tip, *rib_faces, *edges],
+        optional=[*ends, *_lines_beside(design, edges)],
+        chords=np.zeros(1),
+        size=settings.span_size / settings.refinement,
+    )
+    return np.array([line.offset for line in lines])
+
+
+def _material_ends(design: WingDesign) -> list[float]:
+    """Return the fractions of the span where bands, rods and added densities end, ascending."""
+    ends = {band.end for band in design.skin.bands}
+    ends |= {rod.reach for rod in design.rods}
+    ends |= {added.start for added in design.added_density}
+    ends |= {added.end for added in design.added_density}
+    return sorted(ends)
+
+
+def web_faces(design: WingDesign, index: int) -> tuple[MeshLine, MeshLine]:
+    """Return the front and the rear mesh line of a web.
+
+    The first web lies behind its chord fraction, the last one before it, the others around it.
+    """
+    web = design.webs[index]
+    if index == 0:
+        front = 0.0
+    elif index == len(design.webs) - 1:
+        front = -web.thickness
+    else:
+        front = -0.5 * web.thickness
+    return (
+        MeshLine(web.chord, front, f"the front of webs[{index}]"),
+        MeshLine(web.chord, front + web.thickness, f"the rear of webs[{index}]"),
+    )
+
+
+def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
+    """Return the nx + 1 mesh lines along the span.
+
+    These are web faces, edges of defects, the leading-edge wall, and lines between.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The design.
+
+    Raises
+    ------
+    MeshError
+        If two lines that the design asks for nearly coincide, or cross between root and tip.
+    """
+    planform = design.planform
+    settings = design.mesh
+    edges = []
+    for index, defect in enumerate(design.defects):
+        edges.append(MeshLine(defect.chord_start, 0.0, f"the front edge of defects[{index}]"))
+        edges.append(MeshLine(defect.chord_end, 0.0, f"the rear edge of defects[{index}]"))
+    required = list(edges)
+    for index in range(len(design.webs)):
+        required += web_faces(design, index)
+    if design.skin.closed_leading_edge:
+        thickness = design.skin.thickness
+        required.append(MeshLine(design.front_chord, -thickness, "the leading-edge wall"))
+    lines = _filled(
+        required,
+        optional=_lines_beside(design, edges),
+        chords=np.array([planform.root_chord, planform.tip_chord]),
+        size=settings.chord_size / settings.refinement * planform.root_chord,
+    )
+    return tuple(lines)
+
+
+def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) -> IntArray:
+    """Return the interval that holds the middle of each cell between lines.
+
+    Parameters
+    ----------
+    lines : (n + 1,) array
+        Mesh lines, ascending.
+    intervals : iterable of (float, float)
+        Start and end of each interval.
+
+    Returns
+    -------
+    (n,) array of int
+        Number of the interval, -1 for none.
+    """
+    middle = 0.5 * (lines[1:] + lines[:-1])
+    interval_of_cell = np.full(len(middle), -1, dtype=np.int64)
+    for number, (start, end) in enumerate(intervals):
+        interval_of_cell[(middle > start) & (middle < end)] = number
+    return interval_of_cell
+
+
+def web_cells(design: WingDesign, along: Iterable[MeshLine]) -> IntArray:
+    """Return the web (nx,) of each cell between the mesh lines along the span, -1 for none."""
+    root_chord = design.planform.root_chord
+    intervals = []
+    for index in range(len(design.webs)):
+        front, rear = web_faces(design, index)
+        intervals.append((float(front.at(root_chord)), float(rear.at(root_chord))))
+    return cells_within(np.array([line.at(root_chord) for line in along]), intervals)
+
+
+def rib_cells(design: WingDesign, across: FloatArray) -> IntArray:
+    """Return the rib (ny,) of each cell between the mesh lines across the span, -1 for none."""
+    intervals = [rib_interval(design, index) for index in range(len(design.ribs))]
+    return cells_within(across, intervals)
