@@ -255,7 +255,7 @@ class StaticReduction:
         solved = np.linalg.qr(reference_images)[0]
         # The order of columns is: terms that change with health, loads, other terms. A column of
         # the triangular factor is zero below its diagonal, so that this keeps the first ones short.
-        region_numbers = self.terms.stiffness_factors[:-1, 1]
+        _, region_numbers = self.terms.stiffness_factors[:-1].T
         is_constant = region_numbers == 0
         order = np.argsort(is_constant, kind="stable")
         first_load = directions.shape[1] * np.count_nonzero(~is_constant)

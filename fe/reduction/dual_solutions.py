@@ -129,25 +129,38 @@ def _project_duals(
     displacements = factors.unwhitened(directions.swapaxes(0, 1).reshape(size, -1))
     displacements = displacements.reshape(size, count, -1)
     projections = []
-    # the outputs in batches, which limits the memory of the images
     for batch in np.array_split(np.arange(count), ceil(count / OUTPUTS_PER_BATCH)):
-        flat = displacements[:, batch].reshape(size, -1)
-        images = np.stack(
-            [(term @ flat).reshape(size, len(batch), -1) for term in terms.stiffness_terms]
-        )
-        # the images as whitened forces, all terms of an output side by side
-        forces = factors.whitened(np.moveaxis(images, 0, 2).reshape(size, -1))
-        forces_by_output = forces.reshape(size, len(batch), -1).swapaxes(0, 1)
-        projected_terms = np.einsum(
-            "nom,tnok->otmk", displacements[:, batch], images, optimize=True
-        )
-        for output, projected, force in zip(
-            outputs[:, batch].T, projected_terms, forces_by_output, strict=True
-        ):
-            # A dropped direction is zero; a one on the diagonal keeps the system solvable.
-            is_dropped = np.diagonal(projected.sum(axis=0)) == 0.0
-            projected[-1] += np.diag(is_dropped)
-            projections.append((_residual_factor(output, force), projected))
+        projections += _project_batch(terms, outputs[:, batch], displacements[:, batch])
+    return projections
+
+
+def _project_batch(
+    terms: ReductionTerms, outputs: FloatArray, displacements: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return what `_project_duals` does, for b outputs at once.
+
+    Parameters
+    ----------
+    terms : ReductionTerms
+        The full model.
+    outputs : (n, b) array
+        The outputs, whitened.
+    displacements : (n, b, M) array
+        The directions of each output as displacements.
+    """
+    size, count = outputs.shape
+    flat = displacements.reshape(size, -1)
+    images = np.stack([(term @ flat).reshape(size, count, -1) for term in terms.stiffness_terms])
+    projected_terms = np.einsum("nom,tnok->otmk", displacements, images, optimize=True)
+    # the images as whitened forces, all terms of an output side by side
+    forces = terms.factors.whitened(np.moveaxis(images, 0, 2).reshape(size, -1))
+    forces_by_output = forces.reshape(size, count, -1).swapaxes(0, 1)
+    projections = []
+    for output, projected, force in zip(outputs.T, projected_terms, forces_by_output, strict=True):
+        # A dropped direction is zero; a one on the diagonal keeps the system solvable.
+        is_dropped = np.diagonal(projected.sum(axis=0)) == 0.0
+        projected[-1] += np.diag(is_dropped)
+        projections.append((_residual_factor(output, force), projected))
     return projections
 
 
