@@ -337,7 +337,7 @@ REDUCED = "hexahedron20 reduced"
 DECK_KINDS = KINDS | {REDUCED: HEXAHEDRA_20_REDUCED}
 """The kinds that decks can ask for, by their names in a `Deck`.
 
-The names in meshio do not suffice: they are of cells, and not of their integration.
+The names of meshio are of cells only, not of their integration.
 """
 
 

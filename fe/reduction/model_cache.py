@@ -275,7 +275,7 @@ def check_structure(file: Path | str) -> None:
 
 
 def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
-    """Return the cache file of the reduced model of a structure file."""
+    """Return the cache file of the reduced model of a structure file, with its ports or without."""
     design = load_structure(file)
     design_hash = structure_hash(design, file.parent, with_ports=with_ports)
     return cache_file("structure", design_hash, design.reduction)

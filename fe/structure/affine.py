@@ -17,12 +17,13 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidStateError, SolutionError
 from fe.runtime.state import losses_of
+from reporting.words import comma_list
 
 from .tables import StructureDesign
 
 Values = Mapping[str, float]
 PORT_PREFIX = "port."
-"""Begins the names of force and displacement at a port, see `AffineStructure.pushed_at_ports`.
+"""Begins the names of the force and the displacement at a port, see `AffineStructure.pushed_at_ports`.
 
 No name in a structure file has a dot.
 """
@@ -110,7 +111,7 @@ class AffineStructure:
     displacement_output, acceleration_output : csr (m, n)
         Rows that give a displacement, or with second derivatives an acceleration [1].
     port_output : csr (ports, n)
-        Rows that give the displacement of a port; transposed, a force of 1 N there.
+        Rows that give the displacement of a port [1]; transposed, a force of 1 N there.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
     design_hash : str
@@ -248,11 +249,11 @@ class AffineStructure:
     def pushed_at_ports(self) -> "AffineStructure":
         """Return the structure with a force [N] and a displacement [m] at each port, named `port.NAME`.
 
-        The force is a control whose nominal value is zero, so that it acts only where something asks for it.
+        The force is a control whose nominal value is zero: it acts only where something asks for it.
         """
         names = tuple(f"{PORT_PREFIX}{port}" for port in self.ports)
-        unit_forces = zip(names, self.port_output.toarray(), strict=True)
-        port_loads = [LoadTerm(name, vector) for name, vector in unit_forces]
+        unit_forces = self.port_output.toarray()
+        port_loads = [LoadTerm(name, force) for name, force in zip(names, unit_forces, strict=True)]
         return replace(
             self,
             controls=self.controls | dict.fromkeys(names, 0.0),
@@ -289,9 +290,8 @@ def _changed_factors(nominal: dict[str, float], changed: Values | None, kind: st
     changes = dict(changed or {})
     unknown_names = set(changes) - set(nominal)
     if unknown_names:
-        known_names = ", ".join(nominal) or "none"
         raise InvalidStateError(
-            f"The structure has no {kind} named {min(unknown_names)!r}; there are {known_names}."
+            f"The structure has no {kind} named {min(unknown_names)!r}; there are {comma_list(nominal)}."
         )
     factors: dict[str | None, float] = {None: 1.0}
     factors.update(nominal | changes)

@@ -22,7 +22,7 @@ class OutputRows(NamedTuple):
     displacement, acceleration : csr (m, full)
         Displacements, or with second derivatives accelerations [1].
     port : csr (ports, full)
-        Displacements of the ports [1].
+        Displacements of the ports [1]; transposed, a force of 1 N at each.
     """
 
     gauge: sparse.csr_array
@@ -95,7 +95,7 @@ def affine_fields(
         for mass_name, matrix in masses.items():
             load_terms.append(LoadTerm(load.name, restriction @ (matrix @ vector), mass_name))
     port_output = (outputs.port @ expansion).tocsr()
-    _check_ports(design, port_output)
+    _check_ports_can_move(design, port_output)
     return {
         "parameters": {parameter.name: parameter.nominal for parameter in design.parameter},
         "masses": {part.name: part.mass for part in design.mass if part.free},
@@ -118,8 +118,8 @@ def affine_fields(
     }
 
 
-def _check_ports(design: StructureDesign, port_output: sparse.csr_array) -> None:
-    """Raise `InvalidDesignError` if a port lies where nothing can move."""
+def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array) -> None:
+    """Raise `InvalidDesignError` if a row (n,) of a port is zero: the supports hold all that it moves."""
     for (label, port), row in zip(design.numbered("port"), port_output.toarray(), strict=True):
         if not row.any():
             raise InvalidDesignError(

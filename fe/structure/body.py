@@ -119,7 +119,7 @@ class Body(Generic[Mesh]):
         design : StructureDesign
             The design of the structure.
         loads : iterable of (full,) array
-            Its loads, as in `fe.structure.affine.affine_fields`.
+            Its loads, as in `fe.structure.affine_fields.affine_fields`.
         outputs : OutputRows
             Rows of its gauges, displacements, accelerations and ports.
         """

@@ -1,8 +1,8 @@
 """From matrices and a structure file to affine operators; matrices that are no structure's are refused.
 
 Matrices are converted to SI units as they are read: stiffness in N/m, mass in kg, unknowns in metres
-(rotations times the unit of length). A row that reads a displacement is then, transposed, a force of
-1 N there.
+(turns times the unit of length). A row that reads a displacement is then, transposed, a force of 1 N
+there.
 """
 
 import itertools
@@ -61,7 +61,7 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
     free_places = [files.places[row] for row in free]
     _check_structure(stiffness[free][:, free], mass[free][:, free], free_places)
     fields = _fields(design, files, mass, free)
-    # The fields select the free rows; fields of displacements are those of all nodes.
+    # The expansion of the model gives displacements of nodes, not the rows of the matrices.
     fields["expansion"] = _nodal_displacements(files)[:, free]
     return AffineStructure(
         design=design,
@@ -111,8 +111,7 @@ def _fields(design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, fr
 
     def output_rows(key: str) -> sparse.csr_array:
         rows = [
-            _output_row(output, files, f"{label} ({output.name})", design.unit)
-            for label, output in design.numbered(key)
+            _output_row(output, files, f"{label} ({output.name})") for label, output in design.numbered(key)
         ]
         return sparse.csr_array(np.array(rows).reshape(-1, size))
 
@@ -153,13 +152,10 @@ def _load(load: MatrixLoad, files: MatrixFiles, where: str) -> FloatArray:
     return files.vector(str(load.vector), where, FORCE_WEIGHTS)
 
 
-def _output_row(output: Extension | NodeOutput, files: MatrixFiles, where: str, unit: float) -> FloatArray:
-    """Return the row (n,) of an output: a strain [1/m], or a displacement, acceleration or port [1].
-
-    Strains are given per unknown in the unit of length of the matrices [m].
-    """
+def _output_row(output: Extension | NodeOutput, files: MatrixFiles, where: str) -> FloatArray:
+    """Return the row (n,) of a strain [1/m], or of a displacement, acceleration or port [1]."""
     is_strain = isinstance(output, Extension)
-    scale = 1.0 / unit if is_strain else 1.0
+    scale = 1.0 / files.unit if is_strain else 1.0
     if output.vector is not None:
         return scale * files.vector(output.vector, where)
     assert output.direction is not None

@@ -1,4 +1,4 @@
-"""Nodal loads of forces, pressures and accelerations, and the displacement of points by nodes."""
+"""Nodal loads of forces, pressures and accelerations, and the displacement of points and ports."""
 
 from typing import NamedTuple
 
@@ -108,20 +108,18 @@ def port_row(mesh: StructureMesh, port: Port, where: str) -> FloatArray:
     Raises
     ------
     MeshError
-        If its set is missing or empty.
+        If the set of the port is missing or empty.
     InvalidDesignError
-        If its point lies outside.
+        If the point of the port lies outside.
     """
     return np.outer(_force_weights(mesh, port, where), unit_vector(port.direction))
 
 
 def _force_weights(mesh: StructureMesh, part: Load | Port, where: str) -> FloatArray:
-    """Return the weights (nodes,) of the nodes in a force at a point or on a set; they sum to one.
-
-    A force on a set acts by area if the set holds faces, else equally on its nodes.
-    """
+    """Return the weights (nodes,) of the nodes in a force at a point or on a set; their sum is one."""
     if part.point is not None:
         return point_weights(mesh, part.point, where)
+    # a force on a set: by area if it holds faces, else equally among the nodes
     nodes = mesh.nodes_of(str(part.set), where)
     surface = mesh.faces_between(str(part.set), nodes)
     if len(surface):

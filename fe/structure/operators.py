@@ -18,7 +18,16 @@ from reporting.files import atomic_file
 from .affine import AffineStructure, static_response
 from .affine_fields import OutputRows
 from .body import Body, PointMass
-from .design import Damage, Material, MatrixDesign, MeshDesign, PointOutput, load_structure, structure_hash
+from .design import (
+    Damage,
+    Material,
+    MatrixDesign,
+    MeshDesign,
+    PointOutput,
+    Port,
+    load_structure,
+    structure_hash,
+)
 from .gauges import gauge_rows
 from .matrices import assemble_matrices
 from .mesh import StructureMesh
@@ -184,12 +193,11 @@ def load_and_assemble(
     # the body, its loads and outputs
     body = _body(design, mesh, material_of, region_of, mass_as_stiffness=mass_as_stiffness)
     gauges, gauges_moved = gauge_rows(mesh, design.gauge)
-    ports = [port_row(mesh, port, label).ravel() for label, port in design.numbered("port")]
     outputs = OutputRows(
         gauge=gauges,
         displacement=_point_rows(mesh, list(design.numbered("displacement"))),
         acceleration=_point_rows(mesh, list(design.numbered("acceleration"))),
-        port=sparse.csr_array(np.reshape(ports, (-1, mesh.unknowns))),
+        port=_port_rows(mesh, list(design.numbered("port"))),
     )
     loads = (nodal_load(mesh, load, label).ravel() for label, load in design.numbered("load"))
     return Structure(
@@ -271,6 +279,12 @@ def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) ->
     for label, output in labelled:
         weights = point_weights(mesh, output.point, label)
         rows.append(np.outer(weights, unit_vector(output.direction)).ravel())
+    return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
+
+
+def _port_rows(mesh: StructureMesh, labelled: list[tuple[str, Port]]) -> sparse.csr_array:
+    """Return rows (ports, full) of the displacements of ports, each with its label."""
+    rows = [port_row(mesh, port, label).ravel() for label, port in labelled]
     return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
 
 
