@@ -53,7 +53,10 @@ class _Annotation(NamedTuple):
 
 @contextmanager
 def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
-    """Return a context that yields a function, which adds attributes to the SVG drawn inside.
+    """Mark the parts of a figure while it is drawn as SVG, so that a page can show their values.
+
+    Inside of the context the figure is drawn. The function that the context yields then takes the
+    text of the SVG, and returns it with the attributes that the script of the page reads.
 
     Panels get ``data-axes`` (box in units of the SVG; limits, scale, name and texts of either
     axis), lines and scatters ``data-series`` (name, colour), bands and error bars ``data-spread``
@@ -71,9 +74,10 @@ def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
 
     def annotate(svg: str) -> str:
         for number, (artist, attribute, value) in enumerate(annotations):
-            if isinstance(artist, Axes):
-                value = json.dumps(_panel_record(artist), ensure_ascii=False)
-            replacement = f'{attribute}="{html.escape(value)}"'
+            text = value
+            if isinstance(artist, Axes):  # the limits of a panel are known once it is drawn
+                text = json.dumps(_panel_record(artist), ensure_ascii=False)
+            replacement = f'{attribute}="{html.escape(text)}"'
             svg = svg.replace(f'id="hover-{number}-"', replacement, 1)
         return svg
 

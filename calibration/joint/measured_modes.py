@@ -167,7 +167,10 @@ def _terms_of_amplitude(trials: Fits) -> _SystematicTerms:
 
 
 def _term_of_slope(logarithm: Float, value: Float) -> float:
-    """Return the change of a value over one standard deviation of the logarithm of the amplitude.
+    """Return how much a modal value changes systematically with the amplitude.
+
+    A line is fitted to the value over the logarithm of the amplitude. The change is that of the
+    line over one standard deviation of the logarithm, without what chance could have made.
 
     Parameters
     ----------

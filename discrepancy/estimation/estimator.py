@@ -198,23 +198,31 @@ class Estimator:
             if found is None:
                 return None
             current = following(found)
-        lowered = self._lowered(laws, current)
-        return None if lowered is None else self._tuned(laws, lowered)
+        estimate = self._with_smaller_missing_forces(laws, current)
+        return None if estimate is None else self._tuned(laws, estimate)
 
-    def _lowered(self, laws: Laws, start: Start) -> Estimate | None:
-        """Return the most probable of estimates beside ever smaller missing forces (continuation)."""
+    def _with_smaller_missing_forces(self, laws: Laws, start: Start) -> Estimate | None:
+        """Return the estimate whose missing force has the most probable of several sizes (continuation).
+
+        With a large missing force the trajectory follows the readings whatever the laws are. The size is
+        then lowered step by step, and each estimate begins where the last one ended. None if the laws
+        cannot be followed even at the first size.
+        """
         best: Estimate | None = None
         current = start
-        for share in SHARES_OF_SIZE:
-            processes = {port: replace(one, size=share * one.size) for port, one in start.processes.items()}
-            found = self._iterated(laws, replace(current, processes=processes), SMOOTHINGS[-1])
-            if found is None:
+        for fraction in SHARES_OF_SIZE:
+            processes = {
+                port: replace(process, size=fraction * process.size)
+                for port, process in start.processes.items()
+            }
+            estimate = self._iterated(laws, replace(current, processes=processes), SMOOTHINGS[-1])
+            if estimate is None:
                 break
-            if best is None or found.log_evidence > best.log_evidence:
-                best = found
-            elif found.log_evidence < best.log_evidence - DECLINE:
+            if best is None or estimate.log_evidence > best.log_evidence:
+                best = estimate
+            elif estimate.log_evidence < best.log_evidence - DECLINE:
                 break
-            current = following(found)
+            current = following(estimate)
         return best
 
     def _tuned(self, laws: Laws, found: Estimate) -> Estimate:

@@ -93,7 +93,8 @@ def adjustable_laws(search: ForceSearch) -> tuple[int, ...]:
 def _explained(search: ForceSearch, followed: Explained, found: Estimate) -> Explained | None:
     """Return an estimate as a hypothesis of the search, which others may be added to."""
     motions = [
-        _motion(trial, smoothed) for trial, smoothed in zip(followed.view.trials, found.trials, strict=True)
+        _smoothed_motion(trial, smoothed)
+        for trial, smoothed in zip(followed.view.trials, found.trials, strict=True)
     ]
     view = search.linear(followed.view, motions, followed.candidate, found.effect)
     if view is None:
@@ -111,22 +112,25 @@ def _explained(search: ForceSearch, followed: Explained, found: Estimate) -> Exp
     )
 
 
-def _motion(trial: SeenTrial, smoothed: SmoothedTrial) -> Motion:
-    """Return the motion of a trial as the search takes it."""
+def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> Motion:
+    """Return the smoothed motion of a trial in the form in which the search follows hypotheses.
+
+    The search asks which part of the motion the hypothesis explains: all but what the missing force,
+    which none of its laws is, adds to the state.
+    """
     trajectory = smoothed.trajectory
-    by_missing = sum(
-        (trial.pushed(port, force) for port, force in smoothed.missing.items()),
-        np.zeros_like(trajectory.added),
-    )
-    deviations = {
-        port: (deviation[:: trial.parts], _speed_deviation(trial, port, smoothed.state_deviation))
-        for port, deviation in smoothed.deviations.items()
-    }
+    state_by_missing_force = np.zeros_like(trajectory.added)
+    for port, force in smoothed.missing.items():
+        state_by_missing_force = state_by_missing_force + trial.pushed(port, force)
+    deviations = {}
+    for port, deviation in smoothed.deviations.items():
+        at_samples = deviation[:: trial.parts]
+        deviations[port] = (at_samples, _speed_deviation(trial, port, smoothed.state_deviation))
     return Motion(
         added=trajectory.added,
         forces=trajectory.forces,
         left=smoothed.missing,
-        explained=trajectory.added - by_missing,
+        explained=trajectory.added - state_by_missing_force,
         positions=trajectory.positions,
         speeds=trajectory.speeds,
         deviations=deviations,

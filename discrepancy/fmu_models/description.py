@@ -4,10 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
 from pydantic import BeforeValidator, Field
-from reporting.toml_file import Fault, Name, Number, Positive
-from scenarios import binding_files
 
 from discrepancy.campaign.records import Quantity
 from discrepancy.system.load_change import DEFAULT_PLACE
@@ -17,6 +14,9 @@ from discrepancy.system.model_file import (
     ParameterSection,
     Section,
 )
+from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
+from reporting.toml_file import Fault, Name, Number, Positive
+from scenarios import binding_files
 
 CARRIED = tuple(primitive.kind for primitive in (*STRUCTURE, *LOADS, StiffnessDrift))
 """Kinds of primitives that an FMU can carry as its own parameters."""

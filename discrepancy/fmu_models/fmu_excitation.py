@@ -5,10 +5,10 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from fmu_asset.door.runs import State
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.system.time_history import RecordedHistory
+from fmu_asset.door.runs import State
 
 
 class FmuExcitation(NamedTuple):

@@ -8,13 +8,13 @@ that mass as they do on any structure. Second order in the step.
 from collections.abc import Sequence
 
 import numpy as np
+
+from discrepancy.campaign.records import FloatArray
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import Boundaries, Laws, steps_under
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.motion_arrays import State as ModalState
-
-from discrepancy.campaign.records import FloatArray
 
 
 class PortCoupling:
@@ -80,14 +80,17 @@ class PortCoupling:
     def speed_loss(
         self, positions: FloatArray, speeds: FloatArray, accelerations: FloatArray
     ) -> FloatArray:
-        """Return by how much the laws slow down the ports (P,) in the next step.
+        """Return the speed (P,) that the laws take from the ports during the next step.
+
+        The step is integrated with the laws, and the speed at its end is compared with the speed
+        that the ports would have without them. The laws remember the step.
 
         Parameters
         ----------
         positions, speeds : (P,) arrays
-            Motion of the ports at the begin of the step.
+            The motion of the ports at the start of the step.
         accelerations : (P,) array
-            What else accelerates the ports in the step.
+            The accelerations of the ports without the laws, constant during the step.
         """
         h = self._step
         self._state.q[:] = positions
@@ -107,4 +110,5 @@ class PortCoupling:
             tuple(self._results),
         )
         self._has_memory = True
-        return speeds + h * accelerations - self._state.v
+        speeds_without_laws = speeds + h * accelerations
+        return speeds_without_laws - self._state.v

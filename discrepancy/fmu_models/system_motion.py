@@ -5,15 +5,15 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.system.excitation import Excitation
+from discrepancy.system.time_history import SMOOTH_PARTS, equivalent_ramps
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
 from fmu_asset.door.runs import StateSpace
-
-from discrepancy.campaign.records import FloatArray
-from discrepancy.system.excitation import Excitation
-from discrepancy.system.time_history import SMOOTH_PARTS, equivalent_ramps
 
 MOST_SYSTEMS = 64
 """Number of systems that are kept."""

@@ -3,13 +3,13 @@
 from collections.abc import Collection, Mapping
 
 import numpy as np
-from fe.runtime.patch import ModelPatch
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.fmu_motion import FmuSimulator
 from discrepancy.system.load_change import require_release
 from discrepancy.system.response import Conditions
+from fe.runtime.patch import ModelPatch
 
 
 def effect_parameters(

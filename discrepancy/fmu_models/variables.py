@@ -5,14 +5,13 @@ from math import pi
 from pathlib import Path
 from typing import NamedTuple
 
-from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding
-from reporting.words import counted
-
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.description import FmuModelDescription, FmuOutputSection
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding
+from reporting.words import counted
 
 REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")
 """Units of FMUs in which an angular velocity is revolutions per minute."""

@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-from fe.runtime.arrays import FADING, LAGGED
-from fe.runtime.motion import Begin, Laws
 
 from discrepancy.campaign.records import FloatArray, Start
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, ReleasePoint
 from discrepancy.system.linear_system import LinearSystem
+from fe.runtime.arrays import FADING, LAGGED
+from fe.runtime.motion import Begin, Laws
 
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point by less than this share of what the most moving mode does is

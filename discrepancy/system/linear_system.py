@@ -14,14 +14,14 @@ from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from fe.compilation import compiled_kernel
-from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Laws, static_solution
 from scipy.linalg import eigh, null_space
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation
+from fe.compilation import compiled_kernel
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import NO_LAWS, Laws, static_solution
 
 HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest mass of the system."""

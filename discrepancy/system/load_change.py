@@ -4,12 +4,12 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from fe.runtime.patch import LoadGain, LoadPlace, Primitive
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
 from discrepancy.system.response import Place
+from fe.runtime.patch import LoadGain, LoadPlace, Primitive
 
 DEFAULT_PLACE = "tip_load"
 """Load place of a campaign that names none; a model with one input takes that one."""

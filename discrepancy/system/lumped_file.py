@@ -7,8 +7,6 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
-from reporting.toml_file import Fault, Positive
-from reporting.words import counted
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
@@ -32,6 +30,8 @@ from discrepancy.system.lumped_sections import (
     as_list,
 )
 from discrepancy.system.model_file import ModelDescription
+from reporting.toml_file import Fault, Positive
+from reporting.words import counted
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""

@@ -76,14 +76,19 @@ class LumpedModel(DescribedModel, SystemModel):
     # ------------------------------------------------------------ what it is
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether the model can carry a primitive."""
+        """Return whether a patch of this model may hold a primitive.
+
+        A law needs ports. A law of the displacement needs ports that are displaced: where a port is
+        a state, such as the level of a tank, only its rate and its value act, and its position
+        means nothing. Errors of sensors are possible with any model.
+        """
         description = self.description
-        rows = self.port_rows.values()
         if primitive in LAWS:
-            # a law of displacement needs one: the position of a state's port has no meaning
             displacement_count = description.displacement_count
-            all_move = all(np.any(row[:displacement_count]) for row in rows)
-            return bool(self.port_rows) and (primitive.of_speed or all_move)
+            all_ports_are_displaced = all(
+                np.any(row[:displacement_count]) for row in self.port_rows.values()
+            )
+            return bool(self.port_rows) and (primitive.of_speed or all_ports_are_displaced)
         can_move_load = any(section.station_derivative is not None for section in description.input)
         carried: dict[type[Primitive], bool] = {
             changes.StiffnessDrift: description.displacement_count > 0,

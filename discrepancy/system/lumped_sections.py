@@ -4,15 +4,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Annotated, Literal
 
+from pydantic import BeforeValidator, ConfigDict, Field
+
+from discrepancy.campaign.records import Quantity
+from discrepancy.system.model_file import NamedSection, ParameterSection, Section
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from pydantic import BeforeValidator, ConfigDict, Field
 from reporting.toml_file import Fault, Name, NotNegative, Number
-
-from discrepancy.campaign.records import Quantity
-from discrepancy.system.model_file import NamedSection, ParameterSection, Section
 
 GAINS = ("proportional", "derivative", "integral")
 """Gains of a controller; NAME.proportional is what a parameter scales."""

@@ -10,10 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from fe.compilation import compiled_kernel
-from fe.runtime.arrays import LAGGED
-from fe.runtime.motion import Begin, Boundaries, Laws, advance, steps_under, substeps
-from fe.runtime.motion_arrays import ModalMotion, Steps
 
 from discrepancy.campaign.records import FloatArray, Start
 from discrepancy.system.excitation import Excitation, ReleasePoint
@@ -22,6 +18,10 @@ from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.output_equation import OutputEquation, rows_in_coordinates
 from discrepancy.system.response import Response
 from discrepancy.system.time_history import SMOOTH_PARTS, equivalent_ramps
+from fe.compilation import compiled_kernel
+from fe.runtime.arrays import LAGGED
+from fe.runtime.motion import Begin, Boundaries, Laws, advance, steps_under, substeps
+from fe.runtime.motion_arrays import ModalMotion, Steps
 
 LEAST_LEAD = 1e-9
 """Share of an interval by which a first sample is later than the begin and still is at it."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass, RootCompliance
 from scipy.linalg import eigh
 
 from discrepancy.campaign.records import FloatArray, Hold, RecordedInput, Trial
@@ -22,6 +21,7 @@ from discrepancy.system.lumped_sections import (
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.system_state import SystemState
 from discrepancy.system.time_history import RecordedHistory
+from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass, RootCompliance
 
 LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""

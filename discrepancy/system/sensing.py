@@ -5,6 +5,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
+from discrepancy.errors import CatalogueError, ModelError
+from discrepancy.system.interface import Model
+from discrepancy.system.response import ACROSS, Conditions, Outputs, Response
 from fe.high_pass import filtered_record
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
@@ -17,11 +22,6 @@ from fe.runtime.patch import (
     Window,
 )
 from fe.runtime.sensors import SensorRecord, apply_sensors, check_channels, clock_of
-
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
-from discrepancy.errors import CatalogueError, ModelError
-from discrepancy.system.interface import Model
-from discrepancy.system.response import ACROSS, Conditions, Outputs, Response
 
 
 class LoggerRates(NamedTuple):
@@ -203,27 +203,31 @@ def _response_in_clocks(
 
 
 def _logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> LoggerRates:
-    """Return the clock rates of a trial's inputs, and of its channels, less one.
+    """Return by how much the clocks that sampled a trial's inputs and channels run fast.
+
+    A rate of 0.01 means that the clock shows 1 % more time than has passed. Errors of several
+    loggers on one channel multiply. A trial at rest has no clock, so that its rates are zero.
 
     Raises
     ------
     CatalogueError
         If a patch names a logger that the campaign does not have.
     """
-    inputs = 1.0
-    channels = np.ones(len(trial.channels))
+    input_factor = 1.0
+    channel_factors = np.ones(len(trial.channels))
     if not trial.is_dynamic:
-        return LoggerRates(inputs - 1.0, channels - 1.0)
+        return LoggerRates(input_factor - 1.0, channel_factors - 1.0)
     for clock in patch:
         if not isinstance(clock, LoggerClock):
             continue
         members = _members_of_logger(campaign, trial, clock.logger)
         is_member = np.array([name in members for name in trial.channels], dtype=bool)
-        channels = channels * np.where(is_member, 1.0 + clock.rate, 1.0)
+        channel_factors = channel_factors * np.where(is_member, 1.0 + clock.rate, 1.0)
+        # the logger of every channel samples the inputs, also where the trial has none by name
         samples_inputs = any(name in members for name in trial.input_names)
         if clock.logger == EVERY_CHANNEL or samples_inputs:
-            inputs *= 1.0 + clock.rate
-    return LoggerRates(inputs - 1.0, channels - 1.0)
+            input_factor *= 1.0 + clock.rate
+    return LoggerRates(input_factor - 1.0, channel_factors - 1.0)
 
 
 def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[str, ...]:

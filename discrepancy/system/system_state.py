@@ -2,15 +2,14 @@
 
 from typing import NamedTuple
 
-from fe.runtime.patch import ModelPatch
-from fe.runtime.state import Losses
-
 from discrepancy.campaign.records import Trial
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.response import Conditions
 from discrepancy.system.time_history import RecordedHistory
+from fe.runtime.patch import ModelPatch
+from fe.runtime.state import Losses
 
 
 class SystemState(NamedTuple):

@@ -7,10 +7,10 @@ from math import inf, isfinite, pi, sqrt
 from typing import ClassVar, Protocol
 
 import numpy as np
-from fe.runtime.expression import Expression
 from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import FloatArray, Hold
+from fe.runtime.expression import Expression
 
 SMOOTH_PARTS = 8
 """Steps of an interval under a spline; straight lines on them err by 1e-6 of the input."""

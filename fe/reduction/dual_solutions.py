@@ -165,19 +165,23 @@ def _project_batch(
 
 
 def _residual_factor(output: FloatArray, force: FloatArray) -> FloatArray:
-    """Return a triangular factor whose columns have the inner products of output and forces.
+    """Return a small matrix by which the norm of a dual residual is evaluated.
+
+    The residual of a dual solution is the output minus a combination of forces, with n rows:
+    r = [output, force] c. Its norm is needed for many combinations c. With the QR factorisation
+    [output, force] = Q R it is the norm of R c, and R has few rows.
 
     Parameters
     ----------
     output : (n,) array
-        The output.
+        The output, as a whitened force.
     force : (n, T M) array
-        The stiffness terms times the directions of its dual solutions.
+        The T stiffness terms times the M directions of the dual solutions, as whitened forces.
 
     Returns
     -------
     (2 + T M, 1 + T M) array
-        The factor; its last row is the allowance for rounding.
+        The factor R, and a last row that adds what rounding may have made of the residual.
     """
     columns = np.column_stack((output, force))
     allowance = LEAST_DUAL_RESIDUAL * np.linalg.norm(output) * np.eye(1, columns.shape[1])

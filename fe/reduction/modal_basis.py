@@ -156,21 +156,27 @@ def _refine_states(
 def _davidson_corrections(
     terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], mode_count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the corrections of the modes of S states, whitened, and the relative residuals.
+    """Return the directions that improve the modes of S states, and the sizes of their residuals.
+
+    A mode phi in the span of the working basis leaves the residual r = (K - omega^2 M) phi.
+    Davidson's method adds the preconditioned residual X^-1 r to the basis; here the preconditioner
+    is the factorised nominal stiffness X, and directions are kept whitened, as X^-1/2 r.
 
     Returns
     -------
     corrections : (n, S M) array
-        The residuals r = (K - omega^2 M) phi, whitened.
+        The whitened residuals, the modes of one state side by side.
     sizes : (S M,) array
         The square root of (r, X^-1 r) / (phi, K phi), where phi is mass-normalised.
     """
+    # the modes in the working basis, of all states side by side
     modes = [
         projected_modes(working.stiffness, working.mass, state, mode_count) for state in states
     ]
     squares = np.concatenate([mode_squares for mode_squares, _ in modes])
     projected_shapes = np.concatenate([mode_shapes for _, mode_shapes in modes], axis=1)
     shapes = working.displacements @ projected_shapes
+    # coefficients of the affine terms of K and M, a column for each mode
     stiffness = np.repeat([state.stiffness for state in states], mode_count, axis=0).T
     mass = np.repeat([state.mass for state in states], mode_count, axis=0).T
     residuals = affine_product(terms.stiffness_terms, stiffness, shapes)

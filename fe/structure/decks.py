@@ -311,45 +311,49 @@ class _Line(NamedTuple):
 
 
 def cards(path: Path) -> list[_Card]:
-    """Return the words of the bulk data of a file.
+    """Return the entries of the bulk data of a file, each with the fields of its continuations.
 
-    A continuation with a name goes to the line that ends with this name, wherever that stands: also below,
-    if more lines below end with the name than continuations below have it.
+    A continuation without a name belongs to the line above it. One with a name belongs to the line that
+    ends with this name as its marker, which may stand above or below.
     """
-    found: list[_Card] = []
-    awaiting: dict[str, _Card] = {}
-    early: dict[str, _Line] = {}
-    card: _Card | None = None  # of the line before
-    marker = ""
     lines = _bulk_lines(path)
-    parents_below = Counter(line.marker for line in lines)
-    continuations_below = Counter(line.name for line in lines if line.is_continuation)
+    finished: list[_Card] = []
+    waiting_cards: dict[str, _Card] = {}  # cards whose last line ends with a marker, by the marker
+    early_lines: dict[str, _Line] = {}  # continuations that stand above the line they belong to, by name
+    card: _Card | None = None
+    marker = ""
+    markers_below = Counter(line.marker for line in lines)
+    names_below = Counter(line.name for line in lines if line.is_continuation)
     for line in lines:
-        parents_below[line.marker] -= 1
+        markers_below[line.marker] -= 1
         if not line.is_continuation:
             card = _Card(line.head.upper().rstrip("*_"), line.where, line.fields)  # meshio writes CTETRA_
-            found.append(card)
+            finished.append(card)
         else:
-            continuations_below[line.name] -= 1
-            if line.name in awaiting:
-                card = awaiting.pop(line.name)
-            elif line.name and parents_below[line.name] > continuations_below[line.name]:
-                early[line.name] = line
-                card, marker = None, line.marker
+            names_below[line.name] -= 1
+            # more lines below end with the name than continuations below ask for one: one of them is mine
+            belongs_below = bool(line.name) and markers_below[line.name] > names_below[line.name]
+            if line.name in waiting_cards:
+                card = waiting_cards.pop(line.name)
+            elif belongs_below:
+                early_lines[line.name] = line
+                card = None
+                marker = line.marker
                 continue
             elif card is None or (line.name and marker):
                 _refuse_continuation(line)
             card.fields.extend(line.fields)
+        # continuations that stood above follow here, one after the other
         marker = line.marker
-        while marker in early:
-            continuation = early.pop(marker)
+        while marker in early_lines:
+            continuation = early_lines.pop(marker)
             card.fields.extend(continuation.fields)
             marker = continuation.marker
         if marker:
-            awaiting[marker] = card
-    for line in early.values():
+            waiting_cards[marker] = card
+    for line in early_lines.values():
         _refuse_continuation(line)
-    return found
+    return finished
 
 
 def _bulk_lines(path: Path) -> list[_Line]:

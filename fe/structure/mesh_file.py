@@ -170,10 +170,11 @@ def read_by_meshio(path: Path) -> Deck:
 
 
 def _outside_physical_groups(found: Any) -> list[BoolArray]:
-    """Return which elements of each block of a file of Gmsh are in no physical group, where others are.
+    """Return for each block of a mesh from Gmsh which of its elements belong to no part of the structure.
 
-    Gmsh saves them, with the group 0, where its option Mesh.SaveAll says so. Where no solid element has a
-    group, all of them stay: groups may be of faces alone.
+    Gmsh writes elements without a physical group, as group 0, if its option Mesh.SaveAll is set. They are
+    construction geometry if other elements of their dimension have a group. If no solid element has one,
+    the groups name faces only, and all solid elements are the structure.
     """
     groups = found.cell_data.get("gmsh:physical")
     if groups is None:
@@ -183,8 +184,8 @@ def _outside_physical_groups(found: Any) -> list[BoolArray]:
     has_solids = any(np.any(group) for block, group in blocks if block.type not in FLAT)
     outside = []
     for block, group in blocks:
-        is_chosen = has_groups if block.type in FLAT else has_solids
-        outside.append((np.asarray(group) == 0) & is_chosen)
+        groups_choose_elements = has_groups if block.type in FLAT else has_solids
+        outside.append((np.asarray(group) == 0) & groups_choose_elements)
     return outside
 
 
