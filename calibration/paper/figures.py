@@ -114,14 +114,16 @@ class TableRow:
 def table_1(
     result: Calibration, procedure: Calibration, particle: ParticlePosterior
 ) -> tuple[TableRow, ...]:
-    """Return the rows of Table 1.
+    """Return the rows of Table 1 of the paper: each parameter before and after the calibration.
 
     Parameters
     ----------
-    result, procedure : Calibration
-        The calibration that is kept, and that by the paper's procedure on our model.
+    result : Calibration
+        The calibration that tailors the twin.
+    procedure : Calibration
+        The calibration of the same model by the paper's procedure, to compare with.
     particle : ParticlePosterior
-        The posterior of e by the paper's particle filter on its stiffness line.
+        The posterior of the Young's modulus factor by the paper's particle filter.
     """
     priors = {prior.name: prior for prior in result.priors}
     rows = []
@@ -131,7 +133,7 @@ def table_1(
         else:
             paper_procedure = Moments(procedure.mean(name), procedure.standard_deviation(name))
         if name.startswith("damping"):
-            # A Gaussian truncated at its mean has other moments than stated.
+            # The prior is a Gaussian that is cut off at its mean, so its moments are others.
             prior = Moments(*result.prior_moments(name))
         else:
             prior = Moments(priors[name].mean, priors[name].deviation)

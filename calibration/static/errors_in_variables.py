@@ -205,19 +205,25 @@ def exact_posterior(
 def _first_grid_limits(
     data: LoadDisplacementData, curve: StiffnessCurve, prior: GaussianPrior
 ) -> tuple[float, float]:
-    """Return limits of e around the prior and the estimate of each pair, where k(e) > 0."""
-    ratio = data.load / data.displacement
-    relative_deviation = data.load_standard_deviation / data.load
-    relative_deviation = 6.0 * (
-        relative_deviation + data.displacement_standard_deviation / data.displacement
+    """Return a wide range of e for the first grid: it holds the prior, and what each pair shows.
+
+    Each measured pair gives a stiffness, load over displacement, within six deviations. The lower
+    limit stays where the stiffness k(e) is positive.
+    """
+    stiffness = data.load / data.displacement
+    relative_deviation = (
+        data.load_standard_deviation / data.load
+        + data.displacement_standard_deviation / data.displacement
     )
-    lower_stiffness = ratio * np.maximum(1.0 - relative_deviation, 0.01)
-    upper_stiffness = ratio * (1.0 + relative_deviation)
+    relative_reach = 6.0 * relative_deviation
+    lower_stiffness = stiffness * np.maximum(1.0 - relative_reach, 0.01)
+    upper_stiffness = stiffness * (1.0 + relative_reach)
     estimates = curve.young_modulus_factor(np.concatenate([lower_stiffness, upper_stiffness]))
     prior_reach = _REACH * prior.standard_deviation
     lower = min(prior.mean - prior_reach, estimates.min())
     upper = max(prior.mean + prior_reach, estimates.max())
-    return max(lower, curve.young_modulus_factor(1e-3 * ratio.min())), upper
+    least_positive = curve.young_modulus_factor(1e-3 * stiffness.min())
+    return max(lower, least_positive), upper
 
 
 def _refuse_posterior_outside(posterior: ScalarPosterior, curve: StiffnessCurve) -> None:

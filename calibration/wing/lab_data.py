@@ -302,10 +302,23 @@ def _with_load_test(lab: LabData, path: Path) -> LabData:
 def _with_ring_downs(
     lab: LabData, path: Path, record_files: Sequence[Path], *, free: bool
 ) -> LabData:
-    """Return lab data with the ring-downs of step 3 in a folder, and their modal readings."""
+    """Return lab data with the ring-downs of step 3, and the modal parameters that they show.
+
+    Parameters
+    ----------
+    lab : LabData
+        The lab data so far, with the mass as the only reading.
+    path : Path
+        The lab folder.
+    record_files : sequence of Path
+        The files of the ring-downs.
+    free : bool
+        Whether the frequencies of each record are fitted, too.
+    """
     trials = fit_trials(read_records(path), free=free)
     if all(fit.record.lowest is not None for fit in trials):
-        # The extremes are those of the signal; the middle of the ink is not quite its average.
+        # These records were read off plots. Lowest and highest ink of a column are the extremes of
+        # the signal there, while the middle of the ink is not quite its average.
         trials = refine_by_extremes(trials)
     mass = lab.readings[0]
     lab = replace(lab, trials=trials, readings=(mass, *measured_modes(trials)))

@@ -27,7 +27,7 @@ STATES_PER_ROUND = 4
 """Full solutions in a round of the search, and states whose modes are refined together."""
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that the basis can be compressed."""
-INSPECTED_FRACTION = 6
+INSPECTED_ONE_OF = 6
 """In each round one of so many states is evaluated, where the bound was largest; in the last round
 all of them are."""
 SOLUTION_TOLERANCE = 1e-6
@@ -371,12 +371,13 @@ class StaticReduction:
         """
         model = self.model()
         bounds = np.zeros(len(states))
-        enough = len(states) if inspect_all else len(states) // INSPECTED_FRACTION
-        for rank, number in enumerate(np.argsort(-latest, kind="stable")):
-            if rank == enough and bounds.max() > target:
-                break
-            bounds[number] = self.bound(model, states[number])
-            latest[number] = bounds[number]
+        least_count = len(states) if inspect_all else len(states) // INSPECTED_ONE_OF
+        largest_first = np.argsort(-latest, kind="stable")
+        for evaluated_count, state in enumerate(largest_first):
+            if evaluated_count == least_count and bounds.max() > target:
+                break  # a snapshot is needed already
+            bounds[state] = self.bound(model, states[state])
+            latest[state] = bounds[state]
         return bounds
 
     def _check_bound(self, reached: float, settings: StructureSettings) -> None:

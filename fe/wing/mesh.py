@@ -219,22 +219,38 @@ def _hat_function_gram(width: FloatArray) -> FloatArray:
 
 
 def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
-    """Return the inner products (ny + 1, nx + 1) of hat functions with airfoil minus edges.
+    """Return what the airfoil has more than straight edges between its points on the mesh lines.
 
-    Parameters are those of `straight_edged`.
+    The gap between airfoil and edges is integrated over the chord times the linear shape function
+    (hat) of each mesh line, by Gauss-Legendre quadrature in each cell.
+
+    Parameters
+    ----------
+    behind : (nx + 1, ny + 1) array
+        Distance of each mesh line behind the leading edge, at each station [m].
+    chord : (ny + 1,) array
+        The chord at each station [m].
+    thickness_ratio : float
+        Thickness of the airfoil over its chord.
+
+    Returns
+    -------
+    (ny + 1, nx + 1) array
+        The integrals [m^2].
     """
     width = np.diff(behind, axis=0)
-    on_airfoil = _half_thickness(behind, chord, thickness_ratio)
-    lines, stations = behind.shape
-    moment = np.zeros((stations, lines))
-    for root, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True):
-        rear_weight = 0.5 * (1.0 + root)
-        front_weight = 1.0 - rear_weight
-        airfoil = _half_thickness(behind[:-1] + rear_weight * width, chord, thickness_ratio)
-        gap = airfoil - front_weight * on_airfoil[:-1] - rear_weight * on_airfoil[1:]
-        moment[:, :-1] += (front_weight * gap * width * (0.5 * weight)).T
-        moment[:, 1:] += (rear_weight * gap * width * (0.5 * weight)).T
-    return moment
+    height_on_lines = _half_thickness(behind, chord, thickness_ratio)
+    line_count, station_count = behind.shape
+    moments = np.zeros((station_count, line_count))
+    for abscissa, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True):
+        # shape functions of the cell's rear and front line, and the gap there
+        rear = 0.5 * (1.0 + abscissa)
+        front = 1.0 - rear
+        height = _half_thickness(behind[:-1] + rear * width, chord, thickness_ratio)
+        gap = height - front * height_on_lines[:-1] - rear * height_on_lines[1:]
+        moments[:, :-1] += (front * gap * width * (0.5 * weight)).T
+        moments[:, 1:] += (rear * gap * width * (0.5 * weight)).T
+    return moments
 
 
 def _grid_points(
