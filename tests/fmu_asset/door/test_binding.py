@@ -82,7 +82,7 @@ def test_unit_texts_mean_what_is_defined(unit) -> None:
 
 
 def test_units_that_pint_is_not_asked_for_mean_what_it_says():
-    for unit in units._PLAIN:
+    for unit in units._COMMON_UNITS:
         exponents, factor, offset = exact_meaning(unit)
         assert meaning_of(unit) == Meaning(exponents, float(factor), float(offset)), unit
 
