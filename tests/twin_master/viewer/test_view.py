@@ -281,13 +281,15 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_pat
     words = ["run", "level_turns", "--out", tmp_path / "run", "--strain-library", library_file, "--no-report"]
     line = [sys.executable, "-m", "uav_twin", *map(str, words), "--view"]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
-    process = subprocess.Popen(line, stdout=null, stderr=pipe, text=True, start_new_session=True)
     said = ""
-    while "http://127.0.0.1" not in said or "stays until Ctrl-C" not in said:
-        line = process.stderr.readline()
-        assert line, said
-        said += line
-    os.killpg(process.pid, signal.SIGINT)
-    assert process.wait(300.0) == 0, process.stderr.read()
-    process.stderr.close()
+    with subprocess.Popen(line, stdout=null, stderr=pipe, text=True, start_new_session=True) as process:
+        try:
+            while "http://127.0.0.1" not in said or "stays until Ctrl-C" not in said:
+                told = process.stderr.readline()
+                assert told, f"ended with exit code {process.wait(60.0)}: {said}"
+                said += told
+            os.killpg(process.pid, signal.SIGINT)
+            assert process.wait(300.0) == 0, process.stderr.read()
+        finally:
+            process.kill()
     check_same(tmp_path / "run", run, "run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json")
