@@ -1,7 +1,7 @@
 """What an interrupted search has found: `verdict_so_far.json`, in the folder of the verdict to come."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from discrepancy.document import Origin, write_document
@@ -43,28 +43,27 @@ REMARK = (
 
 @dataclass
 class SearchInProgress:
-    """Remembers the searches of an investigation while they go on.
+    """Remembers the latest search of an investigation while it goes on.
 
     Attributes
     ----------
-    searches : list of Search
-        In the order in which they began; the last one goes on.
+    search : Search or None
+        The search that began last; None before the first one has begun.
     """
 
-    searches: list[Search] = field(default_factory=list)
+    search: Search | None = None
 
     def begin(self, search: Search) -> None:
         """Remember a search that begins."""
-        self.searches.append(search)
+        self.search = search
 
     def hypotheses(self) -> tuple[Hypothesis, ...]:
         """Return what the latest search has fitted, the most probable first; nothing before it has begun."""
-        if not self.searches:
+        if self.search is None:
             return ()
-        search = self.searches[-1]
-        probabilities = list(search.set_probabilities().items())[:MOST_HYPOTHESES]
+        probabilities = list(self.search.set_probabilities().items())[:MOST_HYPOTHESES]
         return tuple(
-            hypothesis(search.problem, search.best_of(identifiers), probability)
+            hypothesis(self.search.problem, self.search.best_of(identifiers), probability)
             for identifiers, probability in probabilities
         )
 

@@ -107,17 +107,17 @@ _COMMON_UNITS = {
 
 
 @cache
-def _unit_registry() -> "UnitRegistry[Any]":
+def _known_units() -> "UnitRegistry[Any]":
     """Return pint's units with factors in fractions; multiples of pi are those of the float."""
     import pint
 
-    registry: UnitRegistry[Any] = pint.UnitRegistry(
+    known_units: UnitRegistry[Any] = pint.UnitRegistry(
         None, non_int_type=Fraction, on_redefinition="ignore"
     )
-    registry.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
-    registry.define(f"pi = {Decimal(pi)} = π")
-    registry.define("@alias ohm = Ohm")
-    return registry
+    known_units.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
+    known_units.define(f"pi = {Decimal(pi)} = π")
+    known_units.define("@alias ohm = Ohm")
+    return known_units
 
 
 def _pint_expression(unit: str, *, gravity: bool) -> str:
@@ -220,11 +220,11 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
     text = _pint_expression(unit, gravity=gravity)
     from pint.errors import PintError
 
-    registry = _unit_registry()
+    known_units = _known_units()
     try:
-        parsed = registry.parse_units(text)
-        factor_to_grams, root_units = registry.get_root_units(parsed)
-        offset = registry.Quantity(Fraction(0), parsed).to_root_units().magnitude
+        parsed = known_units.parse_units(text)
+        factor_to_grams, root_units = known_units.get_root_units(parsed)
+        offset = known_units.Quantity(Fraction(0), parsed).to_root_units().magnitude
     except (PintError, TokenError, *_ERRORS_OF_THE_PARSER) as cause:
         raise ValueError(f"{unit!r} is no unit") from cause
     powers: dict[str, Any] = dict(root_units._units)

@@ -108,10 +108,16 @@ def effect_rows(verdict: Verdict) -> list[dict[str, Any]]:
     return rows
 
 
+LONGEST_CARD = 60
+"""Characters of a card of the page at most; the sentence below it has all names."""
+
+
 def what_is_missing(verdict: Verdict) -> str:
-    """Return it in a few words."""
-    if members := words.members_of(verdict):
-        return listing(members, "or")
+    """Return what is missing in the few words of a card."""
+    members = words.members_of(verdict)
+    if members:
+        names = listing(members, "or")
+        return names if len(names) <= LONGEST_CARD else f"one of {len(members)} hypotheses"
     named = verdict.effects if verdict.kind in words.NAMING else ()
     kept = [item for item in named if not (item.shape and verdict.family)]
     found = [effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]

@@ -21,7 +21,7 @@ from discrepancy.files.verdict import primitive_intervals, read_patch, read_verd
 from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import parameter_rows, render_report
+from discrepancy.report.page import parameter_rows, render_report, what_is_missing
 from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.text import (
     WORDS,
@@ -237,6 +237,18 @@ def test_numbers_formulas_and_lists_as_they_are_written():
 def test_rounding_keeps_values_within_a_twentieth_of_their_spread(value, spread):
     text = rounded(value, spread).replace("\N{MINUS SIGN}", "-")
     assert abs(float(text) - value) <= 0.051 * spread + 1e-9 * abs(value)
+
+
+def test_the_card_of_a_group_with_long_names_says_how_many_hypotheses(drag):
+    (effect,) = drag.verdict.effects
+    names = {"short": ("play", "drag"), "long": ("a law with a long name", "another law with a name as long")}
+    cards = {}
+    for length, (first, second) in names.items():
+        effects = (replace(effect, identifier="a", name=first), replace(effect, identifier="b", name=second))
+        verdict = Verdict(VerdictKind.GROUP, "", 0.97, 12.0, effects=effects, group=("a", "b"))
+        cards[length] = what_is_missing(verdict)
+    assert cards["short"] == f"play at {effect.place} or drag at {effect.place}"
+    assert cards["long"] == "one of 2 hypotheses"
 
 
 def test_a_headline_has_one_probability(drag):
