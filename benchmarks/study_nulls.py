@@ -30,12 +30,12 @@ from discrepancy.checks.quality import check_data
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.location.locate import locate
 from discrepancy.model_choice import load_model
-from discrepancy.search.honest_evidence import left_by
+from discrepancy.search.wide_noise import residual_process_of
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -187,7 +187,7 @@ def located(sound: Campaign, model: Model, seed: int) -> list[str]:
     problem = Problem(sound, model, Setting(sound, model, model.scales(sound)))
     found = fit(problem, Candidate(), problem.start(Candidate()))
     where = locate(residual_set(problem, found), seed=seed)
-    gate = absolute_gate(problem, replace(found, remainder=left_by(problem, found)))
+    gate = check_absolute_fit(problem, replace(found, residual_process=residual_process_of(problem, found)))
     wrong = {"not explained": gate.passed is False, "disagrees": where.disagrees}
     wrong["discovery in the map"] = any(cell.significant for cell in where.cells)
     return [name for name, is_wrong in wrong.items() if is_wrong] or ["nothing"]

@@ -48,7 +48,7 @@ def alone(runs: Sequence[Investigation], begins: Sequence[float]) -> Table:
         if found.search is None or found.problem is None:
             continue
         best: dict[str, CandidateFit] = {}
-        for item in found.search.all().values():  # of all places the most probable
+        for item in found.search.compared_fits().values():  # of all places the most probable
             label = " ".join(item.candidate.identifiers) or "none"
             if len(item.candidate.terms) < 2 and (
                 label not in best or found.search.score(best[label]) < found.search.score(item)

@@ -1,11 +1,11 @@
 """Trajectory, missing force and unknowns of a hypothesis, estimated together, with the evidence.
 
-Gauss-Newton on the trajectory: the trials are made linear along the last trajectory, one filter and one
-smoother give the next, until nothing moves. This is the iterated Kalman smoother (Bell 1994, SIAM J.
-Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It begins with a large missing force, with
-which a trajectory follows the readings whatever the law, and lowers it step by step (continuation). The
-innovations at the end give the evidence by Laplace's approximation, which chooses how large the missing force
-is.
+Gauss-Newton on the trajectory: the trials are made linear along the last trajectory, one filter and
+one smoother give the next, until nothing moves. This is the iterated Kalman smoother (Bell 1994,
+SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It begins with a large
+missing force, with which a trajectory follows the readings whatever the law, and lowers it step by
+step (continuation). The innovations at the end give the evidence by Laplace's approximation, which
+chooses how large the missing force is.
 """
 
 from collections.abc import Mapping
@@ -17,17 +17,24 @@ from typing import Protocol
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.missing_force.filtered import LEAST_PRECISION, Process, Regression, Solution, without
+from discrepancy.missing_force.filtered import (
+    LEAST_PRECISION,
+    Process,
+    Regression,
+    Solution,
+    without,
+)
 from discrepancy.missing_force.process_search import prior_log_density
 from discrepancy.missing_force.trial import SeenTrial
 
 from .laws import ForceAlong
-from .linearised import Forces, LinearisedTrial, Readings, SmoothedTrial, Trajectory
+from .linearised import Forces, LinearisedTrial, SensorReadings, SmoothedTrial, Trajectory
 
 SHARES_OF_SIZE = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 """Deviations of the missing force, over the first one, through which it is lowered."""
 SMOOTHINGS = (0.1, 0.02, 0.005)
-"""Half windows of speeds, over the usual speed, over which laws of speed are averaged: wide ones first."""
+"""Half windows of speeds, over the usual speed, over which laws of speed are averaged: wide ones
+first."""
 ITERATIONS = 12
 """Linearisations at one size of the missing force, at most."""
 SETTLED = 0.02
@@ -44,7 +51,7 @@ DECLINE = 12.0
 """Evidence [nat] below the best by which lower missing forces are given up."""
 
 
-class Laws(Protocol):
+class HypothesisLaws(Protocol):
     """The laws and sensors of a hypothesis, as the estimator asks for them."""
 
     @property
@@ -58,17 +65,25 @@ class Laws(Protocol):
         effect: FloatArray,
         shared: FloatArray,
         smoothing: float,
-    ) -> tuple[Mapping[int, Forces], Readings] | None:
-        """Return forces at ports and readings of a trial along a trajectory; None where they cannot be."""
+    ) -> tuple[Mapping[int, Forces], SensorReadings] | None:
+        """Return forces at ports and readings of a trial along a trajectory.
+
+        None where they cannot be.
+        """
 
     def forces(
-        self, number: int, trajectory: Trajectory, effect: FloatArray, shared: FloatArray, smoothing: float
+        self,
+        number: int,
+        trajectory: Trajectory,
+        effect: FloatArray,
+        shared: FloatArray,
+        smoothing: float,
     ) -> Mapping[int, ForceAlong] | None:
         """Return the forces at ports of a trial along a trajectory; None where they cannot be."""
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class MotionEstimate:
     """A hypothesis at its most probable values.
 
     Attributes
@@ -86,7 +101,7 @@ class Estimate:
     log_evidence : float
         Logarithm of the evidence [nat], with the priors of the processes.
     trials : tuple of SmoothedTrial
-        Motion and missing forces of each trial.
+        TrialMotion and missing forces of each trial.
     converged : bool
         Whether the last step was short enough.
     """
@@ -135,7 +150,7 @@ class Linearisation:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class EstimatorStart:
     """Where an estimate begins.
 
     Attributes
@@ -154,9 +169,9 @@ class Start:
     processes: Mapping[int, Process]
 
 
-def following(found: Estimate) -> Start:
+def following(found: MotionEstimate) -> EstimatorStart:
     """Return the start of an estimate that begins where another one ended."""
-    return Start(
+    return EstimatorStart(
         found.effect,
         found.shared,
         tuple(item.trajectory for item in found.trials),
@@ -165,7 +180,7 @@ def following(found: Estimate) -> Start:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimator:
+class MotionEstimator:
     """Estimates hypotheses on the same trials.
 
     Attributes
@@ -182,14 +197,14 @@ class Estimator:
     shared_precision: FloatArray
     usual: Mapping[int, Process]
 
-    def estimate(self, laws: Laws, start: Start) -> Estimate | None:
+    def estimate(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values; None where its laws cannot be followed.
 
         Parameters
         ----------
-        laws : Laws
+        laws : HypothesisLaws
             Of the hypothesis.
-        start : Start
+        start : EstimatorStart
             Where to begin.
         """
         current = start
@@ -201,14 +216,16 @@ class Estimator:
         estimate = self._with_smaller_missing_forces(laws, current)
         return None if estimate is None else self._tuned(laws, estimate)
 
-    def _with_smaller_missing_forces(self, laws: Laws, start: Start) -> Estimate | None:
-        """Return the estimate whose missing force has the most probable of several sizes (continuation).
+    def _with_smaller_missing_forces(
+        self, laws: HypothesisLaws, start: EstimatorStart
+    ) -> MotionEstimate | None:
+        """Return the estimate with the most probable of several sizes of the missing force.
 
-        With a large missing force the trajectory follows the readings whatever the laws are. The size is
-        then lowered step by step, and each estimate begins where the last one ended. None if the laws
-        cannot be followed even at the first size.
+        With a large missing force the trajectory follows the readings whatever the laws are. The
+        size is then lowered step by step, and each estimate begins where the last one ended. None
+        if the laws cannot be followed even at the first size.
         """
-        best: Estimate | None = None
+        best: MotionEstimate | None = None
         current = start
         for fraction in SHARES_OF_SIZE:
             processes = {
@@ -225,10 +242,11 @@ class Estimator:
             current = following(estimate)
         return best
 
-    def _tuned(self, laws: Laws, found: Estimate) -> Estimate:
+    def _tuned(self, laws: HypothesisLaws, found: MotionEstimate) -> MotionEstimate:
         """Return an estimate with size and time of its missing forces at the most probable values.
 
-        A pattern search by ever smaller factors; the trials stay linear along one trajectory meanwhile.
+        A pattern search by ever smaller factors; the trials stay linear along one trajectory
+        meanwhile.
         """
         at = following(found)
         linear = self.linearised(laws, at, SMOOTHINGS[-1])
@@ -248,10 +266,12 @@ class Estimator:
         again = self._iterated(laws, replace(at, processes=processes), SMOOTHINGS[-1])
         return again if again is not None and again.log_evidence > found.log_evidence else found
 
-    def _iterated(self, laws: Laws, start: Start, smoothing: float) -> Estimate | None:
-        """Return the estimate beside missing forces of given size and time, by Gauss-Newton steps."""
+    def _iterated(
+        self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
+    ) -> MotionEstimate | None:
+        """Return the estimate beside given missing forces, by Gauss-Newton steps."""
         current, last_evidence = start, -inf
-        estimate: Estimate | None = None
+        estimate: MotionEstimate | None = None
         for _ in range(ITERATIONS):
             linear = self.linearised(laws, current, smoothing)
             if linear is None:
@@ -270,7 +290,7 @@ class Estimator:
             deviations = np.sqrt(np.diag(solution.covariance))
             moved = float(np.max(np.abs(unknowns - before) / deviations, initial=0.0))
             settled = moved < SETTLED and abs(evidence - last_evidence) < LEVEL
-            estimate = Estimate(
+            estimate = MotionEstimate(
                 effect=unknowns[count:],
                 shared=unknowns[:count],
                 local=tuple(local),
@@ -292,7 +312,9 @@ class Estimator:
         solution, _ = linear.beside(processes).solve()
         return solution.evidence + self._log_prior(processes)
 
-    def linearised(self, laws: Laws, at: Start, smoothing: float) -> Linearisation | None:
+    def linearised(
+        self, laws: HypothesisLaws, at: EstimatorStart, smoothing: float
+    ) -> Linearisation | None:
         """Return all trials, linear along trajectories; None where the laws cannot be followed."""
         found = []
         for number, trial in enumerate(self.trials):
@@ -302,27 +324,39 @@ class Estimator:
             forces, sensors = along
             found.append(
                 LinearisedTrial(
-                    trial, at.processes, at.trajectories[number], forces, sensors, at.effect, at.shared
+                    trial,
+                    at.processes,
+                    at.trajectories[number],
+                    forces,
+                    sensors,
+                    at.effect,
+                    at.shared,
                 )
             )
         precision = np.concatenate((self.shared_precision, np.ones(laws.size)))
         return Linearisation(tuple(found), precision)
 
     def _stepped(
-        self, laws: Laws, current: Start, ahead: Estimate, linear: Linearisation, smoothing: float
-    ) -> Start | None:
+        self,
+        laws: HypothesisLaws,
+        current: EstimatorStart,
+        ahead: MotionEstimate,
+        linear: Linearisation,
+        smoothing: float,
+    ) -> EstimatorStart | None:
         """Return the longest part of a step whose linear laws err by less than the missing force.
 
-        Where a law is not what it was linearised to, the difference acts as a further missing force of which
-        the smoother does not know. In no step is it larger than the missing force that the hypothesis admits.
+        Where a law is not what it was linearised to, the difference acts as a further missing force
+        of which the smoother does not know. In no step is it larger than the missing force that the
+        hypothesis admits.
         """
         change = ahead.effect - current.effect
         longest = float(np.max(np.abs(change), initial=0.0))
         most = min(1.0, LONGEST_STEP / longest) if longest > 0.0 else 1.0
-        chosen: Start | None = None
+        chosen: EstimatorStart | None = None
         for share in SHARES:
             part = min(share, most)
-            there = Start(
+            there = EstimatorStart(
                 current.effect + part * change,
                 current.shared + part * (ahead.shared - current.shared),
                 tuple(
@@ -340,17 +374,27 @@ class Estimator:
         return chosen
 
     def _error_of_laws(
-        self, laws: Laws, current: Start, there: Start, linear: Linearisation, smoothing: float
+        self,
+        laws: HypothesisLaws,
+        current: EstimatorStart,
+        there: EstimatorStart,
+        linear: Linearisation,
+        smoothing: float,
     ) -> float | None:
-        """Return the root mean square error of the linear laws over the missing force's deviation."""
+        """Return the rms error of the linear laws over the deviation of the missing force."""
         worst = 0.0
         for number, item in enumerate(linear.trials):
-            found = laws.forces(number, there.trajectories[number], there.effect, there.shared, smoothing)
+            found = laws.forces(
+                number, there.trajectories[number], there.effect, there.shared, smoothing
+            )
             if found is None:
                 return None
             change = np.concatenate((there.shared - current.shared, there.effect - current.effect))
             for port, forces in item.forces.items():
-                position = there.trajectories[number].positions[:, port] - item.trajectory.positions[:, port]
+                position = (
+                    there.trajectories[number].positions[:, port]
+                    - item.trajectory.positions[:, port]
+                )
                 speed = there.trajectories[number].speeds[:, port] - item.trajectory.speeds[:, port]
                 expected = forces.along.force + forces.along.by_position * position
                 expected = expected + forces.along.by_speed * speed

@@ -1,7 +1,7 @@
 """A trial, linear along a trajectory: the laws of a hypothesis in it, missing forces beside them.
 
-The state of a trial is what forces at ports add to the answer of the linear model. With the laws G of the
-hypothesis, the missing forces f (Gaussian processes in time) and the unknowns w,
+The state of a trial is what forces at ports add to the answer of the linear model. With the laws G
+of the hypothesis, the missing forces f (Gaussian processes in time) and the unknowns w,
 
     s' = A(w) s - sum_p b_p (G_p(x, v; w) + f_p),
     reading = r(w) + C(w) s - sum_p e_p (G_p(x, v; w) + f_p) + noise,
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from discrepancy.campaign.records import FloatArray, IntArray
-from discrepancy.missing_force.filtered import Filtered, Process
+from discrepancy.missing_force.filtered import ForceFilter, Process
 from discrepancy.missing_force.kalman import discretised
 from discrepancy.missing_force.trial import SeenTrial
 
@@ -76,8 +76,8 @@ class Forces:
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """What an effect of sensors does to the readings of a trial, over the deviations of their noise.
+class SensorReadings:
+    """What effects of sensors do to the readings of a trial, over their noise.
 
     Attributes
     ----------
@@ -95,19 +95,20 @@ class Readings:
 class LinearisedTrial:
     """A trial, linear along a trajectory.
 
-    The unknowns are the shared ones, those of the hypothesis' effects, and the trial's own, in this order.
+    The unknowns are the shared ones, those of the hypothesis' effects, and the trial's own, in this
+    order.
 
     Attributes
     ----------
     trial : SeenTrial
-        Readings less the linear model, and how ports move.
+        SensorReadings less the linear model, and how ports move.
     processes : mapping of int to Process
         Missing forces, by the numbers of their ports.
     trajectory : Trajectory
         Along which it is linear.
     forces : mapping of int to Forces
         Of the hypothesis' laws, by port.
-    sensors : Readings
+    sensors : SensorReadings
         Of the hypothesis' sensors.
     effect : (E,) ndarray
         Values of the effects' unknowns at which laws and sensors are linearised.
@@ -119,16 +120,16 @@ class LinearisedTrial:
     processes: Mapping[int, Process]
     trajectory: Trajectory
     forces: Mapping[int, Forces]
-    sensors: Readings
+    sensors: SensorReadings
     effect: FloatArray
     shared: FloatArray
 
     # ------------------------------------------------------------ layout
 
     @cached_property
-    def filtered(self) -> Filtered:
-        """The linear system with its missing forces, in units in which all states are of size one."""
-        return Filtered(self.trial, tuple(self.processes.items()))
+    def filtered(self) -> ForceFilter:
+        """The linear system with its missing forces, scaled so that states are of size one."""
+        return ForceFilter(self.trial, tuple(self.processes.items()))
 
     @property
     def moving(self) -> int:
@@ -141,7 +142,7 @@ class LinearisedTrial:
         return 1 + len(self.shared) + len(self.effect) + len(self.trial.local)
 
     def weight_of(self, unknown: int) -> int:
-        """Return the weight of a shared unknown, or of one of the trial's own, numbered after these."""
+        """Return the weight of a shared unknown or, numbered after these, of a trial's own."""
         count = len(self.shared)
         return 1 + unknown + (len(self.effect) if unknown >= count else 0)
 
@@ -223,7 +224,9 @@ class LinearisedTrial:
         )
         return transition, noise, drift
 
-    def _drift_by_parameters(self, begin: FloatArray, end: FloatArray, kind: IntArray) -> FloatArray:
+    def _drift_by_parameters(
+        self, begin: FloatArray, end: FloatArray, kind: IntArray
+    ) -> FloatArray:
         """Return the drift (F - 1, n, W) by what parameters change in the system itself."""
         trial, moving = self.trial, self.moving
         steps = len(trial.fine_time) - 1
@@ -290,12 +293,14 @@ class LinearisedTrial:
         return np.ascontiguousarray(rows), columns * trial.used[:, :, None]
 
     def _by_parameters(self) -> dict[int, FloatArray]:
-        """Return what a unit of shared unknowns (by number) does to readings along the trajectory."""
+        """Return the derivatives of readings by shared unknowns along the trajectory."""
         trial, trajectory = self.trial, self.trajectory
         found: dict[int, FloatArray] = {}
         for unknown, slope in enumerate(trial.slopes):
             if slope is not None:
-                found[unknown] = trial.over_noise(trial.shown(slope, trajectory.added, trajectory.forces))
+                found[unknown] = trial.over_noise(
+                    trial.shown(slope, trajectory.added, trajectory.forces)
+                )
         shown = trial.readings(trajectory.added, trajectory.forces)
         for unknown, channel, scale in trial.gains:
             found[unknown] = shown * scale * np.eye(shown.shape[1])[channel]
@@ -310,13 +315,21 @@ class LinearisedTrial:
         rows, columns = self._readings()
         covariance, mean = self._start()
         means, covariances, innovations, gains, variances = filter_record(
-            self.trial.parts, transition, noise, drift, rows, columns, self.trial.used, covariance, mean
+            self.trial.parts,
+            transition,
+            noise,
+            drift,
+            rows,
+            columns,
+            self.trial.used,
+            covariance,
+            mean,
         )
         return FilteredRecord(transition, rows, means, covariances, innovations, gains, variances)
 
     @cached_property
     def products(self) -> tuple[FloatArray, float]:
-        """Products (W, W) of residual and unknowns, whitened, and what they take from the evidence [nat].
+        """Products (W, W) of whitened residual and unknowns, and half a log determinant [nat].
 
         The second is half the sum of the logarithms of the readings' variances given those before.
         """
@@ -353,13 +366,17 @@ class LinearisedTrial:
         added = smoothed[:, : self.moving] * self.filtered.units
         missing: dict[int, FloatArray] = {}
         deviations: dict[int, FloatArray] = {}
-        for (port, process), place in zip(self.processes.items(), self.filtered.places, strict=True):
+        for (port, process), place in zip(
+            self.processes.items(), self.filtered.places, strict=True
+        ):
             missing[port] = smoothed[:, place] * process.size
             deviations[port] = np.sqrt(variance[:, place]) * process.size
         forces = dict(missing)
         laws: dict[int, FloatArray] = {}
         for at, port in enumerate(self.ports):
-            law = self.pushes[:, at] @ weights + np.einsum("fn,fn->f", self.tangents[:, at], smoothed)
+            law = self.pushes[:, at] @ weights + np.einsum(
+                "fn,fn->f", self.tangents[:, at], smoothed
+            )
             laws[port] = law
             forces[port] = forces.get(port, 0.0) + law
         shared = unknowns[: len(self.shared)]
@@ -411,8 +428,8 @@ class SmoothedTrial:
 def push_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the state (K, n, n) that a unit push adds over steps of some lengths (K,) [s].
 
-    The push is linear over the step: the first matrix is for its value at the begin, the second for that at
-    the end (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
+    The push is linear over the step: the first matrix is for its value at the begin, the second for
+    that at the end (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
     """
     n = len(generator)
     blocks = np.zeros((len(lengths), 3 * n, 3 * n))

@@ -1,9 +1,11 @@
-"""A trial in which a missing force is looked for: what is left of its readings, and what unknowns do to them.
+"""A trial in which a missing force is looked for.
+
+What is left of its readings, and what unknowns do to them.
 
 Readings and columns are over the deviations of their noise. The unknowns are those of
-`fits.trial_data`, taken at their prior means; a calibrated parameter acts on the motion that the model has (a
-column) and on what the missing force adds to it (`slopes`), so that both together are exact along the motion
-that was.
+`fits.trial_data`, taken at their prior means; a calibrated parameter acts on the motion that the
+model has (a column) and on what the missing force adds to it (`slopes`), so that both together are
+exact along the motion that was.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +19,7 @@ from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
-from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.sensing import in_own_clock
@@ -31,7 +33,8 @@ FINEST, COARSEST = 16, 4
 FINE_PHASE = 0.15
 """Radians of the fastest mode that such a step may span."""
 LONGEST_MEMORY, LEAST_WHITE = 2000, 1e-3
-"""Samples that a coloured noise remembers at most; the least share of its variance that is taken as white."""
+"""Samples that a coloured noise remembers at most; the least share of its variance that is taken as
+white."""
 SMALL = 1e-3
 """Step of the derivative of a system by a parameter, in prior deviations."""
 
@@ -39,7 +42,7 @@ NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class TrialColumn:
     """What an effect does in a trial, for a unit of its unknown.
 
     Attributes
@@ -56,7 +59,7 @@ class Part:
     added: FloatArray | None = None
     forces: Mapping[int, FloatArray] = field(default_factory=dict)
 
-    def plus(self, other: "Part", factor: float) -> "Part":
+    def plus(self, other: "TrialColumn", factor: float) -> "TrialColumn":
         """Return the sum with another part that is taken `factor` times."""
         forces = dict(self.forces)
         for port, force in other.forces.items():
@@ -67,7 +70,7 @@ class Part:
             added = factor * other.added
         else:
             added = self.added + factor * other.added
-        return Part(self.readings + factor * other.readings, added, forces)
+        return TrialColumn(self.readings + factor * other.readings, added, forces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +90,8 @@ class SeenTrial:
     deviation : (C,) ndarray
         Of the noise.
     coloured : sequence of (int, float, float)
-        Channels whose noise has a part that decays in time: its share of the variance, and its rate [1/s].
+        Channels whose noise has a part that decays in time: its share of the variance, and its rate
+        [1/s].
     shared, local : (K, N, C), (L, N, C) ndarray
         What a unit of each scaled unknown does to readings.
     local_precision : (L,) ndarray
@@ -131,7 +135,7 @@ class SeenTrial:
 
     @cached_property
     def steps(self) -> tuple[FloatArray, IntArray]:
-        """Different lengths (J,) of the intervals [s], and which of them leads to each sample (N,)."""
+        """The lengths (J,) of the intervals [s], and the index of that before each sample (N,)."""
         lengths = np.diff(self.time)
         mean = float(lengths.mean())
         if np.all(np.abs(lengths - mean) < 1e-3 * mean):
@@ -143,8 +147,8 @@ class SeenTrial:
     def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Transition (J, n, n) of a fine step, and what a push at its begin and end does (J, n, n).
 
-        By one exponential of the system with its push and the push's rate as states (Van Loan 1978, IEEE
-        Transactions on Automatic Control 23, 395-404).
+        By one exponential of the system with its push and the push's rate as states (Van Loan 1978,
+        IEEE Transactions on Automatic Control 23, 395-404).
         """
         n = len(self.system.generator)
         lengths = self.steps[0][:, None, None] / self.parts
@@ -167,8 +171,8 @@ class SeenTrial:
     def port_motion(self, unknowns: FloatArray, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (F, P) of the ports.
 
-        They are the model's at values (K + L,) of shared unknowns and the trial's own, and of an added state
-        (F, n).
+        They are the model's at values (K + L,) of shared unknowns and the trial's own, and of an
+        added state (F, n).
         """
         motion = np.stack((self.positions, self.speeds))
         for k, moves in self.by_unknowns.items():
@@ -183,8 +187,10 @@ class SeenTrial:
             start = np.linalg.lstsq(self.system.generator, -push * force[0], rcond=1e-12)[0]
         return self._moved(start, push[:, None], force[:, None])
 
-    def turned(self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]) -> Part:
-        """Return what a change of the system makes of an added state (F, n) and `forces` that added it."""
+    def turned(
+        self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]
+    ) -> TrialColumn:
+        """Return the effect of a change of the system on an added state (F, n) and its forces."""
         pushes = added @ slope.generator.T
         for port, force in forces.items():
             pushes -= np.outer(force, slope.actions[port])
@@ -193,22 +199,35 @@ class SeenTrial:
             start = -np.linalg.lstsq(self.system.generator, pushes[0], rcond=1e-12)[0]
         rows = np.flatnonzero(np.any(pushes, axis=0))
         state = self._moved(start, np.eye(len(start))[:, rows], pushes[:, rows])
-        return Part(self.readings(state) + self.over_noise(self.shown(slope, added, forces)), state)
+        return TrialColumn(
+            self.readings(state) + self.over_noise(self.shown(slope, added, forces)), state
+        )
 
     def _moved(
-        self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
+        self,
+        start: FloatArray,
+        directions: FloatArray,
+        pushes: FloatArray,
+        which: IntArray | None = None,
     ) -> FloatArray:
         moves, begins, ends = self.fine
-        begins, ends = np.ascontiguousarray(begins @ directions), np.ascontiguousarray(ends @ directions)
+        begins, ends = (
+            np.ascontiguousarray(begins @ directions),
+            np.ascontiguousarray(ends @ directions),
+        )
         pushes = np.ascontiguousarray(pushes)
         which = self.steps[1] if which is None else which
         return np.asarray(driven(self.parts, moves, begins, ends, which, start, pushes))
 
-    def readings(self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES) -> FloatArray:
-        """Return what readings (N, C) show of an added state (F, n), and at once of forces (F,) at ports."""
+    def readings(
+        self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES
+    ) -> FloatArray:
+        """Return the readings (N, C), over their noise, of an added state (F, n) and forces."""
         return self.over_noise(self.shown(self.system, states, forces))
 
-    def shown(self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]) -> FloatArray:
+    def shown(
+        self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
+    ) -> FloatArray:
         """Return what readings (N, C) show of an added state (F, n) and of forces (F,) at ports."""
         shown = states[:: self.parts] @ system.outputs.T
         for port, force in forces.items():
@@ -216,7 +235,7 @@ class SeenTrial:
         return np.asarray(shown)
 
     def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
-        """Return what forces at ports (F,) do to the readings from one sample until another, from nothing."""
+        """Return what forces (F,) at ports do to the readings of some samples, from rest."""
         fine = slice(begin * self.parts, (end - 1) * self.parts + 1)
         acting = {port: force[fine] for port, force in forces.items()}
         directions = -np.array([self.system.actions[port] for port in acting]).T
@@ -227,12 +246,14 @@ class SeenTrial:
         return np.asarray(shown / self.deviation * self.used[begin:end])
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
-        """Return columns (..., N, C) over the noise's deviations, zero where a reading does not count."""
+        """Return columns (..., N, C) over the noise; 0 where a reading does not count."""
         return np.asarray(columns / self.deviation * self.used)
 
 
 def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, float] | None:
-    """Return the share of a noise's variance that decays in time, and its rate [1/s]; None: it is white.
+    """Return the share of a noise's variance that decays in time, and its rate [1/s].
+
+    None: it is white.
 
     From the correlation at one and two samples: exact for an autoregression of first order.
     """
@@ -247,7 +268,10 @@ def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, flo
 
 
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
-    """Return a dynamic trial of a problem, linear about a point; its model must tell how ports move."""
+    """Return a dynamic trial of a problem, linear about a point.
+
+    Its model must tell how ports move.
+    """
     data = problem.trials[number]
     trial = data.trial
     gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
@@ -282,23 +306,27 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
 def _linear_readings(
     problem: Problem, number: int, point: Point
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return readings (N, C) less the linear model with all unknowns zero, and what units of these do.
+    """Return the residuals (N, C) of the linear model at zero unknowns, and its derivatives.
 
     The latter are (K, N, C) of the shared unknowns and (L, N, C) of the trial's own.
     """
     data = problem.trials[number]
     linear = problem.linearise(number, point, Candidate())
-    columns, shared_of_column = problem.columns(number, point, linear, Candidate())
+    columns, shared_of_column = problem.prediction_derivatives(number, point, linear, Candidate())
     by_local = columns[: data.unknowns.size]
     by_shared = np.zeros((problem.shared.size, *linear.response.shape))
     by_shared[shared_of_column] = columns[data.unknowns.size :]
     residual = data.trial.values - problem.prediction(number, point, linear.response)
-    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
+    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(
+        point.local[number], by_local, 1
+    )
     return residual, by_shared, by_local
 
 
-def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[tuple[int, int, float]]:
-    """Return the shared unknowns that are gains of the trial's channels, as `SeenTrial.gains` has them."""
+def _gain_unknowns(
+    problem: Problem, trial: Trial, gains: FloatArray
+) -> list[tuple[int, int, float]]:
+    """Return the shared unknowns that are gains of the trial's channels (`SeenTrial.gains`)."""
     shared = problem.shared
     unknowns = []
     for row, name in enumerate(shared.gain_channels):
@@ -309,8 +337,10 @@ def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[tu
     return unknowns
 
 
-def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> list[tuple[int, float, float]]:
-    """Return the channels whose noise has a decaying part, with its share of the variance and its rate."""
+def _coloured_noises(
+    noises: Sequence[NoiseModel], interval: float | None
+) -> list[tuple[int, float, float]]:
+    """Return the channels whose noise has a decaying part, with share and rate of that part."""
     coloured = []
     for channel, noise in enumerate(noises):
         part = decaying_part(noise, interval)
@@ -329,7 +359,7 @@ def _fine_steps(system: PortedSystem, time: FloatArray) -> int:
 def _port_motion(
     problem: Problem, number: int, point: Point, parts: int
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
-    """Return positions and speeds (2, F, P) of the ports by the model, and their derivatives by unknowns."""
+    """Return positions and speeds (2, F, P) of the ports, and their derivatives by unknowns."""
     data, shared = problem.trials[number], problem.shared
     trial_in_own_clock, _ = in_own_clock(data.trial, ModelPatch())
 
@@ -341,9 +371,11 @@ def _port_motion(
     here = motion(point.shared, local)
     by_unknowns = {}
     for k in range(shared.count):
-        by_unknowns[k] = (motion(moved(point.shared, k), local) - here) / PARAMETER_STEP
+        by_unknowns[k] = (motion(with_step(point.shared, k), local) - here) / PARAMETER_STEP
     for k in range(data.unknowns.zeros, data.unknowns.size):
-        by_unknowns[shared.size + k] = (motion(point.shared, moved(local, k)) - here) / PARAMETER_STEP
+        by_unknowns[shared.size + k] = (
+            motion(point.shared, with_step(local, k)) - here
+        ) / PARAMETER_STEP
     return here, by_unknowns
 
 
@@ -362,7 +394,7 @@ def _ported(
         return model.ported(trial, outputs, unknowns.parameters(u))
 
     def slope(k: int) -> PortedSystem | None:
-        above, below = (system(moved(shared, k, sign * SMALL)) for sign in (1.0, -1.0))
+        above, below = (system(with_step(shared, k, sign * SMALL)) for sign in (1.0, -1.0))
         found = {
             name: (getattr(above, name) - getattr(below, name)) / (2.0 * SMALL)
             for name in ("generator", "actions", "outputs", "through")
