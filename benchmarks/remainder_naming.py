@@ -220,7 +220,11 @@ def judge(out: Path, seed: int, number: int, *, colour: bool) -> dict[str, Any]:
         found = investigate(read_campaign(folder), model_of(folder), library(), thorough=False)
     except DiscrepancyError as error:
         return truth | {"kind": "error", "sentence": str(error), "outcome": "error", "seconds": 0.0}
-    return truth | scored(found.verdict, truth["identifiers"], found.proof) | {"seconds": time.perf_counter() - began}
+    return (
+        truth
+        | scored(found.verdict, truth["identifiers"], found.proof)
+        | {"seconds": time.perf_counter() - began}
+    )
 
 
 def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, Any]:
