@@ -143,18 +143,18 @@ class EffectLaws:
     def _patch(self, number: int, effect: FloatArray) -> ModelPatch:
         """Return what the effects add to the model in a trial."""
         trial = self.columns.problem.trials[self.columns.numbers[number]].trial
-        found = ModelPatch()
+        patch = ModelPatch()
         for term, part in self.candidate.split(effect):
             if trial.kind in term.effect.acts_on:
-                found = found + term.patch(self.columns.problem.setting, part).in_trial(trial.name)
-        return found
+                patch = patch + term.patch(self.columns.problem.setting, part).in_trial(trial.name)
+        return patch
 
     def _along(
         self, number: int, trajectory: Trajectory, patch: ModelPatch, smoothing: float
     ) -> dict[int, ForceAlong]:
         """Return the forces of a patch's laws, by port."""
         trial = self.trials[number]
-        found: dict[int, ForceAlong] = {}
+        forces: dict[int, ForceAlong] = {}
         for law in self.columns.problem.model.at_ports(patch):
             if not isinstance(law, PortForce):
                 continue
@@ -166,8 +166,8 @@ class EffectLaws:
                 trajectory.speeds[:, port],
                 smoothing,
             )
-            found[port] = force.plus(found[port]) if port in found else force
-        return found
+            forces[port] = force.plus(forces[port]) if port in forces else force
+        return forces
 
     # ------------------------------------------------------------ sensors
 
@@ -176,7 +176,7 @@ class EffectLaws:
         trial = self.trials[number]
         known = np.zeros_like(trial.residual)
         by_unknown: dict[int, FloatArray] = {}
-        at = len(trial.shared)
+        first_unknown = len(trial.shared)
         motion = seen_motion(trajectory)
         for term, part in self.candidate.split(effect):
             if not len(term.patch(self.columns.problem.setting, part).of(PortForce)):
@@ -184,8 +184,8 @@ class EffectLaws:
                 for k in range(len(part)):
                     above = self._shown(number, motion, term, with_step(part, k, STEP))
                     below = self._shown(number, motion, term, with_step(part, k, -STEP))
-                    by_unknown[at + k] = (above - below) / (2.0 * STEP)
-            at += len(part)
+                    by_unknown[first_unknown + k] = (above - below) / (2.0 * STEP)
+            first_unknown += len(part)
         return SensorReadings(known, by_unknown)
 
     def _shown(

@@ -41,7 +41,7 @@ SETTLED = 0.02
 """Step of the unknowns, in their standard deviations, below which nothing moves any more."""
 LEVEL = 0.05
 """Change of the evidence [nat] below which nothing moves any more."""
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+STEP_FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Parts of a step that are tried in turn."""
 LONGEST_STEP = 2.0
 """Longest step of the unknown of an effect, in deviations of its prior."""
@@ -127,24 +127,27 @@ class Linearisation:
         """Return shared unknowns and those of effects, and the unknowns of each trial."""
         total = np.zeros((1 + len(self.precision),) * 2)
         half = 0.0
-        for item in self.trials:
-            products, own_half = item.products
-            kept, kept_half = without(products, np.asarray(own_half), item.trial.local_precision)
-            total += kept
-            half += float(kept_half)
+        for linear_trial in self.trials:
+            products, half_of_trial = linear_trial.products
+            local_precision = linear_trial.trial.local_precision
+            without_local, half_without_local = without(
+                products, np.asarray(half_of_trial), local_precision
+            )
+            total += without_local
+            half += float(half_without_local)
         solution = Regression(total, half).solve(range(len(self.precision)), self.precision)
-        return solution, [self._local(item, solution.mean) for item in self.trials]
+        return solution, [self._local(linear_trial, solution.mean) for linear_trial in self.trials]
 
     def beside(self, processes: Mapping[int, Process]) -> "Linearisation":
         """Return the same with other missing forces."""
-        trials = tuple(replace(item, processes=processes) for item in self.trials)
+        trials = tuple(replace(trial, processes=processes) for trial in self.trials)
         return Linearisation(trials, self.precision)
 
-    def _local(self, item: LinearisedTrial, known: FloatArray) -> FloatArray:
+    def _local(self, linear_trial: LinearisedTrial, known: FloatArray) -> FloatArray:
         """Return the unknowns (L,) of a trial, given the others."""
-        products, _ = item.products
+        products, _ = linear_trial.products
         first = 1 + len(known)
-        precision = np.maximum(item.trial.local_precision, LEAST_PRECISION)
+        precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
         right = products[first:, 0] - products[first:, 1:first] @ known
         return np.linalg.solve(products[first:, first:] + np.diag(precision), right)
 
@@ -169,13 +172,13 @@ class EstimatorStart:
     processes: Mapping[int, Process]
 
 
-def following(found: MotionEstimate) -> EstimatorStart:
+def start_after(estimate: MotionEstimate) -> EstimatorStart:
     """Return the start of an estimate that begins where another one ended."""
     return EstimatorStart(
-        found.effect,
-        found.shared,
-        tuple(item.trajectory for item in found.trials),
-        found.processes,
+        estimate.effect,
+        estimate.shared,
+        tuple(smoothed.trajectory for smoothed in estimate.trials),
+        estimate.processes,
     )
 
 
@@ -203,16 +206,16 @@ class MotionEstimator:
         Parameters
         ----------
         laws : HypothesisLaws
-            Of the hypothesis.
+            The laws and sensors of the hypothesis.
         start : EstimatorStart
-            Where to begin.
+            The values and trajectories to begin with.
         """
         current = start
         for smoothing in SMOOTHINGS[:-1]:
-            found = self._iterated(laws, current, smoothing)
-            if found is None:
+            smoothed = self._iterated(laws, current, smoothing)
+            if smoothed is None:
                 return None
-            current = following(found)
+            current = start_after(smoothed)
         estimate = self._with_smaller_missing_forces(laws, current)
         return None if estimate is None else self._tuned(laws, estimate)
 
@@ -239,38 +242,41 @@ class MotionEstimator:
                 best = estimate
             elif estimate.log_evidence < best.log_evidence - DECLINE:
                 break
-            current = following(estimate)
+            current = start_after(estimate)
         return best
 
-    def _tuned(self, laws: HypothesisLaws, found: MotionEstimate) -> MotionEstimate:
+    def _tuned(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
         """Return an estimate with size and time of its missing forces at the most probable values.
 
         A pattern search by ever smaller factors; the trials stay linear along one trajectory
         meanwhile.
         """
-        at = following(found)
-        linear = self.linearised(laws, at, SMOOTHINGS[-1])
+        start = start_after(estimate)
+        linear = self.linearised(laws, start, SMOOTHINGS[-1])
         if linear is None:
-            return found
-        processes = dict(at.processes)
+            return estimate
+        processes = dict(start.processes)
         top = self._evidence_beside(linear, processes)
         for factor in FACTORS:
             for port, name in product(tuple(processes), ("size", "time")):
                 for change in (factor, 1.0 / factor):
                     value = change * getattr(processes[port], name)
-                    tried = processes | {port: replace(processes[port], **{name: value})}
-                    evidence = self._evidence_beside(linear, tried)
+                    changed = processes | {port: replace(processes[port], **{name: value})}
+                    evidence = self._evidence_beside(linear, changed)
                     if evidence > top:
-                        processes, top = tried, evidence
+                        processes, top = changed, evidence
                         break
-        again = self._iterated(laws, replace(at, processes=processes), SMOOTHINGS[-1])
-        return again if again is not None and again.log_evidence > found.log_evidence else found
+        tuned = self._iterated(laws, replace(start, processes=processes), SMOOTHINGS[-1])
+        return (
+            tuned if tuned is not None and tuned.log_evidence > estimate.log_evidence else estimate
+        )
 
     def _iterated(
         self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
     ) -> MotionEstimate | None:
         """Return the estimate beside given missing forces, by Gauss-Newton steps."""
-        current, last_evidence = start, -inf
+        current = start
+        last_evidence = -inf
         estimate: MotionEstimate | None = None
         for _ in range(ITERATIONS):
             linear = self.linearised(laws, current, smoothing)
@@ -282,14 +288,14 @@ class MotionEstimator:
             count = len(self.shared_precision)
             unknowns = solution.mean
             smoothed = tuple(
-                item.smoothed(np.concatenate((unknowns, own)))
-                for item, own in zip(linear.trials, local, strict=True)
+                trial.smoothed(np.concatenate((unknowns, local_unknowns)))
+                for trial, local_unknowns in zip(linear.trials, local, strict=True)
             )
             evidence = solution.evidence + self._log_prior(start.processes)
-            before = np.concatenate((current.shared, current.effect))
+            last_unknowns = np.concatenate((current.shared, current.effect))
             deviations = np.sqrt(np.diag(solution.covariance))
-            moved = float(np.max(np.abs(unknowns - before) / deviations, initial=0.0))
-            settled = moved < SETTLED and abs(evidence - last_evidence) < LEVEL
+            largest_move = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
+            is_settled = largest_move < SETTLED and abs(evidence - last_evidence) < LEVEL
             estimate = MotionEstimate(
                 effect=unknowns[count:],
                 shared=unknowns[:count],
@@ -298,13 +304,15 @@ class MotionEstimator:
                 processes=start.processes,
                 log_evidence=evidence,
                 trials=smoothed,
-                converged=settled,
+                converged=is_settled,
             )
             last_evidence = evidence
-            ahead = None if settled else self._stepped(laws, current, estimate, linear, smoothing)
-            if ahead is None:
+            next_start = (
+                None if is_settled else self._stepped(laws, current, estimate, linear, smoothing)
+            )
+            if next_start is None:
                 return estimate
-            current = ahead
+            current = next_start
         return estimate
 
     def _evidence_beside(self, linear: Linearisation, processes: Mapping[int, Process]) -> float:
@@ -313,34 +321,36 @@ class MotionEstimator:
         return solution.evidence + self._log_prior(processes)
 
     def linearised(
-        self, laws: HypothesisLaws, at: EstimatorStart, smoothing: float
+        self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
     ) -> Linearisation | None:
         """Return all trials, linear along trajectories; None where the laws cannot be followed."""
-        found = []
+        linear_trials = []
         for number, trial in enumerate(self.trials):
-            along = laws.along(number, at.trajectories[number], at.effect, at.shared, smoothing)
-            if along is None:
+            forces_and_sensors = laws.along(
+                number, start.trajectories[number], start.effect, start.shared, smoothing
+            )
+            if forces_and_sensors is None:
                 return None
-            forces, sensors = along
-            found.append(
+            forces, sensors = forces_and_sensors
+            linear_trials.append(
                 LinearisedTrial(
                     trial,
-                    at.processes,
-                    at.trajectories[number],
+                    start.processes,
+                    start.trajectories[number],
                     forces,
                     sensors,
-                    at.effect,
-                    at.shared,
+                    start.effect,
+                    start.shared,
                 )
             )
         precision = np.concatenate((self.shared_precision, np.ones(laws.size)))
-        return Linearisation(tuple(found), precision)
+        return Linearisation(tuple(linear_trials), precision)
 
     def _stepped(
         self,
         laws: HypothesisLaws,
         current: EstimatorStart,
-        ahead: MotionEstimate,
+        estimate: MotionEstimate,
         linear: Linearisation,
         smoothing: float,
     ) -> EstimatorStart | None:
@@ -350,25 +360,27 @@ class MotionEstimator:
         of which the smoother does not know. In no step is it larger than the missing force that the
         hypothesis admits.
         """
-        change = ahead.effect - current.effect
+        change = estimate.effect - current.effect
         longest = float(np.max(np.abs(change), initial=0.0))
         most = min(1.0, LONGEST_STEP / longest) if longest > 0.0 else 1.0
         chosen: EstimatorStart | None = None
-        for share in SHARES:
-            part = min(share, most)
-            there = EstimatorStart(
-                current.effect + part * change,
-                current.shared + part * (ahead.shared - current.shared),
+        for fraction in STEP_FRACTIONS:
+            taken = min(fraction, most)
+            stepped = EstimatorStart(
+                current.effect + taken * change,
+                current.shared + taken * (estimate.shared - current.shared),
                 tuple(
-                    trajectory.toward(smoothed.trajectory, part)
-                    for trajectory, smoothed in zip(current.trajectories, ahead.trials, strict=True)
+                    trajectory.toward(smoothed.trajectory, taken)
+                    for trajectory, smoothed in zip(
+                        current.trajectories, estimate.trials, strict=True
+                    )
                 ),
                 current.processes,
             )
-            error = self._error_of_laws(laws, current, there, linear, smoothing)
+            error = self._error_of_laws(laws, current, stepped, linear, smoothing)
             if error is None:
                 continue
-            chosen = there
+            chosen = stepped
             if error <= 1.0:
                 break
         return chosen
@@ -377,31 +389,35 @@ class MotionEstimator:
         self,
         laws: HypothesisLaws,
         current: EstimatorStart,
-        there: EstimatorStart,
+        stepped: EstimatorStart,
         linear: Linearisation,
         smoothing: float,
     ) -> float | None:
         """Return the rms error of the linear laws over the deviation of the missing force."""
         worst = 0.0
-        for number, item in enumerate(linear.trials):
-            found = laws.forces(
-                number, there.trajectories[number], there.effect, there.shared, smoothing
+        for number, trial in enumerate(linear.trials):
+            forces_after = laws.forces(
+                number, stepped.trajectories[number], stepped.effect, stepped.shared, smoothing
             )
-            if found is None:
+            if forces_after is None:
                 return None
-            change = np.concatenate((there.shared - current.shared, there.effect - current.effect))
-            for port, forces in item.forces.items():
+            change = np.concatenate(
+                (stepped.shared - current.shared, stepped.effect - current.effect)
+            )
+            for port, forces in trial.forces.items():
                 position = (
-                    there.trajectories[number].positions[:, port]
-                    - item.trajectory.positions[:, port]
+                    stepped.trajectories[number].positions[:, port]
+                    - trial.trajectory.positions[:, port]
                 )
-                speed = there.trajectories[number].speeds[:, port] - item.trajectory.speeds[:, port]
+                speed = (
+                    stepped.trajectories[number].speeds[:, port] - trial.trajectory.speeds[:, port]
+                )
                 expected = forces.along.force + forces.along.by_position * position
                 expected = expected + forces.along.by_speed * speed
                 for unknown, slope in forces.by_unknown.items():
                     expected = expected + change[unknown] * slope
-                error = float(np.sqrt(np.mean((found[port].force - expected) ** 2)))
-                size = max(process.size for process in there.processes.values())
+                error = float(np.sqrt(np.mean((forces_after[port].force - expected) ** 2)))
+                size = max(process.size for process in stepped.processes.values())
                 worst = max(worst, error / size)
         return worst
 

@@ -27,7 +27,7 @@ def refined(
     search: ForceSearch,
     ranked: Sequence[ForceHypothesis],
     effect_count: int,
-    tell: Callable[[str], None] = lambda words: None,
+    on_progress: Callable[[str], None] = lambda message: None,
 ) -> list[ForceHypothesis]:
     """Return hypotheses, the most probable first, with the best ones estimated anew.
 
@@ -41,29 +41,34 @@ def refined(
     Parameters
     ----------
     search : ForceSearch
-        The missing forces.
+        The search for the missing force.
     ranked : sequence of ForceHypothesis
-        The most probable first.
+        The hypotheses, the most probable first.
     effect_count : int
-        Effects that were looked for, for the prior of a hypothesis.
-    tell : callable
-        Takes a few words on what is estimated.
+        The number of effects that were looked for, for the prior of a hypothesis.
+    on_progress : callable
+        Takes a line that says what is estimated.
     """
 
-    def score(item: ForceHypothesis) -> float:
-        return search.score(item, effect_count)
+    def score(hypothesis: ForceHypothesis) -> float:
+        return search.score(hypothesis, effect_count)
 
-    with_effects = [item for item in ranked if item.candidate.terms]
-    chosen = [item for item in with_effects if score(item) > score(with_effects[0]) - CLOSE][
-        :REFINED
-    ]
-    found = list(ranked)
-    for item in chosen:
-        tell(f"estimating {item.candidate.description} together with the motion")
-        better = estimated(search, item)
-        if better is not None and better.log_evidence > item.log_evidence:
-            found[next(at for at, one in enumerate(found) if one is item)] = better
-    return sorted(found, key=lambda item: -score(item))
+    with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
+    close = []
+    for hypothesis in with_effects:
+        if score(hypothesis) > score(with_effects[0]) - CLOSE:
+            close.append(hypothesis)
+    hypotheses = list(ranked)
+    for hypothesis in close[:REFINED]:
+        on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
+        refined_hypothesis = estimated(search, hypothesis)
+        if refined_hypothesis is None:
+            continue
+        if refined_hypothesis.log_evidence > hypothesis.log_evidence:
+            hypotheses = [
+                refined_hypothesis if other is hypothesis else other for other in hypotheses
+            ]
+    return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
 
 
 def estimated(search: ForceSearch, followed: ForceHypothesis) -> ForceHypothesis | None:
@@ -88,43 +93,43 @@ def estimated(search: ForceSearch, followed: ForceHypothesis) -> ForceHypothesis
         port: replace(process, size=max(process.size, search.whole_size(port)))
         for port, process in followed.processes.items()
     }
-    found = estimator.estimate(
+    estimate = estimator.estimate(
         laws, EstimatorStart(followed.effect, followed.shared, trajectories, processes)
     )
-    return None if found is None else _explained(search, followed, found)
+    return None if estimate is None else _explained(search, followed, estimate)
 
 
 def adjustable_laws(search: ForceSearch) -> tuple[int, ...]:
     """Return the shared unknowns by which the laws change that the model has itself."""
     shared = search.point.shared
-    here = search.own_laws(shared)
+    laws_at_point = search.own_laws(shared)
     return tuple(
         number
         for number in range(search.problem.shared.count)
-        if search.own_laws(with_step(shared, number, STEP)) != here
+        if search.own_laws(with_step(shared, number, STEP)) != laws_at_point
     )
 
 
 def _explained(
-    search: ForceSearch, followed: ForceHypothesis, found: MotionEstimate
+    search: ForceSearch, followed: ForceHypothesis, estimate: MotionEstimate
 ) -> ForceHypothesis | None:
     """Return an estimate as a hypothesis of the search, which others may be added to."""
     motions = [
         _smoothed_motion(trial, smoothed)
-        for trial, smoothed in zip(followed.view.trials, found.trials, strict=True)
+        for trial, smoothed in zip(followed.view.trials, estimate.trials, strict=True)
     ]
-    view = search.linear(followed.view, motions, followed.candidate, found.effect)
+    view = search.linear(followed.view, motions, followed.candidate, estimate.effect)
     if view is None:
         return None
-    mean = np.concatenate((found.shared, found.effect))
+    mean = np.concatenate((estimate.shared, estimate.effect))
     return ForceHypothesis(
         candidate=followed.candidate,
-        effect=found.effect,
-        processes=found.processes,
-        log_evidence=found.log_evidence,
+        effect=estimate.effect,
+        processes=estimate.processes,
+        log_evidence=estimate.log_evidence,
         view=view,
-        solution=Solution(found.log_evidence, mean, found.covariance),
-        local=found.local,
+        solution=Solution(estimate.log_evidence, mean, estimate.covariance),
+        local=estimate.local,
         motions=motions,
     )
 

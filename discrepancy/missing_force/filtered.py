@@ -182,7 +182,9 @@ class ForceFilter:
     @property
     def key(self) -> tuple[bytes, ...]:
         """What trials of one system and one grid of samples share; they are filtered together."""
-        return tuple(item.tobytes() for item in (*self.system, *self.trial.steps, self.trial.used))
+        return tuple(
+            array.tobytes() for array in (*self.system, *self.trial.steps, self.trial.used)
+        )
 
     def steps(self, columns: FloatArray) -> FilterSteps:
         """Return the record with columns (K, N, C) to be filtered."""
@@ -263,11 +265,11 @@ class ForceFilter:
     def _deviations(self, covariances: FloatArray) -> FloatArray:
         """Return deviations (2 P, N) of forces and speeds, given state covariances (N, n, n)."""
         count = len(self.processes)
-        shown = np.zeros((2 * count, covariances.shape[-1]))
+        rows = np.zeros((2 * count, covariances.shape[-1]))
         for number, (port, process) in enumerate(self.processes):
-            shown[number, self.places[number]] = process.size
-            shown[count + number, : len(self.units)] = self.trial.system.speeds[port] * self.units
-        variances = np.sum((shown @ covariances) * shown, axis=-1)
+            rows[number, self.places[number]] = process.size
+            rows[count + number, : len(self.units)] = self.trial.system.speeds[port] * self.units
+        variances = np.sum((rows @ covariances) * rows, axis=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
 
 
@@ -331,13 +333,13 @@ def without(
     if not len(precision):
         return products, halves
     prior = np.maximum(precision, LEAST_PRECISION)
-    kept = products.shape[-1] - len(prior)
+    count = products.shape[-1] - len(prior)
     # Schur complement of the last columns
-    root = np.linalg.cholesky(products[..., kept:, kept:] + np.diag(prior))
-    projected = np.asarray(np.linalg.solve(root, products[..., kept:, :kept]))
+    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
+    projected = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
     half_log_determinants = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
     remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior).sum()
-    return products[..., :kept, :kept] - projected.mT @ projected, remaining_halves
+    return products[..., :count, :count] - projected.mT @ projected, remaining_halves
 
 
 def regression(filtered: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:
@@ -352,8 +354,8 @@ def regression(filtered: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> R
         together, half = first_trial.products(np.concatenate([columns for _, columns in group]))
         ends = np.cumsum([0, *(len(columns) for _, columns in group)]).tolist()
         for (trial, _), (begin, end) in zip(group, pairwise(ends), strict=True):
-            own = together[begin:end, begin:end]
-            products, half_with_local = without(own, half, trial.trial.local_precision)
+            of_trial = together[begin:end, begin:end]
+            products, half_with_local = without(of_trial, half, trial.trial.local_precision)
             total = total + products
             log_determinant += float(half_with_local)
     return Regression(np.asarray(total), log_determinant)

@@ -140,8 +140,8 @@ class ProcessSearch:
         units = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
         curvature = np.diag(ahead + back - 2.0 * top)
         for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-            both = self.value(logs + units[i] + units[k])
-            curvature[i, k] = both - ahead[i] - ahead[k] + top
+            ahead_of_both = self.value(logs + units[i] + units[k])
+            curvature[i, k] = ahead_of_both - ahead[i] - ahead[k] + top
             curvature[k, i] = curvature[i, k]
         return curvature
 

@@ -140,8 +140,8 @@ class SeenTrial:
         mean = float(lengths.mean())
         if np.all(np.abs(lengths - mean) < 1e-3 * mean):
             return np.array([mean]), np.zeros(len(self.time), dtype=np.int64)
-        found, which = np.unique(np.round(lengths / mean, 9), return_inverse=True)
-        return found * mean, np.concatenate(([0], which)).astype(np.int64)
+        relative_lengths, index = np.unique(np.round(lengths / mean, 9), return_inverse=True)
+        return relative_lengths * mean, np.concatenate(([0], index)).astype(np.int64)
 
     @cached_property
     def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -208,16 +208,34 @@ class SeenTrial:
         start: FloatArray,
         directions: FloatArray,
         pushes: FloatArray,
-        which: IntArray | None = None,
+        step_of_sample: IntArray | None = None,
     ) -> FloatArray:
-        moves, begins, ends = self.fine
-        begins, ends = (
-            np.ascontiguousarray(begins @ directions),
-            np.ascontiguousarray(ends @ directions),
+        """Return the state (F, n) of the system under pushes, linear between the fine stamps.
+
+        Parameters
+        ----------
+        start : (n,) array
+            The state at the first stamp.
+        directions : (n, D) array
+            The directions of the pushes in the state.
+        pushes : (F, D) array
+            The pushes at the fine stamps.
+        step_of_sample : (N,) array of int, optional
+            The index of the interval before each sample; those of the trial if left out.
+        """
+        transitions, by_push_at_begin, by_push_at_end = self.fine
+        if step_of_sample is None:
+            _, step_of_sample = self.steps
+        states = driven(
+            self.parts,
+            transitions,
+            np.ascontiguousarray(by_push_at_begin @ directions),
+            np.ascontiguousarray(by_push_at_end @ directions),
+            step_of_sample,
+            start,
+            np.ascontiguousarray(pushes),
         )
-        pushes = np.ascontiguousarray(pushes)
-        which = self.steps[1] if which is None else which
-        return np.asarray(driven(self.parts, moves, begins, ends, which, start, pushes))
+        return np.asarray(states)
 
     def readings(
         self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES
@@ -229,21 +247,22 @@ class SeenTrial:
         self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
     ) -> FloatArray:
         """Return what readings (N, C) show of an added state (F, n) and of forces (F,) at ports."""
-        shown = states[:: self.parts] @ system.outputs.T
+        readings = states[:: self.parts] @ system.outputs.T
         for port, force in forces.items():
-            shown -= np.outer(force[:: self.parts], system.through[port])
-        return np.asarray(shown)
+            readings -= np.outer(force[:: self.parts], system.through[port])
+        return np.asarray(readings)
 
     def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
         """Return what forces (F,) at ports do to the readings of some samples, from rest."""
         fine = slice(begin * self.parts, (end - 1) * self.parts + 1)
         acting = {port: force[fine] for port, force in forces.items()}
         directions = -np.array([self.system.actions[port] for port in acting]).T
-        which = np.ascontiguousarray(self.steps[1][begin:end])
+        _, all_steps = self.steps
+        step_of_sample = np.ascontiguousarray(all_steps[begin:end])
         pushes = np.array([*acting.values()]).T
-        states = self._moved(np.zeros(len(directions)), directions, pushes, which)
-        shown = self.shown(self.system, states, acting)
-        return np.asarray(shown / self.deviation * self.used[begin:end])
+        states = self._moved(np.zeros(len(directions)), directions, pushes, step_of_sample)
+        readings = self.shown(self.system, states, acting)
+        return np.asarray(readings / self.deviation * self.used[begin:end])
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over the noise; 0 where a reading does not count."""
@@ -259,12 +278,19 @@ def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, flo
     """
     if interval is None or not noise.applies(interval):
         return None
-    answer = lfilter([1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)])
-    at = [float(answer[: len(answer) - lag] @ answer[lag:]) for lag in range(3)]
-    if not 0.0 < at[2] < at[1]:
+    impulse_response = lfilter(
+        [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)]
+    )
+    covariances = [
+        float(impulse_response[: len(impulse_response) - lag] @ impulse_response[lag:])
+        for lag in range(3)
+    ]
+    if not 0.0 < covariances[2] < covariances[1]:
         return None
-    decay = at[2] / at[1]
-    return min(at[1] / decay / at[0], 1.0 - LEAST_WHITE), -float(np.log(decay)) / interval
+    decay = covariances[2] / covariances[1]
+    return min(covariances[1] / decay / covariances[0], 1.0 - LEAST_WHITE), -float(
+        np.log(decay)
+    ) / interval
 
 
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
@@ -360,23 +386,24 @@ def _port_motion(
     problem: Problem, number: int, point: Point, parts: int
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
     """Return positions and speeds (2, F, P) of the ports, and their derivatives by unknowns."""
-    data, shared = problem.trials[number], problem.shared
+    data = problem.trials[number]
+    shared = problem.shared
     trial_in_own_clock, _ = in_own_clock(data.trial, ModelPatch())
 
-    def motion(of_all: FloatArray, own: FloatArray) -> FloatArray:
-        conditions = data.unknowns.conditions(data.trial, shared.parameters(of_all), own)
+    def motion(shared_values: FloatArray, local_values: FloatArray) -> FloatArray:
+        parameters = shared.parameters(shared_values)
+        conditions = data.unknowns.conditions(data.trial, parameters, local_values)
         return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, parts))
 
     local = point.local[number]
-    here = motion(point.shared, local)
+    at_point = motion(point.shared, local)
     by_unknowns = {}
     for k in range(shared.count):
-        by_unknowns[k] = (motion(with_step(point.shared, k), local) - here) / PARAMETER_STEP
+        by_unknowns[k] = (motion(with_step(point.shared, k), local) - at_point) / PARAMETER_STEP
     for k in range(data.unknowns.zeros, data.unknowns.size):
-        by_unknowns[shared.size + k] = (
-            motion(point.shared, with_step(local, k)) - here
-        ) / PARAMETER_STEP
-    return here, by_unknowns
+        stepped = motion(point.shared, with_step(local, k))
+        by_unknowns[shared.size + k] = (stepped - at_point) / PARAMETER_STEP
+    return at_point, by_unknowns
 
 
 def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
@@ -387,19 +414,42 @@ def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
 def _ported(
     problem: Problem, trial: Trial, shared: FloatArray
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
-    """Return how the ports of a trial move, and the derivatives of that by the shared unknowns."""
-    model, unknowns, outputs = problem.model, problem.shared, problem.campaign.outputs(trial)
+    """Return how the ports of a trial move, and the derivatives of that by the shared unknowns.
+
+    A derivative is None where it is zero; gains do not change how ports move.
+    """
+    unknowns = problem.shared
+    outputs = problem.campaign.outputs(trial)
 
     def system(u: FloatArray) -> PortedSystem:
-        return model.ported(trial, outputs, unknowns.parameters(u))
+        return problem.model.ported(trial, outputs, unknowns.parameters(u))
 
-    def slope(k: int) -> PortedSystem | None:
-        above, below = (system(with_step(shared, k, sign * SMALL)) for sign in (1.0, -1.0))
-        found = {
-            name: (getattr(above, name) - getattr(below, name)) / (2.0 * SMALL)
-            for name in ("generator", "actions", "outputs", "through")
-        }
-        return replace(above, **found) if any(np.any(item) for item in found.values()) else None
+    slopes: list[PortedSystem | None] = []
+    for k in range(unknowns.count):
+        above = system(with_step(shared, k, SMALL))
+        below = system(with_step(shared, k, -SMALL))
+        slopes.append(_slope_of_system(above, below))
+    slopes += [None] * (unknowns.size - len(slopes))
+    return system(shared), slopes
 
-    of_parameters = [slope(k) for k in range(unknowns.count)]
-    return system(shared), of_parameters + [None] * (unknowns.size - len(of_parameters))
+
+def _slope_of_system(above: PortedSystem, below: PortedSystem) -> PortedSystem | None:
+    """Return the derivative of a system between values of a parameter `SMALL` above and below."""
+
+    def slope(upper: FloatArray, lower: FloatArray) -> FloatArray:
+        return np.asarray((upper - lower) / (2.0 * SMALL))
+
+    derivative = replace(
+        above,
+        generator=slope(above.generator, below.generator),
+        actions=slope(above.actions, below.actions),
+        outputs=slope(above.outputs, below.outputs),
+        through=slope(above.through, below.through),
+    )
+    changes = (
+        derivative.generator,
+        derivative.actions,
+        derivative.outputs,
+        derivative.through,
+    )
+    return derivative if any(np.any(change) for change in changes) else None

@@ -64,11 +64,13 @@ EffectColumn = Sequence[TrialColumn]
 
 def combined(columns: Sequence[EffectColumn], factors: Sequence[float]) -> EffectColumn:
     """Return the sum of columns, each taken a number of times."""
-    first, *others = columns
-    found = [TrialColumn(np.zeros_like(part.readings)).plus(part, factors[0]) for part in first]
-    for column, factor in zip(others, factors[1:], strict=True):
-        found = [part.plus(other, factor) for part, other in zip(found, column, strict=True)]
-    return found
+    first_column, *other_columns = columns
+    total = [
+        TrialColumn(np.zeros_like(part.readings)).plus(part, factors[0]) for part in first_column
+    ]
+    for column, factor in zip(other_columns, factors[1:], strict=True):
+        total = [part.plus(added, factor) for part, added in zip(total, column, strict=True)]
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +122,9 @@ class View:
                     part = trial.turned(slope, motion.added, motion.forces)
                     parts[unknown] = (part, float(trial.about[unknown]))
             # gains change the readings of their channel
-            shown = trial.readings(motion.added, motion.forces)
+            readings = trial.readings(motion.added, motion.forces)
             for unknown, channel, scale in trial.gains:
-                part = TrialColumn(shown * scale * np.eye(shown.shape[1])[channel])
+                part = TrialColumn(readings * scale * np.eye(readings.shape[1])[channel])
                 parts[unknown] = (part, float(trial.about[unknown]))
         for unknown, effect in enumerate(self.effects, start=len(self.shared_precision)):
             for part, parts in zip(effect, by_trial, strict=True):
