@@ -20,6 +20,7 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import binding_files
+from twin_master.assets.coupled_source import CoupledSection
 from twin_master.scenario.reading import load_scenario
 
 REPEATS, INNER = 300, 5
@@ -50,6 +51,7 @@ def run() -> list[Measurement]:
 def three_fmus(folder: Path) -> Wiring:
     """Return the system of the shipped scenario, its noise included."""
     asset = load_scenario("three_fmus").scenario.asset
+    assert isinstance(asset, CoupledSection)
     fmus = {
         "damage": atomic_write_bytes(folder / "damage.fmu", companion_bytes("damage_growth")),
         "wing": build_fmu(reduced_model(), folder / "wing.fmu").path,

@@ -263,8 +263,8 @@ def campaign() -> Campaign:
     Two ring-downs, one forced trial, three static ones (up, down, warm) and one flight.
     """
     levels = np.array([5.0, 10.0, 20.0, 30.0, 20.0, 10.0, 5.0])
-    minutes = 60.0 * np.arange(1, 8)
-    samples = np.arange(2000) / 250.0
+    minutes = 60.0 * np.arange(1, 8, dtype=np.float64)
+    samples = np.arange(2000, dtype=np.float64) / 250.0
     trials = (
         _trial("up", TrialKind.STATIC, minutes, force=levels),
         _trial("down", TrialKind.STATIC, 600.0 + minutes, force=-levels, run="B"),

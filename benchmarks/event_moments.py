@@ -33,12 +33,12 @@ def noise(generator: np.random.Generator, count: int, colour: float) -> FloatArr
 def event(generator: np.random.Generator, kind: str, count: int, size: float) -> FloatArray:
     """Return what an event adds (count,), of the root mean square `size`."""
     if kind == "offset":
-        return np.full(count, size * generator.choice([-1.0, 1.0]))
+        return np.full(count, size * float(generator.choice([-1.0, 1.0])))
     if kind == "random motion":
         return size * noise(generator, count, 0.8)
     if kind == "line":
         phase = 2.0 * np.pi * (np.arange(count) / generator.uniform(8.0, 30.0) + generator.uniform())
-        return size * np.sqrt(2.0) * np.sin(phase)
+        return np.asarray(size * np.sqrt(2.0) * np.sin(phase))
     return size * generator.standard_normal(count)
 
 
@@ -47,7 +47,7 @@ def record(
 ) -> tuple[FloatArray, FloatArray, tuple[float, ...]]:
     """Return stamps (N,) and residuals (N,) of a record, and the true begin and end of its event."""
     count = int(generator.integers(300, 2001))
-    time = np.arange(count) * 0.01
+    time = np.arange(count, dtype=np.float64) * 0.01
     if generator.random() < 0.5:
         time = np.sort(time + generator.normal(0.0, 0.0002, count))
     values = noise(generator, count, generator.choice([0.0, 0.5]))
@@ -59,7 +59,8 @@ def record(
     end = begin + generator.uniform(0.1, 0.25) * time[-1] if generator.random() < 0.5 else np.inf
     inside = (time >= begin) & (time < end)
     values[inside] += event(generator, kind, int(inside.sum()), generator.uniform(5.0, 20.0))
-    return time, values, (begin, end) if np.isfinite(end) else (begin,)
+    moments = (begin, end) if np.isfinite(end) else (begin,)
+    return time, values, moments
 
 
 def found_in(time: FloatArray, values: FloatArray) -> Events:

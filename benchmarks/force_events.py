@@ -62,8 +62,8 @@ def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
         windows.append((begin, begin + length * generator.uniform(0.03, 0.15)))
     if kind in ("always", "nothing"):
         windows = []
-    time = step * np.arange(count)
-    sizes = np.exp(generator.uniform(*np.log((0.15, 1.0)), 2))
+    time = step * np.arange(count, dtype=np.float64)
+    sizes = np.exp(generator.uniform(np.log(0.15), np.log(1.0), 2))
     levels = generator.uniform(0.3, 1.4, count // 10 + 1) if slow else generator.uniform(-1.0, 1.0, count)
     hold = 10 if slow else 5
     moments = [float(t) for t in time[hold::hold]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -281,7 +281,7 @@ def _trap(
     order: Order, work: Workbench, generator: np.random.Generator, chance: Chance, known: Reference
 ) -> Case:
     trap = traps.TRAPS[order.trap]
-    drawn = trap.draw(generator, work.bench)
+    drawn: Sequence[Hidden] = trap.draw(generator, work.bench)
     changes = Changes()
     for effect in drawn:
         changes = changes.with_other(effect.changes)

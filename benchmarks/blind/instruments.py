@@ -208,7 +208,7 @@ def measure(
         samples = noise_factor * plan.channels[name].noise * coloured(generator, len(times), correlation)
         for fault in changes.faults:
             if fault.kind == "line" and name in fault.channels:
-                size = float(np.hypot(*fault.numbers[1:3]))
+                size = float(np.hypot(fault.numbers[1], fault.numbers[2]))
                 phase = float(generator.uniform(0.0, 2.0 * np.pi))
                 samples = samples + size * np.cos(2.0 * np.pi * fault.numbers[0] * times + phase)
         record[name] = samples

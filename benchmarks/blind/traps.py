@@ -86,7 +86,8 @@ def scaled(effect: Hidden, factor: float) -> Hidden:
 def _hum(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
     effect = DRAWS["mains_hum"](generator, bench)
     fault = effect.changes.faults[0]
-    size = float(np.hypot(*fault.numbers[1:])) / bench.noise[fault.channels[0]]
+    _frequency, cosine, sine = fault.numbers
+    size = float(np.hypot(cosine, sine)) / bench.noise[fault.channels[0]]
     return (scaled(effect, log_uniform(generator, 0.5, 3.0) / size),)
 
 
@@ -184,7 +185,7 @@ def _outliers(
             return values
         hit = generator.random(len(values)) < 0.01
         size = plan.channels[name].noise * generator.uniform(10.0, 40.0, len(values))
-        return values + hit * size * generator.choice([-1.0, 1.0], len(values))
+        return np.asarray(values + hit * size * generator.choice([-1.0, 1.0], len(values)))
 
     return plan, _on_trials(measured, plan, change)
 

@@ -220,7 +220,7 @@ def _functionals(operators: AffineOperators) -> _Functionals:
         middle_stations=middle,
         middle_holders=tuple(rows([(y, chord) for y in middle]) for chord in CHORDS),
         corner=rows([(corner, 0.9)])[0],
-        lift_stations=places,
+        lift_stations=np.asarray(places, dtype=np.float64),
         lift=lift,
         weight=weight,
         root=root,

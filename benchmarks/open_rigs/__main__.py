@@ -29,7 +29,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.blind_naming import estimates
 from benchmarks.open_rigs.campaigns import drawn, write
-from benchmarks.remainder_naming import scored
+from benchmarks.studies.remainder_naming import scored
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError

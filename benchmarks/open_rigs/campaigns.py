@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ OFFSET = 0.05
 def course_of(rig: Rig, generator: np.random.Generator, size: float) -> Course:
     """Return what drives one trial: tones, from rest where a motion is prescribed, or steps of a pump."""
     slow = 200.0 if rig.drive.endswith("zero_order") else 1.0
-    f = np.exp(generator.uniform(*np.log((0.1, 4.0)), 12)) / slow
+    f = np.exp(generator.uniform(np.log(0.1), np.log(4.0), 12)) / slow
     weight = generator.standard_normal(12) / np.sqrt(1.0 + (f * slow) ** 2)
     turn, w = generator.uniform(0.0, 2.0 * np.pi, 12), 2.0 * np.pi * f
 
@@ -109,13 +109,19 @@ class Bench:
         )[0]
         return float(np.sqrt(np.mean((change - self.taken @ found) ** 2)))
 
-    def sized(self, truth: Truth, key: str, wanted: float, largest: float) -> tuple[Truth, float]:
+    def sized(
+        self, truth: Truth, key: Literal["size", "amount"], wanted: float, largest: float
+    ) -> tuple[Truth, float]:
         """Return a truth whose size or amount makes a change that leaves so much, and how much it leaves."""
-        beside = self.stacked(replace(truth, **{key: 0.0}))
+
+        def with_value(value: float) -> Truth:
+            return replace(truth, size=value) if key == "size" else replace(truth, amount=value)
+
+        beside = self.stacked(with_value(0.0))
         size, found = 0.01, 0.0
         for _ in range(8):
             size = min(size, largest)
-            truth = replace(truth, **{key: size})
+            truth = with_value(size)
             found = self.left(truth, beside)
             if abs(found / wanted - 1.0) < 0.1 or (size == largest and found < wanted):
                 break
@@ -246,7 +252,7 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
         text += entry(
             "channel", name=name, quantity=of, unit=in_unit, output=name, offset_deviation=ZERO * deviation
         )
-    more = {"reference": True} if "[[controller]]" in rig.model else {}
+    more: dict[str, bool | float] = {"reference": True} if "[[controller]]" in rig.model else {}
     more |= {"offset_deviation": offset} if offset else {}
     text += entry("input", name="drive", quantity=quantity, unit=unit, hold=hold, **more)
     folder.mkdir(parents=True)

@@ -241,8 +241,9 @@ def stores(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
 
     def lost(h: float) -> float:
         if truth.law == "overflow":
-            return truth.size * flow * (max(h - truth.shape, 0.0) / (largest - truth.shape)) ** 1.5
-        return truth.size * flow * np.sqrt(max(h, 0.0) / largest) if truth.law == "outflow" else 0.0
+            level = max(h - truth.shape, 0.0) / (largest - truth.shape)
+            return float(truth.size * flow * level**1.5)
+        return truth.size * flow * float(np.sqrt(max(h, 0.0) / largest)) if truth.law == "outflow" else 0.0
 
     def slope(t: float, y: FloatArray) -> list[float]:
         over = upper * y[0] + (lost(y[0]) if truth.at == 0 else 0.0)

@@ -1,11 +1,12 @@
-"""Whether sound data pass: campaigns with nothing wrong, through `check`, the fit and `locate`.
+"""How often campaigns without a fault raise a false alarm; docs/benchmarks.md shows the rate.
 
-`python -m benchmarks.study_nulls --campaigns 200` draws one to three kinds of trials of a shipped rig, their
-rows, stamps (even, jittered, with gaps, on a logger's clock), noise (white or coloured; its deviation known
-from a record, a number or nothing), zeros, gain errors, units and digits, and parameters from the prior.
-Nothing is hidden, so whatever is found is a false alarm. Locating and the fit are asked where noise that is
-coloured has a record. Exit code 1 if more than `FATAL` of the campaigns have a fatal fault, or more than
-`LOCATED` of those with white noise disagree, have discoveries in their map or are not explained.
+`python -m benchmarks.studies.nulls --campaigns 200` draws one to three kinds of trials of a
+shipped rig: their rows, stamps (even, jittered, with gaps, on a logger's clock), noise (white or
+coloured; its deviation known from a record, a number or nothing), zeros, gain errors, units and
+digits, and parameters from the prior. Nothing is hidden, so every finding of `check`, the fit and
+`locate` is a false alarm. Locating and the fit run where coloured noise has a record. The exit
+code is 1 if more than `FATAL` of the campaigns have a fatal fault, or more than `LOCATED` of those
+with white noise disagree, have discoveries in their map or are not explained.
 """
 
 import argparse
@@ -76,6 +77,7 @@ def planned(
     """Return a trial without its readings; in time with so many samples a period."""
     scales = model.scales(Campaign("", {}, (), None, {}, ""))
     rate, size = scales.angular_frequency, scales.length * 10.0 ** generator.uniform(-2.8, -1.6)
+    assert model.load_places is not None, "a shipped rig names the places of its loads"
     given: dict[str, Any] = {"load_place": str(generator.choice(model.load_places))}
     given["start"] = float(generator.uniform(0.0, 5000.0))
     if kind is TrialKind.STATIC:

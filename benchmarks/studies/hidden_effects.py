@@ -1,13 +1,14 @@
-"""Missions with an effect that the twin does not know: found from the run, added to its model, flown again.
+"""Missions with an effect unknown to the twin; docs/discrepancy_missions.md shows the figures.
 
-`python -m benchmarks.study_hidden_effects --seeds 5` flies the scenario growing_damage with each of several
-hidden effects in the FMU of the wing. The run folder alone is then read as a campaign and investigated. What
-is named, or the most probable member of a group, goes into the twin's model, and the mission is flown again
-with the same seed. A drift cannot stand in a table of predicted strains; there the readings are corrected
-before the twin sees them, as with the temperature, which the run records. Printed: the verdict of each
-mission; rms error of the health estimate in points, the share of turns whose 90 % set of states holds the
-truth, and the turns at 3g with z1 truly at or above the limit, before and after; the table compares the
-missions that were flown again.
+`python -m benchmarks.studies.hidden_effects --seeds 5` flies the scenario growing_damage with each
+of several hidden effects in the FMU of the wing. The run folder alone is then read as a campaign
+and investigated. The named effect, or the most probable member of a group, goes into the twin's
+model, and the mission is flown again with the same seed. A drift cannot stand in a table of
+predicted strains; there the readings are corrected before the twin sees them, with the temperature
+that the run recorded. Printed are the verdict of each mission and, before and after: the rms error
+of the health estimate in points, the share of turns whose 90 % set of states holds the truth, and
+the turns at 3g with z1 truly at or above the limit. The table compares the missions that were
+flown again.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.wing_in_air import depends_on_temperature, scenario_in_air
+from benchmarks.studies.wing_in_air import depends_on_temperature, scenario_in_air
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.sources.from_run import run_campaign, run_model

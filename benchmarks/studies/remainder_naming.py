@@ -1,11 +1,13 @@
-"""Names where no hypothesis is exact: `python -m benchmarks.remainder_naming DIR [--count 24] [--seed 1]`.
+"""Verdicts where no hypothesis is exact; docs/benchmarks.md shows their counts.
 
-Campaigns on the lumped rig of the blind test, by its simulator: an effect of the catalogue is hidden, and
-beside it what no hypothesis knows, so that it is 3 to 10 % of what the effect does to the releases (rms, in
-units of the noise): by turns of four campaigns a random force on one of the masses, or a small mass on a
-spring of its own. One campaign in four hides that alone, at two to six times the noise. With `--colour`
-nothing or an effect is hidden in noise of correlation 0.5 whose record has 100 samples. A line for each
-campaign, then the counts; verdicts go to DIR/remainder.json.
+`python -m benchmarks.studies.remainder_naming DIR [--count 24] [--seed 1]` simulates campaigns on
+the lumped rig of the blind test. Each hides an effect of the catalogue and a disturbance that no
+hypothesis knows: in alternate blocks of four campaigns a random force on one of the masses, or a
+small mass on a spring of its own. The disturbance is 3 to 10 % of what the effect does to the
+releases (rms, in units of the noise). One campaign in four hides the disturbance alone, at two to
+six times the noise. With `--colour` nothing or an effect is hidden in noise of correlation 0.5
+whose record has 100 samples. A line is printed for each campaign, then the counts; verdicts go to
+DIR/remainder.json.
 """
 
 import argparse
@@ -202,11 +204,12 @@ def make(out: Path, number: int, seed: int, *, colour: bool) -> dict[str, Any]:
             mass *= min(max(wanted / left, 0.1), 10.0)
     plan = replace(work.plan, noise_samples=100) if colour else work.plan
     measured = measure(generator, plan, signals, changes, correlation=0.5 if colour else 0.0)
+    identifiers = [item.identifier for item in hidden]
     truth = {
-        "identifiers": [item.identifier for item in hidden], "gap": gap, "remainder": left,
+        "identifiers": identifiers, "gap": gap, "remainder": left,
         "mass": mass, "at": at, "frequency": frequency,
     }  # fmt: skip
-    order = Order(f"case-{number:04d}", "catalogue", "lumped", tuple(truth["identifiers"]), seed)
+    order = Order(f"case-{number:04d}", "catalogue", "lumped", tuple(identifiers), seed)
     write_case(Case(order, plan, measured, truth), out / "campaigns", out / "sealed")
     return truth
 

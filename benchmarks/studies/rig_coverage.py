@@ -1,10 +1,10 @@
-"""Whether the intervals of a lumped rig's calibration hold the truth: virtual rigs, measured and calibrated.
+"""How often the intervals of a rig's calibration hold the truth; docs/calibration.md shows it.
 
-`python -m benchmarks.study_rig_coverage --rigs 200` draws chains of one to four masses whose springs, damping
-and last mass are parameters, draws their true values from the prior, measures a load test and a forced motion
-with noise (its deviation known from twelve degrees of freedom), free zeros and gain errors of 1 %, calibrates
-the campaign, and asks how often 90 % intervals hold the truth.
-Exit code 1 if the share of springs, damping or masses lies outside 85 to 95 %.
+`python -m benchmarks.studies.rig_coverage --rigs 200` draws chains of one to four masses whose
+springs, damping and last mass are parameters, draws their true values from the prior, measures a
+load test and a forced motion with noise (its deviation known from twelve degrees of freedom), free
+zeros and gain errors of 1 %, calibrates the campaign, and counts how often 90 % intervals hold the
+truth. The exit code is 1 if the coverage of springs, damping or masses lies outside 85 to 95 %.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.study_coverage import PROBABILITY, TARGET
+from benchmarks.studies.coverage import PROBABILITY, TARGET
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.model_choice import ModelChoice, ModelKind
@@ -66,7 +66,7 @@ def measured(model: LumpedModel, truth: np.ndarray, generator: np.random.Generat
     outputs = tuple(model.quantities.items())
     names = tuple(model.quantities)
     interval = 0.3 / model.scales(Campaign("", {}, (), None, {}, "")).angular_frequency
-    time = interval * np.arange(800)
+    time = interval * np.arange(800, dtype=np.float64)
     force = np.convolve(generator.standard_normal(len(time)), np.hanning(9), "same")
     steps = np.linspace(-50.0, 50.0, 9)
     trials = (
@@ -128,10 +128,10 @@ def main() -> int:
     good = refused <= 0.1 * given.rigs
     for kind, items in held.items():
         share, count = float(np.mean(items)), len(items)
-        error = np.sqrt(PROBABILITY * (1.0 - PROBABILITY) / count)
+        standard_error = np.sqrt(PROBABILITY * (1.0 - PROBABILITY) / count)
         good &= TARGET[0] <= share <= TARGET[1]
         left = f"{np.median(narrowed[kind]):.2f}"
-        shown.add_row(kind, str(count), f"{share:.1%}", f"{error:.1%}", left)
+        shown.add_row(kind, str(count), f"{share:.1%}", f"{standard_error:.1%}", left)
     Console().print(shown)
     return 0 if good else 1
 

@@ -1,8 +1,9 @@
-"""Plans on the belief against an independent solver, on public problems and on the inspected wing.
+"""Bounds of plans on the belief beside an independent solver; docs/planning.md shows the wing's.
 
-`python -m benchmarks.study_planning` prints both bounds of the return from the prior, and the seconds taken.
-With `--storm` the bounds of Storm's belief exploration (Bork, Katoen and Quatmann 2022; `stormpy` of PyPI)
-stand beside them: it unfolds the beliefs for a lower bound, and puts them on a grid for an upper one.
+`python -m benchmarks.studies.planning` plans public problems and the inspected wing, and prints
+both bounds of the return from the prior, and the seconds. `--storm` adds the bounds of Storm's
+belief exploration (Bork, Katoen and Quatmann 2022; `stormpy` of PyPI), which unfolds the beliefs
+for a lower bound, and puts them on a grid for an upper one.
 """
 
 import argparse
@@ -95,15 +96,14 @@ def wing() -> DecisionProblem:
     from fe.reduction.model_cache import reduced_model
     from fe.wing.design import load_design
     from twin_master.assets.reduced_model import ReducedModelSource
-    from twin_master.mission.planning import decision_problem
     from twin_master.mission.preparation import prepare_knowledge
     from twin_master.scenario.reading import load_scenario
 
     scenario = load_scenario("inspected_wing").scenario
     planner = scenario.planner.model_copy(update={"policy": "mode"})
     source = ReducedModelSource(scenario, reduced_model(load_design()))
-    known = prepare_knowledge(scenario.model_copy(update={"planner": planner}), source, scenario.mission.seed)
-    return decision_problem(scenario, known.model, known.sensor_model, known.rewards)
+    by_mode = scenario.model_copy(update={"planner": planner})
+    return prepare_knowledge(by_mode, source, scenario.mission.seed).problem
 
 
 PROBLEMS: dict[str, Callable[[], DecisionProblem]] = {

@@ -1,7 +1,9 @@
-"""Kill a run at random moments, resume it, and compare it with an uninterrupted one, byte for byte.
+"""A killed and resumed run has the files of an uninterrupted one; docs/benchmarks.md shows it.
 
-`python -m benchmarks.kill_and_resume --trials 20` flies the shipped mission; further options after `--` go to
-`python -m twin_master`, for example `-- --strain-library FOLDER`. Exit code 1 if any trial differs.
+`python -m benchmarks.studies.kill_and_resume --trials 20` flies the shipped mission, kills it at
+random moments, resumes it, and compares every file byte for byte. Further options after `--` go to
+`python -m twin_master`, for example `-- --strain-library FOLDER`. The exit code is 1 if any trial
+differs.
 """
 
 import argparse

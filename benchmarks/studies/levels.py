@@ -1,12 +1,13 @@
-"""Whether beliefs hold a truth that lies between the levels of their states.
+"""How well beliefs hold a truth between the levels of their states; docs/scenarios.md shows it.
 
-`python -m benchmarks.study_levels --missions 300` flies the wing, the bracket and the stiffened panel with
-damage that grows between levels, at the mean rate of the twin: a little in every turn ("creeps"), or in the
-turns in which the twin's damage grows, by anything up to two levels ("jumps"). The noise is what the twin
-assumes. A twin whose states stand for intervals (`observation.between_levels`) stands beside one whose truth
-is at the levels: how often 90 % sets hold the level nearest to the truth, how many states they have, the
-error, and in how many of the first `--watched` missions notices raise an alarm though nothing is wrong.
-Exit code 1 if a share of the former lies outside 85 to 95 %.
+`python -m benchmarks.studies.levels --missions 300` flies the wing, the bracket and the stiffened
+panel with damage that grows between levels, at the mean rate of the twin: a little in every turn
+("creeps"), or in the turns in which the twin's damage grows, by anything up to two levels
+("jumps"). The noise is what the twin assumes. A twin whose states stand for intervals
+(`observation.between_levels`) is compared with one whose states stand for the levels themselves:
+how often 90 % sets hold the level nearest to the truth, how many states they have, the rms error,
+and in how many of the first `--watched` missions notices raise an alarm though nothing is wrong.
+The exit code is 1 if the coverage of the former lies outside 85 to 95 %.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from benchmarks.study_level_turns import show
+from benchmarks.studies.level_turns import show
 from reporting.progress import SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.parameter import ParameterDraws

@@ -1,10 +1,12 @@
-"""What fleets learn: coverage of intervals, what groups gain from each other, what flying with it is worth.
+"""What a fleet learns about its probabilities to worsen; docs/fleets.md shows the figures.
 
-    python -m benchmarks.study_fleets coverage --fleets 200
-    python -m benchmarks.study_fleets groups --fleets 40
-    python -m benchmarks.study_fleets half --twins 1000
+    python -m benchmarks.studies.fleets coverage --fleets 200
+    python -m benchmarks.studies.fleets groups --fleets 40
+    python -m benchmarks.studies.fleets half --twins 1000
 
-Everything flies the reduced model in this process; each part prints its table.
+`coverage`: how often 95 % intervals hold the truth. `groups`: what groups gain from each other.
+`half`: what flying with the learnt probabilities is worth. Every mission flies the reduced model
+in this process; each part prints its table.
 """
 
 import argparse
@@ -59,10 +61,11 @@ def learnt(known: Knowledge, flown: Flights) -> Grid:
     worsening = Worsening.of(known.scenario)
     likelihood, _ = scaled_likelihood(known.sensor_model, flown.row, flown.control_index)
 
-    def of(points: Float) -> Float:
-        return transition_evidence(worsening, points, likelihood, flown.control_index).sum(axis=0)
+    def log_likelihood(points: Float) -> Float:
+        evidence = transition_evidence(worsening, points, likelihood, flown.control_index)
+        return np.asarray(evidence.sum(axis=0))
 
-    return refined(of, len(worsening.names))
+    return refined(log_likelihood, len(worsening.names))
 
 
 def coverage(fleets: int, twins: int) -> None:
@@ -100,15 +103,17 @@ def groups(fleets: int, twins: int) -> None:
             known = knowledge(dict(zip(ASSUMED, true.tolist(), strict=True)), ASSUMED, fixed=True)
             grids.append(learnt(known, flights(known, 10_000 * fleet + 100 * group, twins)))
             rates.append(true)
-        for what, found in (("alone", [grid.marginals for grid in grids]), ("shared", shared(grids)[1])):
+        marginals_of = {"alone": [grid.marginals for grid in grids], "shared": shared(grids)[1]}
+        for what, found in marginals_of.items():
             for true, marginals in zip(rates, found, strict=True):
                 for rate, marginal in zip(true.tolist(), marginals, strict=True):
                     low, high = marginal.interval()
                     errors[what].append(marginal.mean - rate)
                     inside[what].append(low <= rate <= high)
-    for what, found in errors.items():
-        rms, share = float(np.sqrt(np.mean(np.square(found)))), float(np.mean(inside[what]))
-        print(f"| {what} | {rms:.4f} | {100 * share:.1f} ± {error(share, len(found)):.1f} % |")
+    for what, deviations in errors.items():
+        rms = float(np.sqrt(np.mean(np.square(deviations))))
+        share = float(np.mean(inside[what]))
+        print(f"| {what} | {rms:.4f} | {100 * share:.1f} ± {error(share, len(deviations)):.1f} % |")
 
 
 def half(twins: int) -> None:

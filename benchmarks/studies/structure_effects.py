@@ -1,10 +1,11 @@
-"""Effects hidden in campaigns on the shipped bracket, made by its full finite element model.
+"""Verdicts on effects hidden in the shipped bracket; docs/structures.md shows them.
 
-`python -m benchmarks.study_structure_effects` loads the bracket at its end in four cycles of load levels, or
-with `--ringdown` lets its end go from four deflections. The readings are those of the full model (981
-unknowns), with noise of gauges and of a displacement, and an effect that nobody tells. The search knows the
-FMU of the reduced structure by the file that `uav-twin structure fmu --rig` writes. Young's modulus is off.
-Printed: the verdict on each campaign, and its time.
+`python -m benchmarks.studies.structure_effects` loads the bracket at its end in four cycles of
+load levels, or with `--ringdown` releases its end from four deflections. The readings come from
+the full finite element model (981 unknowns), with noise of gauges and of a displacement, and one
+hidden effect. The search uses the FMU of the reduced structure by the file that
+`uav-twin structure fmu --rig` writes; its Young's modulus is off. The verdict on each campaign and
+its time are printed.
 """
 
 import argparse
@@ -140,11 +141,13 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     }
     trials = []
     levels = np.concatenate([LEVELS, -LEVELS, LEVELS[:4]])
-    minutes = 60.0 * np.arange(1, len(levels) + 1)
+    minutes = 60.0 * np.arange(1, len(levels) + 1, dtype=np.float64)
     for number, sign in enumerate((1.0, -1.0, 1.0, -1.0)):
         time, force, start, release = 1100.0 * number + minutes, sign * levels, 0.0, None
         if ringdown:
-            time, force, start = INTERVAL * np.arange(SAMPLES), np.zeros(SAMPLES), 1100.0 * number
+            time = INTERVAL * np.arange(SAMPLES, dtype=np.float64)
+            force = np.zeros(SAMPLES)
+            start = 1100.0 * number
             release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()

@@ -1,10 +1,11 @@
-"""What teaching in flight is worth: missions with an effect that only the wing has, watched with `--teach`.
+"""What teaching in flight is worth; docs/watch.md shows the figures.
 
-`python -m benchmarks.study_teaching` flies level_turns with each of several hidden effects in the FMU, and
-watches the recorded strains three times: by a twin that is never taught, by one that is (`uav-twin watch
---teach`: alarm, search, trial, adoption), and by one that knew the effect. Printed: alarm, verdicts,
-adoption, the rms error of z1 and z2 in points behind the adoption (without one, from turn 30 on), and there
-the decisions for 3g with z1 truly at or above the limit; the wing with nothing hidden is the healthy twin's.
+`python -m benchmarks.studies.teaching` flies level_turns with each of several hidden effects in
+the FMU, and watches the recorded strains three times: by a twin that is never taught, by one that
+is (`uav-twin watch --teach`: alarm, search, trial, adoption), and by one that knew the effect from
+the start. Printed are the alarm, the verdicts, the adoption, the rms error of z1 and z2 in points
+after the adoption (without one, from turn 30 on), and the decisions for 3g there with z1 truly at
+or above the limit. The wing with nothing hidden shows what the healthy twin does.
 """
 
 import argparse
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import uav_twin
-from benchmarks.study_hidden_effects import beyond_the_limit, fly_mission, patch_text
+from benchmarks.studies.hidden_effects import beyond_the_limit, fly_mission, patch_text
 from fe.runtime.patch import (
     LocalStiffnessLoss,
     PointMass,
@@ -115,7 +116,7 @@ def study(name: str, seed: int, work: Path) -> None:
     place = work / f"{[*HIDDEN].index(name)}_{seed}"
     place.mkdir()
     fly_mission(place / "run", seed, hidden, scenario="level_turns", turns=TURNS)
-    truth = uav_twin.open_run(place / "run")["truth"]["state"].values
+    truth = np.asarray(uav_twin.open_run(place / "run")["truth/state"].values)
     plain = scenario_of(place, ())
     taught = watched(place / "run", place / "taught", plain, teach=True)
     known = hidden

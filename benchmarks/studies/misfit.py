@@ -1,7 +1,4 @@
-"""By how much the model that the twin believes differs from the asset that flies.
-
-A `Misfit` says what the difference does to an estimate.
-"""
+"""Misfit between the model of a twin and the asset that flies, for the study `level_turns`."""
 
 from dataclasses import dataclass
 

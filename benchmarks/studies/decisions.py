@@ -1,9 +1,10 @@
-"""What belief and decision are worth while something is wrong: with notices and without.
+"""What notices are worth to belief and decisions under a fault; docs/notices.md shows it.
 
-`python -m benchmarks.study_decisions --flights 300` flies the mission of level_turns with a wing whose gauges
-or skin are not as the model says, under many seeds, by the twin of the scenario and by the plain filter
-(`notice = false`). Printed for each: rms error of z1 and z2 from the turn of the fault on, turns flown at 3g
-with z1 truly at or above the limit, and turns at 2g below it, which were needless.
+`python -m benchmarks.studies.decisions --flights 300` flies the mission of level_turns with a wing
+whose gauges or skin are not as the model says. Each seed is flown twice: by the twin of the
+scenario, and by the plain filter (`notice = false`). The table shows for each fault the rms error
+of z1 and z2 from the turn of the fault on, the turns flown at 3g with z1 truly at or above the
+limit, and the turns at 2g below the limit, which were needless.
 """
 
 import argparse
@@ -13,8 +14,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.study_hidden_effects import LIMIT, beyond_the_limit
-from benchmarks.study_learning import SOFTENING, spoiled, third_region
+from benchmarks.studies.hidden_effects import LIMIT, beyond_the_limit
+from benchmarks.studies.learning import SOFTENING, spoiled, third_region
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
 from twin_master.assets.reduced_model import ReducedModelSource

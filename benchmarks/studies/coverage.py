@@ -1,11 +1,12 @@
-"""Whether the intervals of the calibration hold the truth: virtual wings, measured and calibrated.
+"""How often the intervals of a wing's calibration hold the truth; docs/calibration.md shows it.
 
-`python -m benchmarks.study_coverage --wings 200` draws wings from the prior of the calibration, does the
-experiments on each (load test, weighing, five ring-down records with noise), fits the records, and asks how
-often 90 % intervals hold the truth: those of the joint posterior, and those of the paper's procedure on the
-same measurements. The wings' frequencies differ from the model's by draws of the assumed model error, so that
-the intervals are right if the calibration is; `--exact-model` leaves these differences out.
-Exit code 1 if a share of the joint posterior lies outside 85 to 95 %.
+`python -m benchmarks.studies.coverage --wings 200` draws wings from the prior of the calibration,
+simulates the experiments on each (load test, weighing, five ring-down records with noise), fits
+the records, and counts how often 90 % intervals hold the truth: those of the joint posterior, and
+those of the paper's procedure on the same measurements. The frequencies of a wing differ from the
+model's by a draw of the assumed model error, so the intervals are right if the calibration is;
+`--exact-model` leaves these differences out. The exit code is 1 if the coverage of the joint
+posterior lies outside 85 to 95 %.
 """
 
 import argparse

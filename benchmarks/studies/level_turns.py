@@ -1,12 +1,12 @@
-"""How reliably the twin steers: the paper's mission under many seeds.
+"""How reliably the twin steers the paper's mission; docs/benchmarks.md shows the figures.
 
-`python -m benchmarks.study_level_turns --missions 300` flies the reduced model of the shipped wing;
-`--strain-library FOLDER` flies the authors' library instead, `--fmu` the FMU in a worker process. The true
-Young's modulus factor is the mean of the calibration; `--draw-factor` gives every mission a wing of its own,
-with one of the twin's draws.
-`--combinations --strain-library FOLDER` flies all four combinations of asset and twin's model, without and
-with a model error in the assumed noise, and says what the misfit of the models does; `--markdown` prints the
-tables for a page. Exit code 1 if a target is missed.
+`python -m benchmarks.studies.level_turns --missions 300` flies the reduced model of the shipped
+wing under many seeds; `--strain-library FOLDER` flies the authors' library instead, `--fmu` the
+FMU in a worker process. The true Young's modulus factor is the mean of the calibration;
+`--draw-factor` gives every mission a wing of its own, with one of the twin's draws.
+`--combinations --strain-library FOLDER` flies all four combinations of asset and twin's model,
+without and with a model error in the assumed noise, and prints what the misfit of the models does;
+`--markdown` prints the tables for a page. The exit code is 1 if a target is missed.
 """
 
 import argparse
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.misfit import Misfit, find_misfit
-from benchmarks.seeds import fly_seeds, outcomes
+from benchmarks.studies.misfit import Misfit, find_misfit
+from benchmarks.studies.seeds import fly_seeds, outcomes
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import RichProgress
 from twin_master.assets.asset_source import AssetSource, PairedSource

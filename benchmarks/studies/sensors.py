@@ -1,9 +1,9 @@
-"""Eight gauges of 24, chosen by what they tell, by pivoted QR, and at random: flown, and compared.
+"""Eight gauges of 24, chosen by information, by pivoted QR and at random; docs/planning.md.
 
-`python -m benchmarks.study_sensors --missions 300` flies `growing_damage` with eight of the wing's gauges,
-and the others lost from the first turn on. Printed for each choice: rms error of z1 and z2 [points], and the
-share of missions that leave the sharp turn before the damage asks for it. Pivoted QR of what all gauges show
-in all states is how PySensors places sensors.
+`python -m benchmarks.studies.sensors --missions 300` flies `growing_damage` with eight of the
+wing's gauges; the others are lost from the first turn on. The table shows for each choice the rms
+error of z1 and z2 in points, and the share of missions that leave the sharp turn before the damage
+asks for it. Pivoted QR of the readings in all states is how PySensors places sensors.
 """
 
 import argparse
