@@ -1,11 +1,12 @@
 """Laws of the internal forces that are hidden in a structure, and the motion under them.
 
-A port is a place where a force -F acts against the port's own motion x. The structure is given by its lowest
-modes and, for each port, by the flexibility of all higher modes, which move without inertia but with the
-Rayleigh damping of the stiffness: beta d' + d = -F, x = b . q + R d. The motion is integrated by the
-classical Runge-Kutta method with a small fixed step; hysteresis is the exact play operator within a step.
-Dry friction sticks: through the flexibility behind the port where it has one (the force that holds the port
-still follows from the equation above), and by a constraint, entered and left at events, where it has none.
+A port is a place where a force -F acts against the port's own motion x. The structure is given by
+its lowest modes and, for each port, by the flexibility of all higher modes, which move without
+inertia but with the Rayleigh damping of the stiffness: beta d' + d = -F, x = b . q + R d. The
+motion is integrated by the classical Runge-Kutta method with a small fixed step; hysteresis is the
+exact play operator within a step. Dry friction sticks: through the flexibility behind the port
+where it has one (the force that holds the port still follows from the equation above), and by a
+constraint, entered and left at events, where it has none.
 """
 
 from dataclasses import dataclass, field
@@ -22,9 +23,9 @@ IntArray = NDArray[np.int64]
 NO_FORCE, FRICTION, DRAG, POWER, GAP, JENKINS, BOUC_WEN, VISCOUS = range(8)
 """Kinds of law, and their numbers:
 
-friction (F0, a): F0 |x|^a sgn v; drag (c): c |v| v; power (k, n, side): k |x|^n sgn x on one or both sides;
-gap (k, half width): -k clip(x, -h, h); Jenkins elements (stiffness K): hysteresis less K x; Bouc-Wen
-(k, yield displacement, order): k (z - x); viscous (c): c v.
+friction (F0, a): F0 |x|^a sgn v; drag (c): c |v| v; power (k, n, side): k |x|^n sgn x on one or
+both sides; gap (k, half width): -k clip(x, -h, h); Jenkins elements (stiffness K): hysteresis less
+K x; Bouc-Wen (k, yield displacement, order): k (z - x); viscous (c): c v.
 """
 
 
@@ -57,7 +58,7 @@ class Law:
 
     @property
     def needs_flexibility(self) -> bool:
-        """Whether the flexibility of the higher modes behind the port counts (drag: of no account)."""
+        """Whether the law acts through the flexibility of the higher modes at the port."""
         return self.kind not in (DRAG, VISCOUS)
 
 
@@ -251,7 +252,9 @@ def _modal_velocity(state: FloatArray, structure: ModalStructure, port: int) -> 
 
 
 @compiled
-def _port_velocity(state: FloatArray, rate: FloatArray, structure: ModalStructure, port: int) -> float:
+def _port_velocity(
+    state: FloatArray, rate: FloatArray, structure: ModalStructure, port: int
+) -> float:
     """Return the velocity b . q' + R d' of a port, with the d' that stands in `rate`."""
     ports, modes = structure.ports.shape
     v = _modal_velocity(state, structure, port)
@@ -294,7 +297,9 @@ def _force_without_friction(
 
 
 @compiled
-def _friction_limit(state: FloatArray, structure: ModalStructure, laws: LawArrays, port: int) -> float:
+def _friction_limit(
+    state: FloatArray, structure: ModalStructure, laws: LawArrays, port: int
+) -> float:
     """Return the largest friction force F0 |x|^a of a port."""
     x = _port_displacement(state, structure, port)
     return laws.numbers[port, 0] * abs(x) ** laws.numbers[port, 1]
@@ -339,7 +344,7 @@ def _fill_rates(
     rate: FloatArray,
     force: FloatArray,
 ) -> None:
-    """Write the time derivative of a state (q, q', d, z) to `rate`, and the forces (P,) to `force`."""
+    """Write the time derivative of a state (q, q', d, z) to `rate`, the port forces to `force`."""
     ports, modes = structure.ports.shape
 
     # Forces that follow from the state
@@ -408,7 +413,7 @@ def _decide_sliding(
     force: FloatArray,
     port: int,
 ) -> None:
-    """Decide whether a port at rest, with friction and no flexibility, sticks or which way it slides."""
+    """Decide whether a port at rest with rigid friction sticks, or in which direction it slides."""
     scratch = np.empty(len(state))
     history.sliding[port] = 0
     _fill_rates(state, time, structure, laws, history, scratch, force)
@@ -417,7 +422,9 @@ def _decide_sliding(
 
 
 @compiled
-def _fill_port_displacements(state: FloatArray, structure: ModalStructure, displacement: FloatArray) -> None:
+def _fill_port_displacements(
+    state: FloatArray, structure: ModalStructure, displacement: FloatArray
+) -> None:
     """Write the displacement of each port (P,) to `displacement`."""
     for port in range(structure.ports.shape[0]):
         displacement[port] = _port_displacement(state, structure, port)
@@ -470,7 +477,9 @@ def _stop_port(state: FloatArray, structure: ModalStructure, port: int) -> None:
 
 
 @compiled
-def _advance_play(state: FloatArray, structure: ModalStructure, laws: LawArrays, history: History) -> None:
+def _advance_play(
+    state: FloatArray, structure: ModalStructure, laws: LawArrays, history: History
+) -> None:
     """Advance the deflections of the Jenkins elements to a new state; each slips at its limit."""
     for j in range(len(laws.kinds)):
         if laws.kinds[j] == JENKINS:

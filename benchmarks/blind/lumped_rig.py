@@ -1,4 +1,4 @@
-"""A rig of three masses on a joint: its nominal model for the file, and the rig with something hidden."""
+"""A rig of three masses on a joint: its nominal model file, and its true response."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -50,15 +50,30 @@ def model_text() -> str:
 
     lines = ["format = 1", 'name = "Three masses on a joint"']
     lines += [f"mass = {row(np.diag(MASS))}"]
-    lines += ["stiffness = [" + ", ".join(row(line) for line in _stiffness()) + "]", "", "[damping]"]
+    lines += [
+        "stiffness = [" + ", ".join(row(line) for line in _stiffness()) + "]",
+        "",
+        "[damping]",
+    ]
     lines += [f"alpha = {ALPHA}", f"beta = {BETA}"]
     lines += ["", "[[input]]", 'name = "end"', f"vector = {row(PORTS['end'])}"]
     for name, (quantity, vector) in OUTPUTS.items():
-        lines += ["", "[[output]]", f'name = "{name}"', f'quantity = "{quantity}"', f"vector = {row(vector)}"]
+        lines += [
+            "",
+            "[[output]]",
+            f'name = "{name}"',
+            f'quantity = "{quantity}"',
+            f"vector = {row(vector)}",
+        ]
     for name, vector in PORTS.items():
         lines += ["", "[[port]]", f'name = "{name}"', f"vector = {row(vector)}"]
     for name, (mean, deviation) in PRIORS.items():
-        lines += ["", "[[parameter]]", f'name = "{name}"', f'terms = "{name.removesuffix("_factor")}"']
+        lines += [
+            "",
+            "[[parameter]]",
+            f'name = "{name}"',
+            f'terms = "{name.removesuffix("_factor")}"',
+        ]
         lines += [f"mean = {mean}", f"deviation = {deviation}", "low = 0.5", "high = 2.0"]
     return "\n".join(lines) + "\n"
 

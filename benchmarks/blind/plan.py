@@ -153,5 +153,7 @@ class CampaignPlan:
     @property
     def dynamic_channels(self) -> tuple[str, ...]:
         """Channels of the ring-downs."""
-        names = [name for trial in self.trials if trial.kind == "ringdown" for name in trial.channels]
+        names = [
+            name for trial in self.trials if trial.kind == "ringdown" for name in trial.channels
+        ]
         return tuple(dict.fromkeys(names))

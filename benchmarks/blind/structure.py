@@ -1,4 +1,4 @@
-"""A linear structure with ports, and what it does with hidden forces in it: at rest, and after a release."""
+"""A linear structure with hidden forces at ports: its static and its free response."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from benchmarks.blind.laws import (
 FloatArray = NDArray[np.float64]
 
 STEP = 4e-4
-"""Largest time step [s] of the integration; a quarter of it changes no reading by more than 0.04 noises."""
+"""Largest time step [s]; a quarter of it changes readings by less than 0.04 standard deviations."""
 LOAD_STEPS = 32
 """Increments between two load levels on the path of a static trial."""
 
@@ -36,7 +36,9 @@ NEWTON_ITERATIONS = 60
 
 
 @compiled
-def _bouc_wen_after(laws: LawArrays, port: int, displacement: float, start: float, bouc_wen: float) -> float:
+def _bouc_wen_after(
+    laws: LawArrays, port: int, displacement: float, start: float, bouc_wen: float
+) -> float:
     """Return the Bouc-Wen variable of a port after a motion, by the midpoint rule."""
     increment = displacement - start
     sign = np.sign(increment)
@@ -55,7 +57,7 @@ def _path_force(
     play: FloatArray,
     bouc_wen: float,
 ) -> float:
-    """Return the force of a port after a motion from `start`, where the history was the given one."""
+    """Return the force of a port after a motion from `start`, where its history was known."""
     if laws.kinds[port] == BOUC_WEN:
         after = _bouc_wen_after(laws, port, displacement, start, bouc_wen)
         return elastic_force(laws, port, displacement, start, play, after)
@@ -124,7 +126,7 @@ def _advance_hysteresis(
     play: FloatArray,
     bouc_wen: FloatArray,
 ) -> None:
-    """Advance the deflections of Jenkins elements and the Bouc-Wen variables from `start` to `x`."""
+    """Advance Jenkins elements and Bouc-Wen variables in place for a motion from `start` to `x`."""
     for j in range(len(x)):
         if laws.kinds[j] == BOUC_WEN:
             bouc_wen[j] = _bouc_wen_after(laws, j, x[j], start[j], bouc_wen[j])
@@ -177,7 +179,9 @@ def _static_path(
             target = previous + (linear[row] - previous) * (increment / increments)
             difference = 1e-6 * (np.abs(target).max() + 1e-9)
             start = x
-            x, residual = _solve_increment(start, target, flexibility, laws, play, bouc_wen, difference)
+            x, residual = _solve_increment(
+                start, target, flexibility, laws, play, bouc_wen, difference
+            )
             tangent = _tangent(x, start, flexibility, laws, play, bouc_wen, difference)
             if residual > accepted_residual or np.linalg.det(tangent) <= 0.0:
                 return forces
@@ -301,8 +305,8 @@ class Structure:
         loads : (r, n)
             Loads.
         laws : sequence of Law
-            Forces inside; those that need motion do nothing here: readings are taken when all is at rest,
-            and after a knock on the structure, which frees dry friction.
+            Forces inside; those that need motion do nothing here: readings are taken when all is at
+            rest, and after a knock on the structure, which frees dry friction.
         """
         linear = self.solve(loads)
         elastic = [law for law in laws if law.is_elastic]
@@ -355,7 +359,9 @@ class Structure:
         )[0]
         return HeldState((target + float(coupling @ forces)) / unit, forces, play, bouc_wen)
 
-    def ringdown(self, release: Release, laws: Sequence[Law] = (), refinement: int = 1) -> FloatArray:
+    def ringdown(
+        self, release: Release, laws: Sequence[Law] = (), refinement: int = 1
+    ) -> FloatArray:
         """Return the outputs (n, C) after a release, at `release.times`."""
         return self.fine_ringdown(release, laws, 1, refinement)[0]
 
@@ -400,7 +406,9 @@ class Structure:
         modes = len(w2)
         pull = np.append(-held.forces, held.holding_force)
         modal_deflection = (shapes.T @ (ports.T @ pull)) / w2
-        state = np.concatenate([modal_deflection, np.zeros(modes), pull, np.append(held.bouc_wen, 0.0)])
+        state = np.concatenate(
+            [modal_deflection, np.zeros(modes), pull, np.append(held.bouc_wen, 0.0)]
+        )
 
         # Motion
         times = release.times

@@ -1,4 +1,4 @@
-"""The campaign on the wing of the blind test: its channels, and its trials in laboratory and flight."""
+"""The campaign on the wing of the blind test: channels, and trials in laboratory and flight."""
 
 from dataclasses import replace
 
@@ -27,7 +27,11 @@ PRIORS = {
     "damping_beta": (7.31e-4, 0.03 * 7.31e-4),
 }
 """Posterior of the twin's calibration."""
-PLACES: dict[str, str | tuple[float, float]] = {"tip": "tip_load", "middle": MIDDLE, "corner": (1.778, 0.9)}
+PLACES: dict[str, str | tuple[float, float]] = {
+    "tip": "tip_load",
+    "middle": MIDDLE,
+    "corner": (1.778, 0.9),
+}
 NIGHT = 12.0 * 3600.0
 """Time between the laboratory and the first flight [s]."""
 LOAD_PLACES = {"A": "tip", "B": "middle", "C": "corner"}
@@ -54,7 +58,11 @@ def _channels(design: WingDesign) -> dict[str, ChannelPlan]:
     span = design.planform.semi_span
     tip_load = design.tip_load
     displacements = {
-        "load_point": ("load_point_displacement", span - tip_load.distance_from_tip, tip_load.chord),
+        "load_point": (
+            "load_point_displacement",
+            span - tip_load.distance_from_tip,
+            tip_load.chord,
+        ),
         "tip": ("tip_displacement", span, tip_load.chord),
         "middle": (f"displacement[{MIDDLE[0]}, {MIDDLE[1]}]", *MIDDLE),
     }
@@ -135,7 +143,8 @@ def wing_campaign(design: WingDesign) -> CampaignPlan:
     ]
     warm_release = replace(releases[2], name="release 40 mm warm", release=0.04, temperature=WARMER)
     flights = [
-        TrialPlan(f"flight {repeat}", "flight", "F", gauges, np.array([1.0, 2.0, 3.0])) for repeat in (1, 2)
+        TrialPlan(f"flight {repeat}", "flight", "F", gauges, np.array([1.0, 2.0, 3.0]))
+        for repeat in (1, 2)
     ]
     trials = [*load_tests, *releases, *warm_load_tests, warm_release, *flights]
     return CampaignPlan(

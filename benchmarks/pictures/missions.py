@@ -34,7 +34,9 @@ VIEWED_TURN = 28
 def served_view(run_folder: Path) -> Iterator[str]:
     """Run `uav-twin view` on a run folder, give the address of its page, and end it."""
     command = [sys.executable, "-m", "uav_twin", "view", str(run_folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, stderr=subprocess.DEVNULL
+    ) as process:
         assert process.stdout is not None
         try:
             line = process.stdout.readline()

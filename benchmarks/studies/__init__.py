@@ -1,1 +1,1 @@
-"""Studies behind published figures; the first line of each names the page under docs/ that shows them."""
+"""Studies behind published figures; each names the page under docs/ in its first line."""

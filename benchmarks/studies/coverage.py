@@ -42,7 +42,8 @@ NOISE = 3e-4  # V, 3 % of the first mode
 PAPER_SAMPLES = 40
 ALLOWED_REFUSALS = 0.1
 
-# Wings whose second mode is seen in a record: weak as the default prior is, it has wings without damping and
+# Wings whose second mode is seen in a record: weak as the default prior is, it has wings without
+# damping and
 # wings that do not ring. Everything else is the default.
 DAMPING = {"damping_alpha": (1.0, 0.3), "damping_beta": (6e-4, 1.5e-4)}
 
@@ -56,13 +57,19 @@ class Wing:
     readings: tuple[Reading, ...]
 
 
-def measure(model: ReducedModel, seed: int, model_error: tuple[float, float], *, free: bool) -> Wing:
+def measure(
+    model: ReducedModel, seed: int, model_error: tuple[float, float], *, free: bool
+) -> Wing:
     generator = np.random.default_rng([2021, seed])
-    truth = prior_samples(wing_priors(model.validity, **DAMPING), 1, int(generator.integers(2**32)))[0]
+    truth = prior_samples(
+        wing_priors(model.validity, **DAMPING), 1, int(generator.integers(2**32))
+    )[0]
     state = DigitalState(Geometry(), *truth.tolist())
     first, second = (np.array(model_error) * generator.standard_normal(2)).tolist()
     bench = VirtualWing(model, state, (first, second))
-    records = measure_ring_down(bench, seed, sampling_rate=SAMPLING_RATE, duration=DURATION, noise=NOISE)
+    records = measure_ring_down(
+        bench, seed, sampling_rate=SAMPLING_RATE, duration=DURATION, noise=NOISE
+    )
     return Wing(
         truth,
         measure_load_test(bench, seed),
@@ -84,21 +91,28 @@ def main() -> int:
     parser.add_argument("--wings", type=int, default=200)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--exact-model", action="store_true", help="wings without model error")
-    parser.add_argument("--trusting", action="store_true", help="the calibration assumes no model error")
-    parser.add_argument("--peaks", action="store_true", help="frequencies from the spectrum, as the paper")
-    given = parser.parse_args()
+    parser.add_argument(
+        "--trusting", action="store_true", help="the calibration assumes no model error"
+    )
+    parser.add_argument(
+        "--peaks", action="store_true", help="frequencies from the spectrum, as the paper"
+    )
+    arguments = parser.parse_args()
     model = reduced_model(progress=RichProgress())
     table = tabulate_wing(model)
     priors = wing_priors(model.validity, **DAMPING)
-    of_wings = (0.0, 0.0) if given.exact_model else MODEL_ERROR
-    assumed = (0.0, 0.0) if given.trusting else MODEL_ERROR
-    held, held_paper, widths, ratios = [], [], [], []
+    of_wings = (0.0, 0.0) if arguments.exact_model else MODEL_ERROR
+    assumed = (0.0, 0.0) if arguments.trusting else MODEL_ERROR
+    held = []
+    held_paper = []
+    widths = []
+    ratios = []
     not_seen = refused = refused_paper = 0
     seconds = dict.fromkeys(("measuring and fitting", "joint posterior", "paper's procedure"), 0.0)
-    for seed in range(given.first_seed, given.first_seed + given.wings):
+    for seed in range(arguments.first_seed, arguments.first_seed + arguments.wings):
         begin = time.perf_counter()
         try:
-            wing = measure(model, seed, of_wings, free=not given.peaks)
+            wing = measure(model, seed, of_wings, free=not arguments.peaks)
         except ExperimentDataError:
             not_seen += 1
             continue
@@ -131,26 +145,37 @@ def main() -> int:
     count = len(held)
     standard_error = 100.0 * np.sqrt(PROBABILITY * (1.0 - PROBABILITY) / count)
     shown = Table(
-        "quantity", "joint posterior", "wanted", "reached", "the paper's procedure", "width, joint",
-        "width, paper's over joint", title=f"{count} wings, share of 90 % intervals that hold the truth",
-    )  # fmt: skip
+        "quantity",
+        "joint posterior",
+        "wanted",
+        "reached",
+        "the paper's procedure",
+        "width, joint",
+        "width, paper's over joint",
+        title=f"{count} wings, share of 90 % intervals that hold the truth",
+    )
     reached = (share >= TARGET[0]) & (share <= TARGET[1])
     for place, name in enumerate(STATE):
         shown.add_row(
-            name, f"{100 * share[place]:.1f} %", "85 to 95 %", "yes" if reached[place] else "NO",
-            f"{100 * share_paper[place]:.1f} %", f"{width[place]:.3g}", f"{ratio[place]:.2f}",
-        )  # fmt: skip
+            name,
+            f"{100 * share[place]:.1f} %",
+            "85 to 95 %",
+            "yes" if reached[place] else "NO",
+            f"{100 * share_paper[place]:.1f} %",
+            f"{width[place]:.3g}",
+            f"{ratio[place]:.2f}",
+        )
     console = Console(width=160)
     console.print(shown)
     console.print(f"binomial standard error of a calibrated share: {standard_error:.1f} points")
     console.print(
-        f"{not_seen} wings whose records do not show two modes, {refused} refused by the joint posterior, "
-        f"{refused_paper} refused by the paper's procedure (not counted for it)"
+        f"{not_seen} wings whose records do not show two modes, "
+        f"{refused} refused by the joint posterior, {refused_paper} refused by the paper's procedure (not counted for it)"
     )
     console.print(
         ", ".join(f"{name} {value / max(count, 1):.2f} s a wing" for name, value in seconds.items())
     )
-    return 0 if reached.all() and not_seen + refused <= ALLOWED_REFUSALS * given.wings else 1
+    return 0 if reached.all() and not_seen + refused <= ALLOWED_REFUSALS * arguments.wings else 1
 
 
 if __name__ == "__main__":

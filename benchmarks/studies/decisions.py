@@ -40,7 +40,8 @@ def gauges_off(count: int, gain: float, sensors: int, seed: int, turn: int) -> F
 
 def faults(sensors: int) -> dict[str, Fault]:
     """Return what may be wrong, by name."""
-    softer, (begin, rate, limit) = third_region(), SOFTENING
+    softer = third_region()
+    (begin, rate, limit) = SOFTENING
     return {
         "nothing": partial(gauges_off, 0, 0.0, sensors),
         "a gauge shows 20 % too little": partial(gauges_off, 1, -0.2, sensors),
@@ -48,7 +49,9 @@ def faults(sensors: int) -> dict[str, Fault]:
         "gauge 17, strained most, 33 % too little": lambda _seed, turn: np.where(
             (np.arange(sensors) == 16) & (turn >= BEGINS), 2.0 / 3.0, 1.0
         ),
-        "half of the gauges show 33 % too little": partial(gauges_off, sensors // 2, -0.33, sensors),
+        "half of the gauges show 33 % too little": partial(
+            gauges_off, sensors // 2, -0.33, sensors
+        ),
         "skin between the regions softens, a point a turn": lambda _seed, turn: softer(
             min(rate * max(turn - begin + 1, 0), limit)
         ),
@@ -58,8 +61,10 @@ def faults(sensors: int) -> dict[str, Fault]:
 def flown(
     knowledge: Knowledge, source: ReducedModelSource, fault: Fault, seeds: range
 ) -> tuple[Float, Float]:
-    """Return rms of z1 and z2 in points, and turns: at 3g beyond the limit, beyond, at 2g below, below."""
-    scenario, squares, turns = knowledge.scenario, [], np.zeros(4)
+    """Return rms of z1 and z2 [points], and turns at 3g beyond the limit and at 2g below it"""
+    scenario = knowledge.scenario
+    squares = []
+    turns = np.zeros(4)
     sharp = scenario.control_names.index("3g")
     for seed in seeds:
         asset = spoiled(source.open(), partial(fault, seed))
@@ -79,17 +84,21 @@ def main() -> int:
     parser.add_argument("--flights", type=int, default=300)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", help="numbers of faults from 0, with commas")
-    given = parser.parse_args()
-    seeds = range(given.first_seed, given.first_seed + given.flights)
-    scenario, wing = load_scenario(SCENARIO).scenario, reduced_model(load_design())
+    arguments = parser.parse_args()
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.flights)
+    scenario = load_scenario(SCENARIO).scenario
+    wing = reduced_model(load_design())
     plain = scenario.model_copy(update={"notice": None})
     cases = [*faults(scenario.observation.count).items()]
-    chosen = range(len(cases)) if given.only is None else map(int, given.only.split(","))
+    chosen = range(len(cases)) if arguments.only is None else map(int, arguments.only.split(","))
     print(
-        "| wrong from turn 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|" + " --- |" * 5
+        "| wrong from turn 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|"
+        + " --- |" * 5
     )
     sources = [(kind, ReducedModelSource(kind, wing)) for kind in (scenario, plain)]
-    twins = [(prepare_knowledge(kind, source, scenario.mission.seed), source) for kind, source in sources]
+    twins = [
+        (prepare_knowledge(kind, source, scenario.mission.seed), source) for kind, source in sources
+    ]
     for name, fault in (cases[number] for number in chosen):
         for way, (knowledge, source) in zip(("with notices", "without"), twins, strict=True):
             (z1, z2), (sharp, beyond, gentle, below) = flown(knowledge, source, fault, seeds)

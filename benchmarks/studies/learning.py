@@ -33,7 +33,7 @@ from twin_master.scenario.schema import Scenario
 
 SCENARIO = "level_turns_learning"
 REACH = (0.9, 1.1)
-"""Range of e in which the reduced model is valid: the prior leaves it in one wing of ten thousand."""
+"""Range of e in which the reduced model is valid; one wing of ten thousand lies outside."""
 THIRD_REGION = {"span_start": 0.5, "span_end": 0.9, "chord_start": 0.1, "chord_end": 0.3}
 """Skin between the two regions of the model [m]."""
 SOFTENING = (10, 0.01, 0.4)
@@ -49,7 +49,7 @@ COVERAGE = (0.85, 0.95)
 
 @dataclass(frozen=True)
 class Result:
-    """Missions of one kind of twin; `covered` says whether the 90 % interval of e held its true value."""
+    """Missions of one kind of twin; `covered`: how often the 90 % interval of e held the truth."""
 
     study: Outcomes
     covered: Estimated
@@ -74,7 +74,10 @@ def with_factor(scenario: Scenario, wing: ReducedModel, e: float) -> ReducedMode
 
 def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
     """Fly one mission with each wing."""
-    scenario, covered, errors, seconds = knowledge.scenario, [], [], 0.0
+    scenario = knowledge.scenario
+    covered = []
+    errors = []
+    seconds = 0.0
     flights = Flights.empty(knowledge, len(seeds))
     for number, seed in enumerate(seeds):
         e = factor_of(scenario, seed)
@@ -109,8 +112,8 @@ class Alarms:
     named : (N,)
         Whether it named what was wrong.
     bound : (N,)
-        Whether the likelihood ratio reaches the threshold that knows everything, gauge, gain, state, e and
-        noise, but whether the fault is there.
+        Whether the likelihood ratio reaches the threshold that knows everything, gauge, gain,
+        state, e and noise, but whether the fault is there.
     """
 
     turn: NDArray[np.float64]
@@ -119,11 +122,15 @@ class Alarms:
 
 
 def third_region() -> Callable[[float], NDArray[np.float64]]:
-    """Return by which factor each gauge shows more for a loss of stiffness in a third region: full model."""
+    """Return the strain factor of each gauge for a stiffness loss in a third region."""
     design = load_design()
-    operators = assemble(design.changed(defects=[*(d.model_dump() for d in design.defects), THIRD_REGION]))
+    operators = assemble(
+        design.changed(defects=[*(d.model_dump() for d in design.defects), THIRD_REGION])
+    )
     losses = np.linspace(0.0, SOFTENING[2], 5)
-    strain = np.array([solve_static(operators, 1.0, (0.0, 0.0, loss), 3.0).strain for loss in losses])
+    strain = np.array(
+        [solve_static(operators, 1.0, (0.0, 0.0, loss), 3.0).strain for loss in losses]
+    )
     factors = strain / strain[0]
     return lambda loss: np.array([np.interp(loss, losses, column) for column in factors.T])
 
@@ -146,8 +153,11 @@ def fly_for_alarms(
     fault: Callable[[int, int], NDArray[np.float64]],
     wrong: Callable[[int], int | None],
 ) -> Alarms:
-    """Fly a mission with each wing; fault(seed, turn) is what its gauges show more, wrong(seed) the gauge."""
-    scenario, turns, named, bound = knowledge.scenario, [], [], []
+    """Fly a mission with each wing, with a fault of its gauges, and return the alarms."""
+    scenario = knowledge.scenario
+    turns = []
+    named = []
+    bound = []
     assert scenario.notice is not None
     noise = scenario.truth.noise.standard_deviation
     for seed in seeds:
@@ -157,7 +167,9 @@ def fly_for_alarms(
             return fault(seed, turn)
 
         flight = fly(
-            scenario, knowledge.twin(lag=1), knowledge.plant(knowledge.truth(seed), spoiled(asset, factor))
+            scenario,
+            knowledge.twin(lag=1),
+            knowledge.plant(knowledge.truth(seed), spoiled(asset, factor)),
         )
         alarms = [(turn, notice) for turn, notice in flight.notices if notice.kind == "alarm"]
         turns.append(alarms[0][0] if alarms else np.inf)
@@ -179,7 +191,8 @@ def fly_for_alarms(
 
 def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
     """Print what is found and what is raised in vain; return whether every target is reached."""
-    softer, sensors = third_region(), knowledge.scenario.observation.count
+    softer = third_region()
+    sensors = knowledge.scenario.observation.count
     begin, rate, limit = SOFTENING
     one = np.ones(sensors)
 
@@ -189,7 +202,9 @@ def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
     def off(seed: int, _turn: int) -> NDArray[np.float64]:
         return np.where(np.arange(sensors) == gauge_of(seed), 1.0 + GAIN, 1.0)
 
-    cases: dict[str, tuple[range, Callable[[int, int], NDArray[np.float64]], Callable[[int], int | None]]] = {
+    cases: dict[
+        str, tuple[range, Callable[[int, int], NDArray[np.float64]], Callable[[int], int | None]]
+    ] = {
         "healthy": (seeds, lambda _seed, _turn: one, lambda _seed: None),
         "gauge": (seeds, off, gauge_of),
         "third region": (
@@ -200,7 +215,8 @@ def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
     }
     last = begin - 1 + limit / rate  # the turn of the limit
     print(
-        "\n| mission | alarm | turn, median | named | a test that knows all but whether |\n|" + " --- |" * 5
+        "\n| mission | alarm | turn, median | named | a test that knows all but whether |\n|"
+        + " --- |" * 5
     )
     reached = True
     for name, (own, fault, wrong) in cases.items():
@@ -214,14 +230,19 @@ def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
             f"| {100 * result.named[found].mean() if found.any() else 0:.0f} % | {100 * bound:.1f} % |",
             flush=True,
         )
-        reached &= share <= NOTICE_TARGETS[name] if name == "healthy" else share >= NOTICE_TARGETS[name]
+        reached &= (
+            share <= NOTICE_TARGETS[name] if name == "healthy" else share >= NOTICE_TARGETS[name]
+        )
     return reached
 
 
 def show(name: str, result: Result) -> None:
     """Print a line of the table."""
     study = result.study
-    within, early, z1, z2 = study.within, study.early, study.rms[0], study.rms[1]
+    within = study.within
+    early = study.early
+    z1 = study.rms[0]
+    z2 = study.rms[1]
     print(
         f"| {name} | {100 * early.value:.1f} ± {100 * early.error:.1f} % "
         f"| {100 * within.value:.1f} ± {100 * within.error:.1f} % "
@@ -264,15 +285,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--missions", type=int, default=300)
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--notices", type=int, default=200, help="missions of each kind for the alarms")
-    given = parser.parse_args()
-    seeds = range(given.first_seed, given.first_seed + given.missions)
+    parser.add_argument(
+        "--notices", type=int, default=200, help="missions of each kind for the alarms"
+    )
+    arguments = parser.parse_args()
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.missions)
     scenario = load_scenario(SCENARIO).scenario
     wing = reduced_model(load_design())
-    knowledge = prepare_knowledge(scenario, ReducedModelSource(scenario, wing), given.first_seed)
-    good = not given.missions or learning(scenario, wing, knowledge, seeds)
-    if given.notices:
-        good &= notices(knowledge, wing, range(given.first_seed, given.first_seed + given.notices))
+    knowledge = prepare_knowledge(
+        scenario, ReducedModelSource(scenario, wing), arguments.first_seed
+    )
+    good = not arguments.missions or learning(scenario, wing, knowledge, seeds)
+    if arguments.notices:
+        good &= notices(
+            knowledge, wing, range(arguments.first_seed, arguments.first_seed + arguments.notices)
+        )
     return 0 if good else 1
 
 

@@ -23,7 +23,15 @@ from rich.table import Table
 
 from discrepancy.campaign.noise import pre_trigger_record, repeat_record
 from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Start, Trial, TrialKind
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    Hold,
+    NoiseRecord,
+    Start,
+    Trial,
+    TrialKind,
+)
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.model_check import check_against_model, prior_mean
 from discrepancy.checks.outliers import mark_outliers
@@ -44,7 +52,9 @@ from fe.runtime.patch import ModelPatch
 
 FATAL, LOCATED = 0.01, 0.05
 MODELS = ("single_mass_rig", "three_mass_chain")
-LONGEST, LOUDEST, RECORD = 1500, 0.1, 200
+LONGEST = 1500
+LOUDEST = 0.1
+RECORD = 200
 """Samples of a trial, and noise over what a channel shows, up to which the fit is asked; samples of a
 record of coloured noise from which on it is."""
 KINDS = (TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FORCED)
@@ -52,17 +62,22 @@ UNITS = {"displacement": ("m", "mm", "um"), "strain": ("1", "microstrain", "perc
 
 
 def coloured(generator: np.random.Generator, time: np.ndarray, correlation: float) -> np.ndarray:
-    """Return noise of unit variance at times, in intervals, over each of which it is so correlated."""
+    """Return unit noise at times [intervals], with a correlation over one interval."""
     kept = correlation ** np.diff(time, prepend=-np.inf)
     fresh = np.sqrt(1.0 - kept**2) * generator.standard_normal(len(time))
     return np.array(
-        [*accumulate(zip(kept, fresh, strict=True), lambda x, step: step[0] * x + step[1], initial=0.0)]
+        [
+            *accumulate(
+                zip(kept, fresh, strict=True), lambda x, step: step[0] * x + step[1], initial=0.0
+            )
+        ]
     )[1:]
 
 
 def stamps(generator: np.random.Generator, interval: float, count: int) -> np.ndarray:
-    """Return times [s]: even, jittered by a third of the interval, or with a fifth of the samples lost."""
-    time, kind = interval * np.arange(count), generator.integers(3)
+    """Return times [s]: even, jittered by a third of an interval, or without a fifth of samples."""
+    time = interval * np.arange(count)
+    kind = generator.integers(3)
     if kind == 1:
         time = time + interval * generator.uniform(-0.3, 0.3, count)
     if kind == 2:
@@ -71,12 +86,17 @@ def stamps(generator: np.random.Generator, interval: float, count: int) -> np.nd
 
 
 def planned(
-    generator: np.random.Generator, kind: TrialKind, name: str, outputs: Sequence[str], model: Model,
+    generator: np.random.Generator,
+    kind: TrialKind,
+    name: str,
+    outputs: Sequence[str],
+    model: Model,
     samples: float,
-) -> Trial:  # fmt: skip
+) -> Trial:
     """Return a trial without its readings; in time with so many samples a period."""
     scales = model.scales(Campaign("", {}, (), None, {}, ""))
-    rate, size = scales.angular_frequency, scales.length * 10.0 ** generator.uniform(-2.8, -1.6)
+    rate = scales.angular_frequency
+    size = scales.length * 10.0 ** generator.uniform(-2.8, -1.6)
     assert model.load_places is not None, "a shipped rig names the places of its loads"
     given: dict[str, Any] = {"load_place": str(generator.choice(model.load_places))}
     given["start"] = float(generator.uniform(0.0, 5000.0))
@@ -90,14 +110,19 @@ def planned(
         force = levels[generator.integers(3)] * size * scales.tip_stiffness
         factor = float(generator.choice([1.0, 1.0, 0.3, 2.0]))
         time = given["start"] + 60.0 * np.arange(count)
-        return Trial.plain(name, kind, tuple(outputs), time, force=force, noise_factor=factor, **given)
+        return Trial.plain(
+            name, kind, tuple(outputs), time, force=force, noise_factor=factor, **given
+        )
     count = max(int(generator.uniform(4.5, 25.0) * samples), 10)
     time = stamps(generator, 2.0 * np.pi / rate / samples, count)
     if kind is TrialKind.RINGDOWN:
         aside = size * generator.choice([-1.0, 1.0]) * generator.uniform(0.3, 1.0)
         modes = int(generator.integers(1, 4))
         release = Release(
-            float(aside), float(generator.choice([0.02, 0.05, 0.2])), bool(generator.random() < 0.6), modes
+            float(aside),
+            float(generator.choice([0.02, 0.05, 0.2])),
+            bool(generator.random() < 0.6),
+            modes,
         )
         return Trial.plain(name, kind, tuple(outputs), time, release=release, **given)
     course = (
@@ -106,17 +131,22 @@ def planned(
         1.0 * (time > 0.2 * time[-1]),
         np.sin(rate * (0.3 + time / time[-1]) * time),
     )
-    force = course[generator.integers(4)] * size * scales.tip_stiffness * generator.uniform(0.1, 1.0)
+    force = (
+        course[generator.integers(4)] * size * scales.tip_stiffness * generator.uniform(0.1, 1.0)
+    )
     begins = generator.choice(np.array([Start.SETTLED, Start.STILL, Start.UNKNOWN], dtype=object))
     hold = Hold.SMOOTH if generator.random() < 0.5 else None
     time = time + float(generator.choice([0.0, generator.uniform(0.0, 10.0)]))  # a logger's clock
-    return Trial.plain(name, kind, tuple(outputs), time, force=force, begins=begins, hold=hold, **given)
+    return Trial.plain(
+        name, kind, tuple(outputs), time, force=force, begins=begins, hold=hold, **given
+    )
 
 
 def shown(generator: np.random.Generator, bare: Campaign, model: Model) -> dict[str, np.ndarray]:
     """Return what each trial shows without noise, at true parameters and initial states."""
     values = [
-        np.clip(generator.normal(item.mean, item.deviation), item.low, item.high) for item in model.parameters
+        np.clip(generator.normal(item.mean, item.deviation), item.low, item.high)
+        for item in model.parameters
     ]
     found = {}
     for trial in bare.trials:
@@ -139,7 +169,9 @@ def campaign(generator: np.random.Generator, model: Model) -> tuple[Campaign, di
     outputs = outputs[: int(generator.integers(1, len(outputs) + 1))]
     kinds = [KINDS[k] for k in generator.permutation(3)[: int(generator.integers(1, 4))]]
     samples = float(generator.choice([8, 12, 20, 50, 90]))
-    interval = 2.0 * np.pi / model.scales(Campaign("", {}, (), None, {}, "")).angular_frequency / samples
+    interval = (
+        2.0 * np.pi / model.scales(Campaign("", {}, (), None, {}, "")).angular_frequency / samples
+    )
     trials = tuple(
         planned(generator, kind, f"{kind.value} {number}", outputs, model, samples)
         for kind in kinds
@@ -149,7 +181,8 @@ def campaign(generator: np.random.Generator, model: Model) -> tuple[Campaign, di
     bare = Campaign("sound", named, trials, None, {}, "0" * 64)
     clean = shown(generator, bare, model)
     correlation = float(generator.choice([0.0, 0.0, 0.0, 0.5, 0.9, 0.98]))
-    share, digits = 10.0 ** generator.uniform(-3.0, -0.7), float(generator.choice([0.0, 0.0, 0.0, 0.3, 2.0]))
+    share = 10.0 ** generator.uniform(-3.0, -0.7)
+    digits = float(generator.choice([0.0, 0.0, 0.0, 0.3, 2.0]))
     values = {name: np.empty_like(own) for name, own in clean.items()}
     channels = {}
     for column, (name, channel) in enumerate(named.items()):
@@ -157,7 +190,9 @@ def campaign(generator: np.random.Generator, model: Model) -> tuple[Campaign, di
         deviation = max(share * size, 1e-9)
         zero = float(generator.choice([0.0, deviation, 5.0 * deviation, np.inf]))
         gain = float(generator.choice([0.0, 0.005, 0.05]))
-        record = coloured(generator, np.arange(float(generator.choice([40, 200, 1000]))), correlation)
+        record = coloured(
+            generator, np.arange(float(generator.choice([40, 200, 1000]))), correlation
+        )
         sources = (
             pre_trigger_record(deviation * record, interval, name, "noise.csv"),
             NoiseRecord(deviation * float(np.sqrt(generator.chisquare(50) / 50.0)), 50.0),
@@ -166,18 +201,24 @@ def campaign(generator: np.random.Generator, model: Model) -> tuple[Campaign, di
         )
         unit = str(generator.choice(UNITS.get(channel.quantity.value, ("",))))
         noise = sources[generator.integers(len(sources))]
-        channels[name] = replace(channel, noise=noise, gain_deviation=gain, offset_deviation=zero, unit=unit)
+        channels[name] = replace(
+            channel, noise=noise, gain_deviation=gain, offset_deviation=zero, unit=unit
+        )
         true_gain = 1.0 + gain * generator.standard_normal()
         for trial in trials:
             own = clean[trial.name][:, column]
-            rest = coloured(generator, trial.time / interval, correlation)  # none is left between levels
+            rest = coloured(
+                generator, trial.time / interval, correlation
+            )  # none is left between levels
             moved = generator.standard_normal() * (zero if np.isfinite(zero) else 2.0 * size)
             read = true_gain * own + moved + deviation * trial.noise_factor * rest
             digit = digits * deviation
             values[trial.name][:, column] = np.round(read / digit) * digit if digit else read
     read_trials = tuple(replace(trial, values=values[trial.name]) for trial in trials)
     repeated = {
-        name: item if item.noise is not None else replace(item, noise=repeat_record(item, read_trials))
+        name: item
+        if item.noise is not None
+        else replace(item, noise=repeat_record(item, read_trials))
         for name, item in channels.items()
     }
     told = {"correlation": correlation, "noise": share, "digits": digits}
@@ -199,11 +240,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--campaigns", type=int, default=200)
     parser.add_argument("--first-seed", type=int, default=0)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     models = [load_model(name) for name in MODELS]
     alarms: dict[str, Counter[str]] = {"all": Counter(), "white": Counter(), "coloured": Counter()}
     count: Counter[str] = Counter()
-    for seed in range(given.first_seed, given.first_seed + given.campaigns):
+    for seed in range(arguments.first_seed, arguments.first_seed + arguments.campaigns):
         generator = np.random.default_rng([2026, seed])
         model = models[generator.integers(len(models))]
         try:
@@ -213,7 +254,9 @@ def main() -> int:
             count["all"] += 1
             alarms["all"].update({f"{item.kind.value}, fatal" for item in faults if item.fatal})
             alarms["all"]["any fatal"] += any(item.fatal for item in faults)
-            alarms["all"]["samples left out"] += any(not trial.used.all() for trial in marked.trials)
+            alarms["all"]["samples left out"] += any(
+                not trial.used.all() for trial in marked.trials
+            )
             noises = [item.noise for item in marked.channels.values()]
             recorded = all(
                 noise is not None and noise.samples is not None and len(noise.samples) >= RECORD
@@ -228,7 +271,10 @@ def main() -> int:
         except DiscrepancyError as error:
             print(f"campaign {seed}: {error}")
             alarms["all"]["refused"] += 1
-    title = f"{given.campaigns} sound campaigns, seeds from {given.first_seed}: what was found all the same"
+    title = (
+        f"{arguments.campaigns} sound campaigns, seeds from {arguments.first_seed}: "
+        "what was found all the same"
+    )
     table = Table("campaigns", "finding", "found", "of", title=title)
     for group, found in alarms.items():
         for name, number in sorted(found.items(), key=lambda item: -item[1]):

@@ -48,9 +48,13 @@ from discrepancy.workflow import investigate
 FloatArray = NDArray[np.float64]
 
 HIDDEN = (
-    "coulomb_friction", "quadratic_damping", "cubic_stiffness", "breathing_crack", "free_play",
+    "coulomb_friction",
+    "quadratic_damping",
+    "cubic_stiffness",
+    "breathing_crack",
+    "free_play",
     "structural_damping",
-)  # fmt: skip
+)
 SHARES = (0.03, 0.10)
 """Remainder over the gap that the effect makes (rms over the releases)."""
 ALONE = (2.0, 6.0)
@@ -59,9 +63,13 @@ LEAST_GAP = 25.0
 """Gap over the noise of an effect that is to be found, or else the largest of as many draws."""
 DRAWN = 20
 TRIALS = (
-    "load A1", "load B1", "release 4 mm plus 1", "release 12 mm plus 1", "release 12 mm minus 1",
+    "load A1",
+    "load B1",
+    "release 4 mm plus 1",
+    "release 12 mm plus 1",
+    "release 12 mm minus 1",
     "release 8 mm plus 1",
-)  # fmt: skip
+)
 SAMPLES = 400
 FORGETS = 0.3
 """Time over which the random force does [s]."""
@@ -84,7 +92,9 @@ class LooseRig(LumpedRig):
 
     def __init__(self, share: float, at: int, frequency: float) -> None:
         super().__init__()
-        self.share, self.at, self.frequency = share, at, frequency
+        self.share = share
+        self.at = at
+        self.frequency = frequency
 
     def structure(
         self, parameters: Mapping[str, float], changes: Changes, temperature: float = 0.0
@@ -129,7 +139,8 @@ def short_plan(plan: CampaignPlan) -> CampaignPlan:
     trials = [trial for trial in plan.trials if trial.name in TRIALS]
     rows = [trial.rows[:SAMPLES] if trial.kind == "ringdown" else trial.rows for trial in trials]
     return replace(
-        plan, trials=tuple(replace(trial, rows=row) for trial, row in zip(trials, rows, strict=True))
+        plan,
+        trials=tuple(replace(trial, rows=row) for trial, row in zip(trials, rows, strict=True)),
     )
 
 
@@ -143,7 +154,9 @@ def pushed(work: Workbench, chance: Chance, generator: np.random.Generator, at: 
     force = np.concatenate((np.zeros(count), shapes[at]))[:, None]
     found = {}
     for trial in work.plan.trials:
-        columns = [work.rig.outputs.index(work.plan.channels[name].output) for name in trial.channels]
+        columns = [
+            work.rig.outputs.index(work.plan.channels[name].output) for name in trial.channels
+        ]
         scales = np.array([work.plan.channels[name].scale for name in trial.channels])
         found[trial.name] = np.zeros((len(trial.rows), len(columns)))
         if trial.kind != "ringdown":
@@ -177,28 +190,40 @@ def make(out: Path, number: int, seed: int, *, colour: bool) -> dict[str, Any]:
     chance = draw_chance(generator, work.plan)
     nominal = reference(work.rig, work.plan, chance).nominal
     hidden: list[Hidden] = []
-    signals, gap, changes = nominal, 0.0, Changes()
+    signals = nominal
+    gap = 0.0
+    changes = Changes()
     identifier = HIDDEN[(number - number // 4) % len(HIDDEN)]
     for _ in range(DRAWN if number % 4 else 0):
         effect = DRAWS[identifier](generator, work.bench)
         drawn = finite_signals(work, chance, effect.changes)
         if drawn is not None and gap < LEAST_GAP and over_noise(work.plan, drawn, nominal) > gap:
-            hidden, signals, changes = [effect], drawn, effect.changes
+            hidden = [effect]
+            signals = drawn
+            changes = effect.changes
             gap = over_noise(work.plan, drawn, nominal)
     wanted = gap * float(generator.uniform(*SHARES)) if hidden else float(generator.uniform(*ALONE))
-    at, frequency = int(generator.integers(3)), float(np.exp(generator.uniform(*np.log(RESONANCES))))
+    at, frequency = (
+        int(generator.integers(3)),
+        float(np.exp(generator.uniform(*np.log(RESONANCES)))),
+    )
     mass, left = 0.0, 0.0
     if number // 4 % 2 == 0 and not colour:
         push = pushed(work, chance, generator, at)
-        size = wanted / over_noise(work.plan, push, {name: 0.0 * values for name, values in push.items()})
-        signals, left = {name: values + size * push[name] for name, values in signals.items()}, wanted
+        size = wanted / over_noise(
+            work.plan, push, {name: 0.0 * values for name, values in push.items()}
+        )
+        signals = {name: values + size * push[name] for name, values in signals.items()}
+        left = wanted
     elif not colour:
-        bare, mass = signals, 1e-3
+        bare = signals
+        mass = 1e-3
         for _ in range(8):
             loose = Workbench(LooseRig(mass, at, frequency), work.plan, lambda item: work.bench)
             found = finite_signals(loose, chance, changes)
             assert found is not None
-            signals, left = found, over_noise(work.plan, found, bare)
+            signals = found
+            left = over_noise(work.plan, found, bare)
             if abs(left / wanted - 1.0) < 0.05:
                 break
             mass *= min(max(wanted / left, 0.1), 10.0)
@@ -206,9 +231,13 @@ def make(out: Path, number: int, seed: int, *, colour: bool) -> dict[str, Any]:
     measured = measure(generator, plan, signals, changes, correlation=0.5 if colour else 0.0)
     identifiers = [item.identifier for item in hidden]
     truth = {
-        "identifiers": identifiers, "gap": gap, "remainder": left,
-        "mass": mass, "at": at, "frequency": frequency,
-    }  # fmt: skip
+        "identifiers": identifiers,
+        "gap": gap,
+        "remainder": left,
+        "mass": mass,
+        "at": at,
+        "frequency": frequency,
+    }
     order = Order(f"case-{number:04d}", "catalogue", "lumped", tuple(identifiers), seed)
     write_case(Case(order, plan, measured, truth), out / "campaigns", out / "sealed")
     return truth
@@ -231,7 +260,7 @@ def judge(out: Path, seed: int, number: int, *, colour: bool) -> dict[str, Any]:
 
 
 def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, Any]:
-    """Return what a verdict says and its outcome: its kind if right, else wrong; nothing where nothing is."""
+    """Return a verdict and its outcome: its kind if right, else wrong; nothing where nothing is."""
     named = sorted(item.identifier for item in verdict.effects)
     families = {item.identifier: item.family for item in library()}
     kind = verdict.kind.value
@@ -247,12 +276,17 @@ def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, 
         outcome = kind if true or kind == "unexplained" else "nothing"
     closed = None if proof is None else proof.closed
     return {
-        "kind": kind, "named": named, "outcome": outcome, "sentence": verdict.sentence,
+        "kind": kind,
+        "named": named,
+        "outcome": outcome,
+        "sentence": verdict.sentence,
         "probability": verdict.probability,
         "share": None if closed is None else [closed.low, closed.value, closed.high],
-        "hypotheses": [[list(item.identifiers), item.log_evidence] for item in verdict.hypotheses[:6]],
+        "hypotheses": [
+            [list(item.identifiers), item.log_evidence] for item in verdict.hypotheses[:6]
+        ],
         "gates": [gate.reason for gate in verdict.gates if gate.passed is False],
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
@@ -263,22 +297,26 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--colour", action="store_true")
-    given = parser.parse_args()
-    shutil.rmtree(given.out / "campaigns", ignore_errors=True)
+    arguments = parser.parse_args()
+    shutil.rmtree(arguments.out / "campaigns", ignore_errors=True)
     rows = []
-    work = partial(judge, given.out, given.seed, colour=given.colour)
-    with ProcessPoolExecutor(given.jobs, initializer=threadpool_limits, initargs=(1,)) as pool:
-        for row in pool.map(work, range(given.count)):
+    work = partial(judge, arguments.out, arguments.seed, colour=arguments.colour)
+    with ProcessPoolExecutor(arguments.jobs, initializer=threadpool_limits, initargs=(1,)) as pool:
+        for row in pool.map(work, range(arguments.count)):
             rows.append(row)
             true = ", ".join(row["identifiers"]) or "nothing"
             print(
-                f"{true:20s} gap {row['gap']:6.1f} remainder {row['remainder']:5.2f}  {row['outcome']:14s} "
-                f"{row['seconds']:5.0f} s  {row['sentence']}", flush=True,
-            )  # fmt: skip
+                f"{true:20s} gap {row['gap']:6.1f} remainder {row['remainder']:5.2f}  "
+                f"{row['outcome']:14s} "
+                f"{row['seconds']:5.0f} s  {row['sentence']}",
+                flush=True,
+            )
     for hidden in (True, False):
         counts = Counter(row["outcome"] for row in rows if bool(row["identifiers"]) is hidden)
         print("an effect hidden:" if hidden else "none hidden:", dict(counts))
-    (given.out / "remainder.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    (arguments.out / "remainder.json").write_text(
+        json.dumps(rows, indent=1) + "\n", encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ FREEDOM, GAIN, ZERO, NOISE = 12, 0.01, 0.3, 0.02  # zero and noise: shares of wh
 
 
 def rig(generator: np.random.Generator) -> LumpedModel:
-    """Return a chain from the ground: every spring a part of its own, the damping and the last mass too."""
+    """Return a chain of masses with parameters for each spring, the damping and the last mass."""
     count = int(generator.integers(1, 5))
     rows = np.eye(count) - np.eye(count, k=-1)
     stiffness = 10.0 ** generator.uniform(3.0, 4.0, count)
@@ -43,22 +43,32 @@ def rig(generator: np.random.Generator) -> LumpedModel:
     return LumpedModel(
         LumpedDescription.parse(
             {
-                "format": 1, "name": f"Chain of {count}", "mass": mass.tolist(), "stiffness": none,
+                "format": 1,
+                "name": f"Chain of {count}",
+                "mass": mass.tolist(),
+                "stiffness": none,
                 "damping": {"ratios": generator.uniform(0.005, 0.03, count).tolist()},
                 "mass_part": [{"name": "last_mass", "matrix": last.tolist()}],
                 "stiffness_part": [
-                    {"name": name, "matrix": (own * np.outer(row, row)).tolist()} for name, own, row in parts
+                    {"name": name, "matrix": (own * np.outer(row, row)).tolist()}
+                    for name, own, row in parts
                 ],
                 "input": [{"name": "end", "vector": ends[-1]}],
                 "output": [{"name": f"x{k}", "vector": end} for k, end in enumerate(ends, start=1)],
                 "parameter": [
-                    {"name": name, "terms": name, "mean": 1.0, "deviation": DEVIATION[kind],
-                     "low": 0.02, "high": 4.0}
+                    {
+                        "name": name,
+                        "terms": name,
+                        "mean": 1.0,
+                        "deviation": DEVIATION[kind],
+                        "low": 0.02,
+                        "high": 4.0,
+                    }
                     for name, kind in scaled.items()
                 ],
             }
         )
-    )  # fmt: skip
+    )
 
 
 def measured(model: LumpedModel, truth: np.ndarray, generator: np.random.Generator) -> Campaign:
@@ -70,10 +80,14 @@ def measured(model: LumpedModel, truth: np.ndarray, generator: np.random.Generat
     force = np.convolve(generator.standard_normal(len(time)), np.hanning(9), "same")
     steps = np.linspace(-50.0, 50.0, 9)
     trials = (
-        Trial.plain("load_test", TrialKind.STATIC, names, np.arange(9.0), force=steps, load_place="end"),
+        Trial.plain(
+            "load_test", TrialKind.STATIC, names, np.arange(9.0), force=steps, load_place="end"
+        ),
         Trial.plain("forced", TrialKind.FORCED, names, time, force=10.0 * force, load_place="end"),
     )
-    shown = [model.respond(trial, outputs, model.patch, Conditions(truth)).values for trial in trials]
+    shown = [
+        model.respond(trial, outputs, model.patch, Conditions(truth)).values for trial in trials
+    ]
     size = np.abs(shown[1]).max(axis=0)
     gain = 1.0 + GAIN * generator.standard_normal(len(names))
     deviation = NOISE * size
@@ -90,7 +104,13 @@ def measured(model: LumpedModel, truth: np.ndarray, generator: np.random.Generat
     ]
     filled = tuple(
         Trial.plain(
-            trial.name, trial.kind, names, trial.time, force=trial.force, load_place="end", values=own
+            trial.name,
+            trial.kind,
+            names,
+            trial.time,
+            force=trial.force,
+            load_place="end",
+            values=own,
         )
         for trial, own in zip(trials, values, strict=True)
     )
@@ -101,12 +121,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rigs", type=int, default=200)
     parser.add_argument("--first-seed", type=int, default=0)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     held: dict[str, list[bool]] = {kind: [] for kind in DEVIATION}
     narrowed: dict[str, list[float]] = {kind: [] for kind in DEVIATION}
     refused = 0
     tail = 0.5 * (1.0 - PROBABILITY)
-    for seed in range(given.first_seed, given.first_seed + given.rigs):
+    for seed in range(arguments.first_seed, arguments.first_seed + arguments.rigs):
         generator = np.random.default_rng([2021, seed])
         model = rig(generator)
         prior = np.array([item.deviation for item in model.parameters])
@@ -123,9 +143,14 @@ def main() -> int:
             kind = item.name.split("_")[item.name == "last_mass"]
             held[kind].append(bool(lower[place] <= truth[place] <= upper[place]))
             narrowed[kind].append(float(found.samples[:, place].std() / prior[place]))
-    title = f"{given.rigs - refused} rigs, share of 90 % intervals that hold the truth; {refused} refused"
-    shown = Table("parameter", "count", "holds", "standard error", "deviation over prior", title=title)
-    good = refused <= 0.1 * given.rigs
+    title = (
+        f"{arguments.rigs - refused} rigs, share of 90 % intervals that hold the truth; "
+        f"{refused} refused"
+    )
+    shown = Table(
+        "parameter", "count", "holds", "standard error", "deviation over prior", title=title
+    )
+    good = refused <= 0.1 * arguments.rigs
     for kind, items in held.items():
         share, count = float(np.mean(items)), len(items)
         standard_error = np.sqrt(PROBABILITY * (1.0 - PROBABILITY) / count)

@@ -53,7 +53,7 @@ WITHOUT = 30
 
 @dataclass(frozen=True)
 class Watched:
-    """A watch of a mission; `mean` (T, 2) is what it believed of z1, z2, `sharp` (T,) whether it chose 3g."""
+    """A watch of a mission: mean (T, 2) of z1 and z2, and whether it chose 3g (T,)."""
 
     mean: NDArray[np.float64]
     sharp: NDArray[np.bool_]
@@ -62,13 +62,16 @@ class Watched:
 
 def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
     """Write the scenario of a watch whose twin knows some effects."""
-    kept, skipping = [], False
+    kept = []
+    skipping = False
     for line in scenario_files()["level_turns"].read_text(encoding="utf-8").splitlines():
         if line.startswith("["):
             skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
         if not skipping:
             kept.append(
-                line.replace("standard_deviation_microstrain = 125", "standard_deviation_microstrain = 150")
+                line.replace(
+                    "standard_deviation_microstrain = 125", "standard_deviation_microstrain = 150"
+                )
             )
     text = "\n".join([*kept, "", "[notice]", ""])
     if known:
@@ -89,14 +92,17 @@ def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
             watch.run(feed, lambda _decision: None)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]
     turns = [record for record in lines if "filtered" in record]
-    filtered, chosen = (np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control"))
+    filtered, chosen = (
+        np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control")
+    )
     mean = filtered @ watch.models[0].knowledge.model.states.coordinates
     return Watched(mean, chosen == watch.scenario.control_names.index("3g"), lines)
 
 
 def said(records: list[dict[str, Any]]) -> tuple[str, int]:
     """Return what happened, and the first turn behind the adoption."""
-    words, first = [], WITHOUT
+    words = []
+    first = WITHOUT
     for record in records:
         if "verdict" in record:
             verdict = record["verdict"]
@@ -132,11 +138,18 @@ def study(name: str, seed: int, work: Path) -> None:
     }
     # What is decided behind a turn is in force in the next one.
     decided = {
-        way: "{} of {}".format(*beyond_the_limit(np.append(False, watch.sharp[first:-1]), truth[first:, 0]))
+        way: "{} of {}".format(
+            *beyond_the_limit(np.append(False, watch.sharp[first:-1]), truth[first:, 0])
+        )
         for way, watch in ways.items()
     }
-    figures = ", ".join(f"{way} {z1:.2f} {z2:.2f}, {decided[way]}" for way, (z1, z2) in errors.items())
-    print(f"{name}, seed {seed}: {what}. From turn {first} on rms of z1, z2, 3g: {figures}", flush=True)
+    figures = ", ".join(
+        f"{way} {z1:.2f} {z2:.2f}, {decided[way]}" for way, (z1, z2) in errors.items()
+    )
+    print(
+        f"{name}, seed {seed}: {what}. From turn {first} on rms of z1, z2, 3g: {figures}",
+        flush=True,
+    )
 
 
 def main() -> int:
@@ -144,10 +157,14 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="numbers of hidden effects from 0, with commas")
-    given = parser.parse_args()
-    names = [*HIDDEN] if given.only is None else [[*HIDDEN][int(number)] for number in given.only.split(",")]
+    arguments = parser.parse_args()
+    names = (
+        [*HIDDEN]
+        if arguments.only is None
+        else [[*HIDDEN][int(number)] for number in arguments.only.split(",")]
+    )
     with tempfile.TemporaryDirectory() as work:
-        for seed in range(given.first_seed, given.first_seed + given.seeds):
+        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
             for name in names:
                 study(name, seed, Path(work))
     return 0
