@@ -1,6 +1,6 @@
 """Every picture of docs/images by its name, with what README and docs say of it."""
 
-from benchmarks.pictures import front, measured, missions
+from benchmarks.pictures import examples, front, measured, missions
 from benchmarks.pictures.picture import Picture, Statement
 
 NOTEBOOK_FLEET = "fleet"
@@ -41,6 +41,12 @@ PICTURES = {
             (Statement("docs/discrepancy.md", "a step of {step} N over the speed"),),
             minutes=True,
             source=NOTEBOOK_EFFECT,
+        ),
+        Picture(
+            "force_at_joint",
+            examples.draw_force_at_joint,
+            (Statement("docs/locating.md", "a force of {rms} N (rms), at most {largest} N"),),
+            minutes=True,
         ),
         Picture(
             "front_watch",

@@ -144,7 +144,7 @@ def measure(
 
 
 def paper_interval(table: WingTable, wing: MeasuredWing, seed: int) -> NDArray[np.float64]:
-    """Return intervals (2, 5) of the paper's procedure, Kapteyn et al. 2021, eqs. (19), (20), (25)."""
+    """Return intervals (2, 5) of the procedure of Kapteyn et al. 2021, eqs. (19), (20), (25)."""
     alone = exact_posterior(wing.static, curve=table.stiffness)
     factors = alone.samples(seed, PAPER_SAMPLES)
     result = fit_masses(table.frequency, factors, table.validity, wing.readings)

@@ -9,10 +9,12 @@ target is missed.
 """
 
 import argparse
+import itertools
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,8 @@ from twin_master.fleet.reading import Estimated, Outcomes
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights
+from twin_master.mission.turns import History
+from twin_master.network.estimator import Notice
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 
@@ -48,12 +52,24 @@ COVERAGE = (0.85, 0.95)
 
 
 @dataclass(frozen=True)
-class Result:
-    """Missions of one kind of twin; `covered`: how often the 90 % interval of e held the truth."""
+class TwinResult:
+    """How one kind of twin flew its missions.
 
-    study: Outcomes
-    covered: Estimated
-    error_of_e: float
+    Attributes
+    ----------
+    outcomes : Outcomes
+        What became of the missions.
+    coverage : Estimated
+        Share of the missions whose 90 % interval of e holds its true value.
+    factor_rms : float
+        Rms error of the learnt e.
+    seconds_per_turn : float
+        Processor time of a turn [s].
+    """
+
+    outcomes: Outcomes
+    coverage: Estimated
+    factor_rms: float
     seconds_per_turn: float
 
 
@@ -72,8 +88,8 @@ def with_factor(scenario: Scenario, wing: ReducedModel, e: float) -> ReducedMode
     return ReducedModelSource(scenario.model_copy(update={"asset": asset}), wing)
 
 
-def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
-    """Fly one mission with each wing."""
+def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> TwinResult:
+    """Fly a mission for each seed, each with a wing of its own, and compare what the twin learnt."""
     scenario = knowledge.scenario
     covered = []
     errors = []
@@ -88,37 +104,57 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
         flight = fly(scenario, twin, plant)
         seconds += time.process_time() - begin
         flights.put(number, flight)
-        # What was learnt at the end: the belief is pure, so the last turn can be asked again.
-        learnt = twin.revise(twin.turns - 1, twin.observed(twin.turns - 1)).learnt
+        # Revising the last turn with its own observation changes nothing, and returns the learnt e
+        last_turn = twin.turns - 1
+        learnt = twin.revise(last_turn, twin.observed(last_turn)).learnt
         if scenario.calibration.parameter in learnt:
-            found = learnt[scenario.calibration.parameter]
-            covered.append(found.lower <= e <= found.upper)
-            errors.append(found.mean - e)
+            estimate = learnt[scenario.calibration.parameter]
+            covered.append(estimate.lower <= e <= estimate.upper)
+            errors.append(estimate.mean - e)
     share = float(np.mean(covered)) if covered else float("nan")
-    spread = float(np.sqrt(share * (1.0 - share) / max(len(covered), 1)))
-    root = float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
-    per_turn = seconds / (len(seeds) * scenario.mission.steps)
-    return Result(outcomes(knowledge, flights), Estimated(share, spread), root, per_turn)
+    standard_error = float(np.sqrt(share * (1.0 - share) / max(len(covered), 1)))
+    return TwinResult(
+        outcomes=outcomes(knowledge, flights),
+        coverage=Estimated(share, standard_error),
+        factor_rms=float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan"),
+        seconds_per_turn=seconds / (len(seeds) * scenario.mission.steps),
+    )
+
+
+@dataclass(frozen=True)
+class GaugeFault:
+    """A fault of the gauges in the missions of a study.
+
+    Attributes
+    ----------
+    factor : callable
+        (seed, turn) -> factors (G,) of the gauges.
+    gauge : callable
+        seed -> index of the faulty gauge, or None if no gauge is faulty.
+    """
+
+    factor: Callable[[int, int], NDArray[np.float64]]
+    gauge: Callable[[int], int | None]
 
 
 @dataclass(frozen=True)
 class Alarms:
-    """First alarms of N missions; (N,) each.
+    """First alarms of N missions.
 
     Attributes
     ----------
-    turn : (N,)
-        Of the first alarm; infinite where there was none.
-    named : (N,)
-        Whether it named what was wrong.
-    bound : (N,)
-        Whether the likelihood ratio reaches the threshold that knows everything, gauge, gain,
-        state, e and noise, but whether the fault is there.
+    turn : (N,) array
+        Turn of the first alarm; infinite where there was none.
+    named : (N,) array
+        Whether the alarm named the fault.
+    detectable : (N,) array
+        Whether the likelihood ratio of the fault against none reaches the threshold of alarms, in
+        a test that knows the fault, the state, e and the noise.
     """
 
     turn: NDArray[np.float64]
     named: NDArray[np.bool_]
-    bound: NDArray[np.bool_]
+    detectable: NDArray[np.bool_]
 
 
 def third_region() -> Callable[[float], NDArray[np.float64]]:
@@ -136,152 +172,181 @@ def third_region() -> Callable[[float], NDArray[np.float64]]:
 
 
 def spoiled(asset: Asset, factor: Callable[[int], NDArray[np.float64]]) -> Asset:
-    """Return an asset whose gauges show a factor (G,) more in each turn."""
-    turn = iter(range(1_000_000))
+    """Return an asset whose gauge readings are multiplied by factors (G,) of the turn."""
+    turns = itertools.count()
 
     def observe(control: object, health: object) -> AssetReading:
         reading = asset.step(control, health)  # type: ignore[arg-type]
-        return replace(reading, values=reading.values * factor(next(turn)))
+        return replace(reading, values=reading.values * factor(next(turns)))
 
     return StatelessAsset(observe)
 
 
+def is_named(alarm: Notice | None, faulty_gauge: int | None) -> bool:
+    """Return whether an alarm names the fault: its gauge, or that no state fits the strains."""
+    if alarm is None:
+        return False
+    if faulty_gauge is None:
+        return "no state" in alarm.sentence
+    return alarm.sensors == (faulty_gauge + 1,)
+
+
+def largest_evidence(
+    flight: History, factor: Callable[[int], NDArray[np.float64]], noise: NDArray[np.float64]
+) -> float:
+    """Return the largest log likelihood ratio of a known fault against none over a mission.
+
+    Parameters
+    ----------
+    flight : Flight
+        A mission with the fault.
+    factor : callable
+        turn -> factors (G,) of the gauges.
+    noise : (G,) array
+        Standard deviations of the gauges.
+    """
+    with_fault = flight.observation
+    factors = np.array([factor(turn) for turn in range(len(with_fault))])
+    healthy = with_fault / factors
+    residual_healthy = (flight.observed - healthy) ** 2
+    residual_fault = (flight.observed - with_fault) ** 2
+    gained = (residual_healthy - residual_fault) / (2.0 * np.square(noise))
+    return float(np.cumsum(gained.sum(axis=1)).max())
+
+
 def fly_for_alarms(
-    knowledge: Knowledge,
-    wing: ReducedModel,
-    seeds: range,
-    fault: Callable[[int, int], NDArray[np.float64]],
-    wrong: Callable[[int], int | None],
+    knowledge: Knowledge, wing: ReducedModel, seeds: range, fault: GaugeFault
 ) -> Alarms:
-    """Fly a mission with each wing, with a fault of its gauges, and return the alarms."""
+    """Fly a mission for each seed with a fault of the gauges, and return the first alarms."""
     scenario = knowledge.scenario
+    assert scenario.notice is not None
+    threshold = np.log(scenario.notice.threshold)
+    noise = np.asarray(scenario.truth.noise.standard_deviation)
     turns = []
     named = []
-    bound = []
-    assert scenario.notice is not None
-    noise = scenario.truth.noise.standard_deviation
+    detectable = []
     for seed in seeds:
         asset = with_factor(scenario, wing, factor_of(scenario, seed)).open()
-
-        def factor(turn: int, seed: int = seed) -> NDArray[np.float64]:
-            return fault(seed, turn)
-
-        flight = fly(
-            scenario,
-            knowledge.twin(lag=1),
-            knowledge.plant(knowledge.truth(seed), spoiled(asset, factor)),
-        )
+        factor = partial(fault.factor, seed)
+        plant = knowledge.plant(knowledge.truth(seed), spoiled(asset, factor))
+        flight = fly(scenario, knowledge.twin(lag=1), plant)
         alarms = [(turn, notice) for turn, notice in flight.notices if notice.kind == "alarm"]
-        turns.append(alarms[0][0] if alarms else np.inf)
-        gauge = wrong(seed)
-        said = alarms[0][1] if alarms else None
-        if gauge is None:
-            named.append(said is not None and "no state" in said.sentence)
-        else:
-            named.append(said is not None and said.sensors == (gauge + 1,))
-        shown = flight.observation
-        healthy = shown / np.array([fault(seed, turn) for turn in range(len(shown))])
-        gained = ((flight.observed - healthy) ** 2 - (flight.observed - shown) ** 2) / (
-            2.0 * np.square(noise)
-        )
-        evidence = np.cumsum(gained.sum(axis=1))
-        bound.append(bool(evidence.max() >= np.log(scenario.notice.threshold)))
-    return Alarms(np.array(turns), np.array(named), np.array(bound))
+        first_turn, first_alarm = alarms[0] if alarms else (np.inf, None)
+        turns.append(first_turn)
+        named.append(is_named(first_alarm, fault.gauge(seed)))
+        detectable.append(bool(largest_evidence(flight, factor, noise) >= threshold))
+    return Alarms(np.array(turns), np.array(named), np.array(detectable))
 
 
-def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
-    """Print what is found and what is raised in vain; return whether every target is reached."""
-    softer = third_region()
-    sensors = knowledge.scenario.observation.count
+def gauge_faults(gauges: int) -> dict[str, GaugeFault]:
+    """Return the faults of the study by name, for a number of gauges."""
+    third_region_factor = third_region()
     begin, rate, limit = SOFTENING
-    one = np.ones(sensors)
 
-    def gauge_of(seed: int) -> int:
-        return int(np.random.default_rng([seed, 2]).integers(sensors))
+    def faulty_gauge(seed: int) -> int:
+        return int(np.random.default_rng([seed, 2]).integers(gauges))
 
-    def off(seed: int, _turn: int) -> NDArray[np.float64]:
-        return np.where(np.arange(sensors) == gauge_of(seed), 1.0 + GAIN, 1.0)
+    def factor_of_gain(seed: int, _turn: int) -> NDArray[np.float64]:
+        return np.where(np.arange(gauges) == faulty_gauge(seed), 1.0 + GAIN, 1.0)
 
-    cases: dict[
-        str, tuple[range, Callable[[int, int], NDArray[np.float64]], Callable[[int], int | None]]
-    ] = {
-        "healthy": (seeds, lambda _seed, _turn: one, lambda _seed: None),
-        "gauge": (seeds, off, gauge_of),
-        "third region": (
-            seeds[: max(len(seeds) // 2, 1)],
-            lambda _seed, turn: softer(min(rate * max(turn - begin + 1, 0), limit)),
-            lambda _seed: None,
-        ),
+    def factor_of_region(_seed: int, turn: int) -> NDArray[np.float64]:
+        return third_region_factor(min(rate * max(turn - begin + 1, 0), limit))
+
+    def no_gauge(_seed: int) -> None:
+        return None
+
+    return {
+        "healthy": GaugeFault(lambda _seed, _turn: np.ones(gauges), no_gauge),
+        "gauge": GaugeFault(factor_of_gain, faulty_gauge),
+        "third region": GaugeFault(factor_of_region, no_gauge),
     }
-    last = begin - 1 + limit / rate  # the turn of the limit
+
+
+def study_notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
+    """Print how many faults raise an alarm; return whether every target is reached."""
+    begin, rate, limit = SOFTENING
+    turn_of_limit = begin - 1 + limit / rate
     print(
         "\n| mission | alarm | turn, median | named | a test that knows all but whether |\n|"
         + " --- |" * 5
     )
-    reached = True
-    for name, (own, fault, wrong) in cases.items():
-        result = fly_for_alarms(knowledge, wing, own, fault, wrong)
-        found = result.turn < (last if name == "third region" else np.inf)
-        share, bound = float(found.mean()), float(result.bound.mean())
-        error = np.sqrt(share * (1.0 - share) / len(own))
-        median = np.median(result.turn[found]) if found.any() else np.nan
+    passes = True
+    for name, fault in gauge_faults(knowledge.scenario.observation.count).items():
+        flown = seeds[: max(len(seeds) // 2, 1)] if name == "third region" else seeds
+        latest = turn_of_limit if name == "third region" else np.inf
+        alarms = fly_for_alarms(knowledge, wing, flown, fault)
+        in_time = alarms.turn < latest
+        share = float(in_time.mean())
+        standard_error = np.sqrt(share * (1.0 - share) / len(flown))
+        median_turn = np.median(alarms.turn[in_time]) if in_time.any() else np.nan
+        named = 100 * alarms.named[in_time].mean() if in_time.any() else 0
         print(
-            f"| {name} | {found.sum()} of {len(own)}, {100 * share:.1f} ± {100 * error:.1f} % | {median:.0f} "
-            f"| {100 * result.named[found].mean() if found.any() else 0:.0f} % | {100 * bound:.1f} % |",
+            f"| {name} | {in_time.sum()} of {len(flown)}, "
+            f"{100 * share:.1f} ± {100 * standard_error:.1f} % | {median_turn:.0f} "
+            f"| {named:.0f} % | {100 * float(alarms.detectable.mean()):.1f} % |",
             flush=True,
         )
-        reached &= (
-            share <= NOTICE_TARGETS[name] if name == "healthy" else share >= NOTICE_TARGETS[name]
-        )
-    return reached
+        target = NOTICE_TARGETS[name]
+        passes &= share <= target if name == "healthy" else share >= target
+    return passes
 
 
-def show(name: str, result: Result) -> None:
-    """Print a line of the table."""
-    study = result.study
-    within = study.within
-    early = study.early
-    z1 = study.rms[0]
-    z2 = study.rms[1]
-    print(
-        f"| {name} | {100 * early.value:.1f} ± {100 * early.error:.1f} % "
-        f"| {100 * within.value:.1f} ± {100 * within.error:.1f} % "
-        f"| {100 * z1.value:.2f} ± {100 * z1.error:.2f} | {100 * z2.value:.2f} ± {100 * z2.error:.2f} "
-        f"| {100 * result.covered.value:.1f} ± {100 * result.covered.error:.1f} % "
-        f"| {100 * result.error_of_e:.2f} % | {1.0 / result.seconds_per_turn:.0f} |",
-        flush=True,
-    )
+def print_row(name: str, result: TwinResult) -> None:
+    """Print a row of the table of twins."""
+    early = result.outcomes.early
+    within = result.outcomes.within
+    z1, z2 = result.outcomes.rms
+    coverage = result.coverage
+    cells = [
+        name,
+        f"{100 * early.value:.1f} ± {100 * early.error:.1f} %",
+        f"{100 * within.value:.1f} ± {100 * within.error:.1f} %",
+        f"{100 * z1.value:.2f} ± {100 * z1.error:.2f}",
+        f"{100 * z2.value:.2f} ± {100 * z2.error:.2f}",
+        f"{100 * coverage.value:.1f} ± {100 * coverage.error:.1f} %",
+        f"{100 * result.factor_rms:.2f} %",
+        f"{1.0 / result.seconds_per_turn:.0f}",
+    ]
+    print("| " + " | ".join(cells) + " |", flush=True)
 
 
-def reached(result: Result) -> bool:
-    """Return whether every target is reached."""
-    study, covered = result.study, result.covered.value
+def reaches_targets(result: TwinResult) -> bool:
+    """Return whether a twin reaches every target."""
+    outcome = result.outcomes
     return (
-        study.early.value <= MOST_EARLY
-        and study.within.value >= LEAST_WITHIN
-        and study.rms[0].value <= MOST_RMS["z1"]
-        and study.rms[1].value <= MOST_RMS["z2"]
-        and COVERAGE[0] <= covered <= COVERAGE[1]
+        outcome.early.value <= MOST_EARLY
+        and outcome.within.value >= LEAST_WITHIN
+        and outcome.rms[0].value <= MOST_RMS["z1"]
+        and outcome.rms[1].value <= MOST_RMS["z2"]
+        and COVERAGE[0] <= result.coverage.value <= COVERAGE[1]
     )
 
 
-def learning(scenario: Scenario, wing: ReducedModel, knowledge: Knowledge, seeds: range) -> bool:
-    """Print what learning is worth; return whether every target is reached."""
-    print(
-        "| twin | early 2g | 2g within 2 turns | rms z1, points | rms z2, points | 90 % interval holds e "
-        f"| rms of e | turns a second |\n|{' --- |' * 8}"
+def study_learning(
+    scenario: Scenario, wing: ReducedModel, knowledge: Knowledge, seeds: range
+) -> bool:
+    """Print missions of a twin that learns and of one that averages; return whether the former passes."""
+    headings = (
+        "twin",
+        "early 2g",
+        "2g within 2 turns",
+        "rms z1, points",
+        "rms z2, points",
+        "90 % interval holds e",
+        "rms of e",
+        "turns a second",
     )
+    print("| " + " | ".join(headings) + f" |\n|{' --- |' * len(headings)}")
     learning = fly_wings(knowledge, wing, seeds)
-    show("learns", learning)
-    anew = scenario.model_copy(update={"learning": None})
-    show(
-        "averages anew",
-        fly_wings(prepare_knowledge(anew, ReducedModelSource(anew, wing), seeds[0]), wing, seeds),
-    )
-    return reached(learning)
+    print_row("learns", learning)
+    without = scenario.model_copy(update={"learning": None})
+    averaging = prepare_knowledge(without, ReducedModelSource(without, wing), seeds[0])
+    print_row("averages anew", fly_wings(averaging, wing, seeds))
+    return reaches_targets(learning)
 
 
 def main() -> int:
+    """Run the study; return 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--missions", type=int, default=300)
     parser.add_argument("--first-seed", type=int, default=0)
@@ -289,18 +354,17 @@ def main() -> int:
         "--notices", type=int, default=200, help="missions of each kind for the alarms"
     )
     arguments = parser.parse_args()
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.missions)
+    first = arguments.first_seed
     scenario = load_scenario(SCENARIO).scenario
     wing = reduced_model(load_design())
-    knowledge = prepare_knowledge(
-        scenario, ReducedModelSource(scenario, wing), arguments.first_seed
-    )
-    good = not arguments.missions or learning(scenario, wing, knowledge, seeds)
+    knowledge = prepare_knowledge(scenario, ReducedModelSource(scenario, wing), first)
+    passes = True
+    if arguments.missions:
+        seeds = range(first, first + arguments.missions)
+        passes = study_learning(scenario, wing, knowledge, seeds)
     if arguments.notices:
-        good &= notices(
-            knowledge, wing, range(arguments.first_seed, arguments.first_seed + arguments.notices)
-        )
-    return 0 if good else 1
+        passes &= study_notices(knowledge, wing, range(first, first + arguments.notices))
+    return 0 if passes else 1
 
 
 if __name__ == "__main__":
