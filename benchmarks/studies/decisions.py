@@ -9,6 +9,7 @@ limit, and the turns at 2g below the limit, which were needless.
 
 import argparse
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -24,62 +25,111 @@ from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]
-Fault = Callable[[int, int], Float]
-"""What the gauges show more (G,) in a flight of a seed in a turn."""
+FaultFactor = Callable[[int, int], Float]
+"""(seed, turn) -> factors (G,) of the gauges in a turn of the flight with a seed."""
 
 SCENARIO = "level_turns"
 BEGINS = 10
-"""Turn from which on something is wrong."""
+"""First turn with a fault."""
+MOST_STRAINED = 16
+"""Index of gauge 17, whose strain is the largest."""
 
 
-def gauges_off(count: int, gain: float, sensors: int, seed: int, turn: int) -> Float:
-    """Return what the gauges show more where `count` of them, drawn for each flight, are off."""
-    chosen = np.random.default_rng([seed, 2]).permutation(sensors)[:count]
-    return np.where(np.isin(np.arange(sensors), chosen) & (turn >= BEGINS), 1.0 + gain, 1.0)
+@dataclass(frozen=True)
+class FlightErrors:
+    """Errors and decisions of a twin over its flights.
+
+    Attributes
+    ----------
+    rms : (2,) array
+        Rms error of z1 and z2 from the turn of the fault on [percentage points].
+    beyond : int
+        Turns with z1 at or above the limit.
+    sharp_beyond : int
+        Those of them that are flown at 3g.
+    below : int
+        Turns with z1 below the limit.
+    gentle_below : int
+        Those of them after which 2g is flown, which was needless.
+    """
+
+    rms: Float
+    beyond: int
+    sharp_beyond: int
+    below: int
+    gentle_below: int
 
 
-def faults(sensors: int) -> dict[str, Fault]:
-    """Return what may be wrong, by name."""
-    softer = third_region()
-    (begin, rate, limit) = SOFTENING
+def factor_of_drawn_gauges(count: int, gain: float, sensors: int, seed: int, turn: int) -> Float:
+    """Return factors (G,) of the gauges; `count` of them, drawn for a flight, have a gain error."""
+    drawn = np.random.default_rng([seed, 2]).permutation(sensors)[:count]
+    is_faulty = np.isin(np.arange(sensors), drawn) & (turn >= BEGINS)
+    return np.where(is_faulty, 1.0 + gain, 1.0)
+
+
+def fault_factors(sensors: int) -> dict[str, FaultFactor]:
+    """Return the faults of the study by name, for a number of gauges."""
+    third_region_factor = third_region()
+    begin, rate, limit = SOFTENING
+
+    def of_most_strained(_seed: int, turn: int) -> Float:
+        is_faulty = (np.arange(sensors) == MOST_STRAINED) & (turn >= BEGINS)
+        return np.where(is_faulty, 2.0 / 3.0, 1.0)
+
+    def of_softening_skin(_seed: int, turn: int) -> Float:
+        return third_region_factor(min(rate * max(turn - begin + 1, 0), limit))
+
     return {
-        "nothing": partial(gauges_off, 0, 0.0, sensors),
-        "a gauge shows 20 % too little": partial(gauges_off, 1, -0.2, sensors),
-        "a gauge shows 33 % too little": partial(gauges_off, 1, -1.0 / 3.0, sensors),
-        "gauge 17, strained most, 33 % too little": lambda _seed, turn: np.where(
-            (np.arange(sensors) == 16) & (turn >= BEGINS), 2.0 / 3.0, 1.0
-        ),
+        "nothing": partial(factor_of_drawn_gauges, 0, 0.0, sensors),
+        "a gauge shows 20 % too little": partial(factor_of_drawn_gauges, 1, -0.2, sensors),
+        "a gauge shows 33 % too little": partial(factor_of_drawn_gauges, 1, -1.0 / 3.0, sensors),
+        "gauge 17, strained most, 33 % too little": of_most_strained,
         "half of the gauges show 33 % too little": partial(
-            gauges_off, sensors // 2, -0.33, sensors
+            factor_of_drawn_gauges, sensors // 2, -0.33, sensors
         ),
-        "skin between the regions softens, a point a turn": lambda _seed, turn: softer(
-            min(rate * max(turn - begin + 1, 0), limit)
-        ),
+        "skin between the regions softens, a point a turn": of_softening_skin,
     }
 
 
-def flown(
-    knowledge: Knowledge, source: ReducedModelSource, fault: Fault, seeds: range
-) -> tuple[Float, Float]:
-    """Return rms of z1 and z2 [points], and turns at 3g beyond the limit and at 2g below it"""
+def fly_with_fault(
+    knowledge: Knowledge, source: ReducedModelSource, fault: FaultFactor, seeds: range
+) -> FlightErrors:
+    """Fly a mission for each seed with a fault of the gauges, and return errors and decisions.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        What the twin knows.
+    source : ReducedModelSource
+        The asset without the fault.
+    fault : callable
+        Factors of the gauges.
+    seeds : range
+        Seeds of the flights.
+    """
     scenario = knowledge.scenario
-    squares = []
-    turns = np.zeros(4)
     sharp = scenario.control_names.index("3g")
+    squared_errors = []
+    counts = np.zeros(4, dtype=int)
     for seed in seeds:
         asset = spoiled(source.open(), partial(fault, seed))
-        flight = fly(scenario, knowledge.twin(lag=1), knowledge.plant(knowledge.truth(seed), asset))
-        state = flight.state
-        error = flight.filtered @ knowledge.model.states.coordinates - state
-        squares.append(np.mean(error[BEGINS:] ** 2, axis=0))
-        beyond = beyond_the_limit(flight.control_index == sharp, state[:, 0])
-        below = (state[:, 0] < LIMIT)[:-1]
-        gentle = below & (flight.control_index != sharp)[1:]
-        turns += [*beyond, gentle.sum(), below.sum()]
-    return 100.0 * np.sqrt(np.mean(squares, axis=0)), turns
+        plant = knowledge.plant(knowledge.truth(seed), asset)
+        flight = fly(scenario, knowledge.twin(lag=1), plant)
+        error = flight.filtered @ knowledge.model.states.coordinates - flight.state
+        squared_errors.append(np.mean(error[BEGINS:] ** 2, axis=0))
+
+        z1 = flight.state[:, 0]
+        is_sharp = flight.control_index == sharp
+        sharp_beyond, beyond = beyond_the_limit(is_sharp, z1)
+        is_below = (z1 < LIMIT)[:-1]
+        is_gentle_next = (~is_sharp)[1:]
+        counts += [beyond, sharp_beyond, is_below.sum(), (is_below & is_gentle_next).sum()]
+    rms = 100.0 * np.sqrt(np.mean(squared_errors, axis=0))
+    return FlightErrors(rms, *counts.tolist())
 
 
 def main() -> int:
+    """Print a row for each fault and each twin."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=300)
     parser.add_argument("--first-seed", type=int, default=0)
@@ -88,23 +138,30 @@ def main() -> int:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.flights)
     scenario = load_scenario(SCENARIO).scenario
     wing = reduced_model(load_design())
-    plain = scenario.model_copy(update={"notice": None})
-    cases = [*faults(scenario.observation.count).items()]
-    chosen = range(len(cases)) if arguments.only is None else map(int, arguments.only.split(","))
+    scenarios = {
+        "with notices": scenario,
+        "without": scenario.model_copy(update={"notice": None}),
+    }
+    sources = {twin: ReducedModelSource(flown, wing) for twin, flown in scenarios.items()}
+    knowledge = {
+        twin: prepare_knowledge(scenarios[twin], source, scenario.mission.seed)
+        for twin, source in sources.items()
+    }
+    faults = list(fault_factors(scenario.observation.count).items())
+    if arguments.only is not None:
+        faults = [faults[int(number)] for number in arguments.only.split(",")]
     print(
         "| wrong from turn 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|"
         + " --- |" * 5
     )
-    sources = [(kind, ReducedModelSource(kind, wing)) for kind in (scenario, plain)]
-    twins = [
-        (prepare_knowledge(kind, source, scenario.mission.seed), source) for kind, source in sources
-    ]
-    for name, fault in (cases[number] for number in chosen):
-        for way, (knowledge, source) in zip(("with notices", "without"), twins, strict=True):
-            (z1, z2), (sharp, beyond, gentle, below) = flown(knowledge, source, fault, seeds)
+    for name, fault in faults:
+        for twin, source in sources.items():
+            errors = fly_with_fault(knowledge[twin], source, fault, seeds)
+            z1, z2 = errors.rms
             print(
-                f"| {name} | {way} | {z1:.1f}, {z2:.1f} | {100 * sharp / beyond:.1f} % "
-                f"| {100 * gentle / below:.2f} % |",
+                f"| {name} | {twin} | {z1:.1f}, {z2:.1f} "
+                f"| {100 * errors.sharp_beyond / errors.beyond:.1f} % "
+                f"| {100 * errors.gentle_below / errors.below:.2f} % |",
                 flush=True,
             )
     return 0

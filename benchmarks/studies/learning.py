@@ -89,7 +89,7 @@ def with_factor(scenario: Scenario, wing: ReducedModel, e: float) -> ReducedMode
 
 
 def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> TwinResult:
-    """Fly a mission for each seed, each with a wing of its own, and compare what the twin learnt."""
+    """Fly a mission for each seed with a wing of its own, and evaluate what the twin learnt."""
     scenario = knowledge.scenario
     covered = []
     errors = []
@@ -325,7 +325,7 @@ def reaches_targets(result: TwinResult) -> bool:
 def study_learning(
     scenario: Scenario, wing: ReducedModel, knowledge: Knowledge, seeds: range
 ) -> bool:
-    """Print missions of a twin that learns and of one that averages; return whether the former passes."""
+    """Compare twins that learn and that average; return whether the former reaches its targets."""
     headings = (
         "twin",
         "early 2g",

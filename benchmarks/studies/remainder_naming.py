@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.blind.cases import Case, Order, Workbench, finite_signals, workbench
 from benchmarks.blind.changes import Changes
 from benchmarks.blind.detectability import reference
-from benchmarks.blind.effects import DRAWS, Hidden
+from benchmarks.blind.effects import DRAWS
 from benchmarks.blind.instruments import Chance, Signals, draw_chance, measure
 from benchmarks.blind.lumped_rig import LumpedRig
 from benchmarks.blind.plan import CampaignPlan, TrialPlan
@@ -71,8 +71,8 @@ TRIALS = (
     "release 8 mm plus 1",
 )
 SAMPLES = 400
-FORGETS = 0.3
-"""Time over which the random force does [s]."""
+MEMORY = 0.3
+"""Time constant of the random force [s]."""
 RESONANCES = (1.6, 14.0)
 """Of the small mass [Hz]; its own damping is that of the rig."""
 
@@ -82,18 +82,18 @@ class LooseRig(LumpedRig):
 
     Parameters
     ----------
-    share : float
-        Of the mass that carries it.
-    at : int
-        Which carries it.
+    mass_ratio : float
+        The small mass over the mass that carries it.
+    carrier : int
+        Index of the mass that carries it.
     frequency : float
-        At which it would swing alone [Hz].
+        Natural frequency of the small mass on a fixed support [Hz].
     """
 
-    def __init__(self, share: float, at: int, frequency: float) -> None:
+    def __init__(self, mass_ratio: float, carrier: int, frequency: float) -> None:
         super().__init__()
-        self.share = share
-        self.at = at
+        self.mass_ratio = mass_ratio
+        self.carrier = carrier
         self.frequency = frequency
 
     def structure(
@@ -101,14 +101,15 @@ class LooseRig(LumpedRig):
     ) -> Structure:
         """Return the rig at a temperature above the reference [K]."""
         bare = super().structure(parameters, changes, temperature)
-        mass = self.share * float(bare.mass[self.at, self.at])
+        mass = self.mass_ratio * float(bare.mass[self.carrier, self.carrier])
         spring = mass * (2.0 * np.pi * self.frequency) ** 2
-        between = np.zeros(4)
-        between[self.at], between[3] = 1.0, -1.0
+        extension = np.zeros(4)
+        extension[self.carrier] = 1.0
+        extension[3] = -1.0
         return replace(
             bare,
             mass=block_diag(bare.mass, mass),
-            stiffness=block_diag(bare.stiffness, 0.0) + spring * np.outer(between, between),
+            stiffness=block_diag(bare.stiffness, 0.0) + spring * np.outer(extension, extension),
             outputs=np.column_stack((bare.outputs, np.zeros(len(bare.outputs)))),
             ports={name: np.append(vector, 0.0) for name, vector in bare.ports.items()},
             modes=4,
@@ -144,119 +145,227 @@ def short_plan(plan: CampaignPlan) -> CampaignPlan:
     )
 
 
-def pushed(work: Workbench, chance: Chance, generator: np.random.Generator, at: int) -> Signals:
-    """Return what a random force does to the linear rig, another one in each release."""
+def random_force_response(
+    work: Workbench, chance: Chance, generator: np.random.Generator, mass: int
+) -> Signals:
+    """Return the response of the linear rig to a random force on a mass, zero in static trials.
+
+    The force is noise of unit variance a sample, filtered by a low-pass with the time constant
+    `MEMORY`; each release has another one. It acts from five seconds before the release.
+    """
     structure = work.rig.structure(chance.parameters, Changes())
-    w, shapes = structure.angular_frequency, structure.shapes
+    w = structure.angular_frequency
+    shapes = structure.shapes
     damping = np.diag(structure.alpha + structure.beta * w**2)
-    count = len(w)
-    matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-np.diag(w**2), -damping]])
-    force = np.concatenate((np.zeros(count), shapes[at]))[:, None]
-    found = {}
+    modes = len(w)
+    system_matrix = np.block(
+        [[np.zeros((modes, modes)), np.eye(modes)], [-np.diag(w**2), -damping]]
+    )
+    input_vector = np.concatenate((np.zeros(modes), shapes[mass]))[:, None]
+    system = (system_matrix, input_vector, np.eye(2 * modes), 0.0 * input_vector)
+    response = {}
     for trial in work.plan.trials:
-        columns = [
-            work.rig.outputs.index(work.plan.channels[name].output) for name in trial.channels
-        ]
-        scales = np.array([work.plan.channels[name].scale for name in trial.channels])
-        found[trial.name] = np.zeros((len(trial.rows), len(columns)))
+        channels = [work.plan.channels[name] for name in trial.channels]
         if trial.kind != "ringdown":
+            response[trial.name] = np.zeros((len(trial.rows), len(channels)))
             continue
         interval = float(trial.rows[1] - trial.rows[0])
-        before = round(5.0 / interval)
-        kept = np.exp(-interval / FORGETS)
-        series = lfilter([1.0], [1.0, -kept], generator.standard_normal(before + len(trial.rows)))
-        system = (matrix, force, np.eye(2 * count), 0.0 * force)
-        modal = lsim(system, series, interval * np.arange(len(series)))[1]
-        values = modal[before:, :count] @ (structure.outputs[columns] @ shapes).T
-        found[trial.name] = values / scales
-    return found
+        lead = round(5.0 / interval)
+        memory = np.exp(-interval / MEMORY)
+        noise = generator.standard_normal(lead + len(trial.rows))
+        force = lfilter([1.0], [1.0, -memory], noise)
+        modal = lsim(system, force, interval * np.arange(len(force)))[1]
+        rows = [work.rig.outputs.index(channel.output) for channel in channels]
+        values = modal[lead:, :modes] @ (structure.outputs[rows] @ shapes).T
+        response[trial.name] = values / np.array([channel.scale for channel in channels])
+    return response
 
 
-def over_noise(plan: CampaignPlan, one: Signals, other: Signals) -> float:
-    """Return the rms difference of releases over the noise."""
-    parts = []
+def over_noise(plan: CampaignPlan, signals: Signals, reference_signals: Signals) -> float:
+    """Return the rms difference of two signals in the releases, in units of the noise."""
+    differences = []
     for trial in plan.trials:
         if trial.kind == "ringdown":
             noise = np.array([plan.channels[name].noise for name in trial.channels])
-            parts.append(((one[trial.name] - other[trial.name]) / noise).ravel())
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+            difference = (signals[trial.name] - reference_signals[trial.name]) / noise
+            differences.append(difference.ravel())
+    return float(np.sqrt(np.mean(np.concatenate(differences) ** 2)))
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """The rig with a hidden effect, or with nothing hidden.
+
+    Attributes
+    ----------
+    identifiers : list of str
+        The effect, or nothing.
+    changes : Changes
+        Its changes of the rig.
+    signals : mapping of str to array
+        Readings without noise by trial.
+    gap : float
+        Rms of what the effect does to the releases, in units of the noise.
+    """
+
+    identifiers: list[str]
+    changes: Changes
+    signals: Signals
+    gap: float
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Readings with a disturbance that no hypothesis knows.
+
+    Attributes
+    ----------
+    signals : mapping of str to array
+        Readings without noise by trial.
+    remainder : float
+        Rms of what the disturbance does to the releases, in units of the noise.
+    mass_ratio : float
+        The loose mass over the mass that carries it; 0 without one.
+    """
+
+    signals: Signals
+    remainder: float
+    mass_ratio: float
+
+
+def hide_effect(
+    work: Workbench,
+    chance: Chance,
+    generator: np.random.Generator,
+    identifier: str | None,
+) -> HiddenEffect:
+    """Draw an effect until its gap is `LEAST_GAP`, or take the largest of as many draws."""
+    nominal = reference(work.rig, work.plan, chance).nominal
+    hidden = HiddenEffect([], Changes(), nominal, 0.0)
+    if identifier is None:
+        return hidden
+    for _ in range(DRAWN):
+        effect = DRAWS[identifier](generator, work.bench)
+        signals = finite_signals(work, chance, effect.changes)
+        if signals is None or hidden.gap >= LEAST_GAP:
+            continue
+        gap = over_noise(work.plan, signals, nominal)
+        if gap > hidden.gap:
+            hidden = HiddenEffect([effect.identifier], effect.changes, signals, gap)
+    return hidden
+
+
+def add_random_force(
+    work: Workbench,
+    chance: Chance,
+    generator: np.random.Generator,
+    hidden: HiddenEffect,
+    mass: int,
+    wanted: float,
+) -> Disturbance:
+    """Add the response to a random force on a mass, scaled to the remainder `wanted`."""
+    response = random_force_response(work, chance, generator, mass)
+    nothing = {name: 0.0 * values for name, values in response.items()}
+    scale = wanted / over_noise(work.plan, response, nothing)
+    signals = {name: values + scale * response[name] for name, values in hidden.signals.items()}
+    return Disturbance(signals, wanted, 0.0)
+
+
+def add_loose_mass(
+    work: Workbench,
+    chance: Chance,
+    hidden: HiddenEffect,
+    carrier: int,
+    frequency: float,
+    wanted: float,
+) -> Disturbance:
+    """Add a mass on a spring of its own, sized to a remainder within 5 % of `wanted`."""
+    mass_ratio = 1e-3
+    for _ in range(8):
+        rig = LooseRig(mass_ratio, carrier, frequency)
+        loose = Workbench(rig, work.plan, lambda _region: work.bench)
+        signals = finite_signals(loose, chance, hidden.changes)
+        assert signals is not None
+        remainder = over_noise(work.plan, signals, hidden.signals)
+        disturbance = Disturbance(signals, remainder, mass_ratio)
+        if abs(remainder / wanted - 1.0) < 0.05:
+            break
+        mass_ratio *= min(max(wanted / remainder, 0.1), 10.0)
+    return replace(disturbance, mass_ratio=mass_ratio)
 
 
 def make(out: Path, number: int, seed: int, *, colour: bool) -> dict[str, Any]:
-    """Write a campaign, and return what is true of it."""
+    """Write a campaign and return its truth.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the study.
+    number : int
+        Number of the campaign, which decides what is hidden.
+    seed : int
+        Seed of the study.
+    colour : bool
+        Whether the noise is coloured, instead of a disturbance.
+    """
     generator = np.random.default_rng([seed, number, 7])
-    known = workbench("lumped")
-    work = Workbench(LumpedRig(), short_plan(known.plan), lambda item: known.bench)
+    lumped = workbench("lumped")
+    work = Workbench(LumpedRig(), short_plan(lumped.plan), lambda _region: lumped.bench)
     chance = draw_chance(generator, work.plan)
-    nominal = reference(work.rig, work.plan, chance).nominal
-    hidden: list[Hidden] = []
-    signals = nominal
-    gap = 0.0
-    changes = Changes()
-    identifier = HIDDEN[(number - number // 4) % len(HIDDEN)]
-    for _ in range(DRAWN if number % 4 else 0):
-        effect = DRAWS[identifier](generator, work.bench)
-        drawn = finite_signals(work, chance, effect.changes)
-        if drawn is not None and gap < LEAST_GAP and over_noise(work.plan, drawn, nominal) > gap:
-            hidden = [effect]
-            signals = drawn
-            changes = effect.changes
-            gap = over_noise(work.plan, drawn, nominal)
-    wanted = gap * float(generator.uniform(*SHARES)) if hidden else float(generator.uniform(*ALONE))
-    at, frequency = (
-        int(generator.integers(3)),
-        float(np.exp(generator.uniform(*np.log(RESONANCES)))),
-    )
-    mass, left = 0.0, 0.0
-    if number // 4 % 2 == 0 and not colour:
-        push = pushed(work, chance, generator, at)
-        size = wanted / over_noise(
-            work.plan, push, {name: 0.0 * values for name, values in push.items()}
-        )
-        signals = {name: values + size * push[name] for name, values in signals.items()}
-        left = wanted
-    elif not colour:
-        bare = signals
-        mass = 1e-3
-        for _ in range(8):
-            loose = Workbench(LooseRig(mass, at, frequency), work.plan, lambda item: work.bench)
-            found = finite_signals(loose, chance, changes)
-            assert found is not None
-            signals = found
-            left = over_noise(work.plan, found, bare)
-            if abs(left / wanted - 1.0) < 0.05:
-                break
-            mass *= min(max(wanted / left, 0.1), 10.0)
+
+    # The hidden effect: none in each fourth campaign
+    identifier = HIDDEN[(number - number // 4) % len(HIDDEN)] if number % 4 else None
+    hidden = hide_effect(work, chance, generator, identifier)
+
+    # The disturbance
+    if hidden.identifiers:
+        wanted = hidden.gap * float(generator.uniform(*SHARES))
+    else:
+        wanted = float(generator.uniform(*ALONE))
+    mass = int(generator.integers(3))
+    frequency = float(np.exp(generator.uniform(*np.log(RESONANCES))))
+    if colour:
+        disturbance = Disturbance(hidden.signals, 0.0, 0.0)
+    elif number // 4 % 2 == 0:
+        disturbance = add_random_force(work, chance, generator, hidden, mass, wanted)
+    else:
+        disturbance = add_loose_mass(work, chance, hidden, mass, frequency, wanted)
+
+    # Readings
     plan = replace(work.plan, noise_samples=100) if colour else work.plan
-    measured = measure(generator, plan, signals, changes, correlation=0.5 if colour else 0.0)
-    identifiers = [item.identifier for item in hidden]
+    measured = measure(
+        generator,
+        plan,
+        disturbance.signals,
+        hidden.changes,
+        correlation=0.5 if colour else 0.0,
+    )
     truth = {
-        "identifiers": identifiers,
-        "gap": gap,
-        "remainder": left,
-        "mass": mass,
-        "at": at,
+        "identifiers": hidden.identifiers,
+        "gap": hidden.gap,
+        "remainder": disturbance.remainder,
+        "mass": disturbance.mass_ratio,
+        "at": mass,
         "frequency": frequency,
     }
-    order = Order(f"case-{number:04d}", "catalogue", "lumped", tuple(identifiers), seed)
+    order = Order(f"case-{number:04d}", "catalogue", "lumped", tuple(hidden.identifiers), seed)
     write_case(Case(order, plan, measured, truth), out / "campaigns", out / "sealed")
     return truth
 
 
 def judge(out: Path, seed: int, number: int, *, colour: bool) -> dict[str, Any]:
-    """Make a campaign, name what it lacks and return truth and verdict."""
+    """Make a campaign, investigate it and return its truth, its verdict and the outcome."""
     truth = make(out, number, seed, colour=colour)
     folder = out / "campaigns" / f"case-{number:04d}"
-    began = time.perf_counter()
+    begin = time.perf_counter()
     try:
-        found = investigate(read_campaign(folder), model_of(folder), library(), thorough=False)
+        investigation = investigate(
+            read_campaign(folder), model_of(folder), library(), thorough=False
+        )
     except DiscrepancyError as error:
         return truth | {"kind": "error", "sentence": str(error), "outcome": "error", "seconds": 0.0}
-    return (
-        truth
-        | scored(found.verdict, truth["identifiers"], found.proof)
-        | {"seconds": time.perf_counter() - began}
-    )
+    verdict = scored(investigation.verdict, truth["identifiers"], investigation.proof)
+    return truth | verdict | {"seconds": time.perf_counter() - begin}
 
 
 def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, Any]:
