@@ -38,8 +38,8 @@ from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_patch, read_verdict_file
 from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.system.lumped_model import LumpedModel
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.wing_rows import PatchArrays
 from fe.structure.design import load_structure
 from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design

@@ -28,8 +28,8 @@ from discrepancy.system.output_equation import OutputEquation
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.model_cache import reduced_structure
-from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.port_laws import port_laws
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.packing.structure_fmu import build_fmu
@@ -131,7 +131,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     damping = rayleigh.alpha * mass + rayleigh.beta * stiffness
     end = rows[0]
     system = LinearSystem(mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, rayleigh.beta)
-    laws = laws_of(ModelPatch(hidden.laws), system.ports)
+    laws = port_laws(ModelPatch(hidden.laws), system.ports)
     channels = {
         name: Channel(
             name, quantity, name, NoiseRecord(NOISE[quantity], 200.0), 0.005, ZERO.get(quantity, 0.0)

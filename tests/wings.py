@@ -15,7 +15,7 @@ def wing_integrator(
     model: ReducedModel, *, damping_alpha: float, damping_beta: float, **values: Any
 ) -> ModalIntegrator:
     """Return the integrator at values by name, the losses together as `stiffness_loss`."""
-    return ModalIntegrator(model, model.vector(**values), damping_alpha, damping_beta)
+    return ModalIntegrator(model.structure_at(model.vector(**values)), damping_alpha, damping_beta)
 
 
 def tip_stiffness(wing: AffineWing, young_modulus_factor: float = 1.0, loss: Losses = ()) -> float:

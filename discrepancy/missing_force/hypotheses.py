@@ -22,11 +22,11 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.system.response import Response
 from discrepancy.system.sensing import observe_response
 from fe.compilation import compiled, law_functions
-from fe.runtime.arrays import HEAD, PLACE
+from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.laws import LAWS, advance, pull
+from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import steady
+from fe.runtime.laws.speed import steady_force
 from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of
 
@@ -93,11 +93,11 @@ def along(
     """Fill `found` (F,) with the force of a law at positions and speeds (F,) that follow one another."""
     for k in range(len(x)):
         if of_speed:
-            found[k] = steady(law, x[k], v[k])
+            found[k] = steady_force(law, x[k], v[k])
         else:
             advance(number, law, memory, x[k])
-            memory[PLACE] = x[k]
-            found[k] = pull(number, law, memory, x[k], 1.0)[0]
+            memory[POSITION] = x[k]
+            found[k] = force_and_slope(number, law, memory, x[k], 1.0)[0]
 
 
 @cache
@@ -118,15 +118,15 @@ def law_course(
     Where a speed may be zero by its deviation `doubt`, a law of the speed that is a force at rest, too, is
     what holds the port, `holding` (F,), up to its own largest.
     """
-    values, found = law.row, np.zeros(len(position))
-    memory = np.zeros(HEAD + max(1, len(values) - PARAMETERS))
+    values, found = law.parameter_row, np.zeros(len(position))
+    memory = np.zeros(FIRST_ELEMENT + max(1, len(values) - PARAMETERS))
     motion = (np.ascontiguousarray(position), np.ascontiguousarray(speed))
-    _compiled_along()(LAWS.index(type(law)), type(law).of_speed, values, *motion, memory, found)
-    if type(law).of_speed and doubt > 0.0:
+    _compiled_along()(LAWS.index(type(law)), type(law).depends_on_speed, values, *motion, memory, found)
+    if type(law).depends_on_speed and doubt > 0.0:
         slow = max(WIDER * doubt, SLOW * float(np.sqrt(np.mean(speed**2))))
         moves = erf(np.abs(speed) / (np.sqrt(2.0) * slow))
         found = moves * found + (1.0 - moves) * np.clip(holding, -np.abs(found), np.abs(found))
-    return found * law.acts(time)
+    return found * law.acts_at(time)
 
 
 class Columns:

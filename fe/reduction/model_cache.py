@@ -18,9 +18,9 @@ from threadpoolctl import threadpool_limits
 
 from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20
-from fe.runtime.arrays import FloatArray, IntArray, KeptArrays
+from fe.runtime.arrays import FloatArray, IntArray, StoredArrays
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.wing_rows import PatchArrays
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import assemble_structure, write_vtu
 from fe.structure.tables import StructureSettings
@@ -40,7 +40,7 @@ MODELLING_PACKAGES = ("runtime", "elements", "full", "structure", "wing", "reduc
 A change in any of their files makes a new cache entry.
 """
 
-_Record = TypeVar("_Record", bound=KeptArrays)
+_Record = TypeVar("_Record", bound=StoredArrays)
 
 
 def modelling_hash() -> str:
@@ -96,7 +96,7 @@ class WingFields(ReducedModel):
         Modal basis vectors.
     """
 
-    what = "a field basis"
+    record_name = "a field basis"
 
     points: Annotated[FloatArray, "points", 3]
     cells: Annotated[IntArray, "cells", 20]
@@ -354,7 +354,7 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     """
     displacement = wing.static_displacement @ wing.static_response(vector).coordinates
     strains = _strains_at_centres(wing, displacement)
-    region_losses = [vector[wing.chosen.index(name)] for name in wing.regions]
+    region_losses = [vector[wing.input_names.index(name)] for name in wing.regions]
     skin_loss, web_loss, rib_loss = 0.0, 0.0, 0.0
     losses = np.array([skin_loss, *region_losses, web_loss, rib_loss])
     write_vtu(

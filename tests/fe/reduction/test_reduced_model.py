@@ -57,7 +57,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
 
 
 def named(model: ReducedModel, vector: np.ndarray) -> dict[str, float]:
-    return dict(zip(model.chosen, vector.tolist(), strict=True))
+    return dict(zip(model.input_names, vector.tolist(), strict=True))
 
 
 def states(model: ReducedModel, count: int) -> np.ndarray:
@@ -123,8 +123,8 @@ def test_low_modes_keep_their_digits(pair):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e9, -1e9])
 def test_values_outside_validity_are_refused_by_name(pair, bad):
     model = pair.model
-    assert tuple(model.validity) == model.chosen
-    for name in model.chosen:
+    assert tuple(model.validity) == model.input_names
+    for name in model.input_names:
         vector = model.vector({name: bad})
         asked = [(ask, vector) for ask in (model.static_response, model.modes)]
         for ask, values in (*asked, (model.static_outputs, np.stack((model.nominal, vector)))):
