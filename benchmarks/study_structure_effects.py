@@ -27,7 +27,7 @@ from discrepancy.system.motion import motion_of
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
-from fe.reduction.model_cache import reduced_structure
+from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.port_laws import port_laws
 from fe.structure.design import load_structure
@@ -112,7 +112,7 @@ def structure_file(folder: Path) -> Path:
 def rig(folder: Path) -> Path:
     """Pack the bracket and write its model file; return the model file."""
     file = structure_file(folder)
-    build_fmu(reduced_structure(file), folder / "bracket.fmu", kind="compiled")
+    build_fmu(reduced_model(file), folder / "bracket.fmu", kind="compiled")
     path = folder / "rig.toml"
     path.write_text(rig_text(load_structure(file), "bracket.fmu"), encoding="utf-8")
     return path

@@ -85,7 +85,7 @@ class StructureModel(SystemModel):
     Parameters
     ----------
     model : ReducedModel
-        The structure, with the ports of its file (`reduced_structure(..., with_ports=True)`).
+        The structure, with the ports of its file (`reduced_model(..., with_ports=True)`).
 
     Raises
     ------

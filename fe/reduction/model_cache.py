@@ -11,7 +11,7 @@ expanded on the mesh by the static basis, which takes milliseconds.
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -115,28 +115,58 @@ def _fields_of(model: ReducedModel) -> dict[str, Any]:
     return {field.name: getattr(model, field.name) for field in fields(ReducedModel)}
 
 
+@overload
 def reduced_model(
-    design: WingDesign | None = None,
+    source: WingDesign | None = None,
     progress: Progress | None = None,
     settings: StructureSettings | None = None,
+) -> ReducedModel: ...
+
+
+@overload
+def reduced_model(
+    source: Path | str,
+    progress: Progress | None = None,
+    *,
+    memory_limit: float | None = None,
+    with_ports: bool = False,
+) -> ReducedModel: ...
+
+
+def reduced_model(
+    source: WingDesign | Path | str | None = None,
+    progress: Progress | None = None,
+    settings: StructureSettings | None = None,
+    *,
+    memory_limit: float | None = None,
+    with_ports: bool = False,
 ) -> ReducedModel:
-    """Return the reduced model of a wing, from the cache if it is there.
+    """Return the reduced model of a wing, or of a structure file, from the cache if it is there.
 
     Parameters
     ----------
-    design : WingDesign, optional
-        The wing; the shipped one by default.
+    source : WingDesign, Path or str, optional
+        The design of a wing, by default the shipped one, or the path of a structure file.
     progress : Progress, optional
         Where a build reports.
     settings : StructureSettings, optional
-        The accuracy that is asked for; by default that of the design.
+        The accuracy that is asked for of a wing; by default that of the design.
+    memory_limit : float, optional
+        Bytes that assembly and factorisation of a structure may take, as in
+        `fe.structure.operators.load_and_assemble`.
+    with_ports : bool
+        Whether the model of a structure also has the force and the displacement at each port of the
+        file, see `AffineStructure.pushed_at_ports`. Its `design_hash` is that of the model without
+        them.
 
     Raises
     ------
     FiniteElementError
-        If the design cannot be modelled or reduced.
+        If the design or the structure cannot be read, modelled or reduced.
     """
-    wing = design or load_design()
+    if isinstance(source, Path | str):
+        return _reduced_structure(source, progress, memory_limit, with_ports=with_ports)
+    wing = source or load_design()
     return _cached(
         ReducedModel,
         cache_file("wing", wing.hash, settings),
@@ -221,33 +251,14 @@ def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> 
     return reduce_patches(_assembled(design, progress), progress)
 
 
-def reduced_structure(
+def _reduced_structure(
     file: Path | str,
-    progress: Progress | None = None,
+    progress: Progress | None,
+    memory_limit: float | None,
     *,
-    memory_limit: float | None = None,
-    with_ports: bool = False,
+    with_ports: bool,
 ) -> ReducedModel:
-    """Return the reduced model of a structure file, from the cache if it is there.
-
-    Parameters
-    ----------
-    file : Path or str
-        The structure file, beside its mesh.
-    progress : Progress, optional
-        Where a build reports.
-    memory_limit : float, optional
-        Bytes that assembly and factorisation may take, as in
-        `fe.structure.operators.load_and_assemble`.
-    with_ports : bool
-        Whether the model also has the force and the displacement at each port of the file, see
-        `AffineStructure.pushed_at_ports`. Its `design_hash` is that of the model without them.
-
-    Raises
-    ------
-    FiniteElementError
-        If the structure cannot be read, modelled or reduced.
-    """
+    """Return the reduced model of a structure file; the parameters are those of `reduced_model`."""
 
     def build() -> ReducedModel:
         from .reduced_basis import reduce_structure

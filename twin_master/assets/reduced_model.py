@@ -86,9 +86,9 @@ class NamedStructure(AssetSource):
 
     def reduced(self, progress: Progress) -> "ReducedModel":
         """Return the reduced model, from the cache if it is there."""
-        from fe.reduction.model_cache import reduced_structure
+        from fe.reduction.model_cache import reduced_model
 
-        return reduced_structure(self.file, progress=progress)
+        return reduced_model(self.file, progress=progress)
 
     def check_model(self) -> None:
         """Look at what the reduced model is made of, as far as that takes no time."""
