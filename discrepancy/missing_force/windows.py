@@ -115,6 +115,8 @@ def sized_windows(
 ) -> tuple[GapWindow, ...]:
     """Return windows with the sizes and channels that the residuals show in them.
 
+    A window in which no reading counts is left out: nothing shows a gap there.
+
     Parameters
     ----------
     windows : sequence of GapWindow
@@ -132,6 +134,8 @@ def sized_windows(
         end = window.last if window.end is None else window.end.value
         time = item.trial.time
         inside = item.used & ((time >= begin) & (time <= end))[:, None]
+        if not inside.any():
+            continue
         squares = np.where(inside, (item.residual / noise[window.trial]) ** 2, 0.0).sum(axis=0)
         sizes = np.sqrt(squares / np.maximum(inside.sum(axis=0), 1))
         largest = float(sizes.max())
