@@ -38,6 +38,11 @@ class Term:
         return self.effect.identifier + (FREE_SHAPE if self.free_shape else "")
 
     @property
+    def name_in_words(self) -> str:
+        """The effect's name; of a free shape that of its family, of which the effect is one member."""
+        return f"a law of the family {self.effect.family}" if self.free_shape else self.effect.name
+
+    @property
     def parameters(self) -> tuple[EffectParameter | ShapeParameter, ...]:
         """Fitted parameters, in order."""
         return (*self.effect.parameters, *(self.effect.shape if self.free_shape else ()))

@@ -311,7 +311,7 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     at = search.ports.index(port)
     if at not in found.processes:
         found = search.at[port]
-    named = " and ".join(term.effect.name for term in found.candidate.terms if term.place == port)
+    named = " and ".join(term.name_in_words for term in found.candidate.terms if term.place == port)
     courses = []
     for trial, motion in zip(found.view.trials, found.motions, strict=True):
         samples = slice(None, None, trial.parts)
@@ -363,7 +363,7 @@ def seen_force(
         return None
     if missing is None or not missing.law or found is None:
         return missing
-    told, laws = missing.told, [(term.effect.name, term.place) for term in terms if term.place in ports]
+    told, laws = missing.told, [(term.name_in_words, term.place) for term in terms if term.place in ports]
     if len({place for _, place in laws}) > 1:
         told = replace(told, law=" and ".join(f"{name} at {place}" for name, place in laws))
     with suppress(*CANNOT):
