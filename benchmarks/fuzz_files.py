@@ -134,9 +134,9 @@ def _checkpoint(folder: Path) -> None:
 
     place = folder / "checkpoint"
     place.mkdir()
-    turns = [record for record, *_ in records_backwards(folder / "run" / JOURNAL_NAME)][-2::-1]
+    steps = [record for record, *_ in records_backwards(folder / "run" / JOURNAL_NAME)][-2::-1]
     with JournalFile(place, CONFIG_HASH) as file:
-        for record in turns:
+        for record in steps:
             file.append(record)
 
 

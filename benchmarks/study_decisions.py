@@ -2,8 +2,8 @@
 
 `python -m benchmarks.study_decisions --flights 300` flies the mission of level_turns with a wing whose gauges
 or skin are not as the model says, under many seeds, by the twin of the scenario and by the plain filter
-(`notice = false`). Printed for each: rms error of z1 and z2 from the turn of the fault on, turns flown at 3g
-with z1 truly at or above the limit, and turns at 2g below it, which were needless.
+(`notice = false`). Printed for each: rms error of z1 and z2 from the step of the fault on, steps flown at 3g
+with z1 truly at or above the limit, and steps at 2g below it, which were needless.
 """
 
 import argparse
@@ -24,17 +24,17 @@ from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]
 Fault = Callable[[int, int], Float]
-"""What the gauges show more (G,) in a flight of a seed in a turn."""
+"""What the gauges show more (G,) in a flight of a seed in a step."""
 
 SCENARIO = "level_turns"
 BEGINS = 10
-"""Turn from which on something is wrong."""
+"""Step from which on something is wrong."""
 
 
-def gauges_off(count: int, gain: float, sensors: int, seed: int, turn: int) -> Float:
+def gauges_off(count: int, gain: float, sensors: int, seed: int, step: int) -> Float:
     """Return what the gauges show more where `count` of them, drawn for each flight, are off."""
     chosen = np.random.default_rng([seed, 2]).permutation(sensors)[:count]
-    return np.where(np.isin(np.arange(sensors), chosen) & (turn >= BEGINS), 1.0 + gain, 1.0)
+    return np.where(np.isin(np.arange(sensors), chosen) & (step >= BEGINS), 1.0 + gain, 1.0)
 
 
 def faults(sensors: int) -> dict[str, Fault]:
@@ -44,12 +44,12 @@ def faults(sensors: int) -> dict[str, Fault]:
         "nothing": partial(gauges_off, 0, 0.0, sensors),
         "a gauge shows 20 % too little": partial(gauges_off, 1, -0.2, sensors),
         "a gauge shows 33 % too little": partial(gauges_off, 1, -1.0 / 3.0, sensors),
-        "gauge 17, strained most, 33 % too little": lambda _seed, turn: np.where(
-            (np.arange(sensors) == 16) & (turn >= BEGINS), 2.0 / 3.0, 1.0
+        "gauge 17, strained most, 33 % too little": lambda _seed, step: np.where(
+            (np.arange(sensors) == 16) & (step >= BEGINS), 2.0 / 3.0, 1.0
         ),
         "half of the gauges show 33 % too little": partial(gauges_off, sensors // 2, -0.33, sensors),
-        "skin between the regions softens, a point a turn": lambda _seed, turn: softer(
-            min(rate * max(turn - begin + 1, 0), limit)
+        "skin between the regions softens, a point a step": lambda _seed, step: softer(
+            min(rate * max(step - begin + 1, 0), limit)
         ),
     }
 
@@ -57,8 +57,8 @@ def faults(sensors: int) -> dict[str, Fault]:
 def flown(
     knowledge: Knowledge, source: ReducedModelSource, fault: Fault, seeds: range
 ) -> tuple[Float, Float]:
-    """Return rms of z1 and z2 in points, and turns: at 3g beyond the limit, beyond, at 2g below, below."""
-    scenario, squares, turns = knowledge.scenario, [], np.zeros(4)
+    """Return rms of z1 and z2 in points, and steps: at 3g beyond the limit, beyond, at 2g below, below."""
+    scenario, squares, steps = knowledge.scenario, [], np.zeros(4)
     sharp = scenario.control_names.index("3g")
     for seed in seeds:
         asset = spoiled(source.open(), partial(fault, seed))
@@ -69,8 +69,8 @@ def flown(
         beyond = beyond_the_limit(flight.control_index == sharp, state[:, 0])
         below = (state[:, 0] < LIMIT)[:-1]
         gentle = below & (flight.control_index != sharp)[1:]
-        turns += [*beyond, gentle.sum(), below.sum()]
-    return 100.0 * np.sqrt(np.mean(squares, axis=0)), turns
+        steps += [*beyond, gentle.sum(), below.sum()]
+    return 100.0 * np.sqrt(np.mean(squares, axis=0)), steps
 
 
 def main() -> int:
@@ -85,7 +85,7 @@ def main() -> int:
     cases = [*faults(scenario.observation.count).items()]
     chosen = range(len(cases)) if given.only is None else map(int, given.only.split(","))
     print(
-        "| wrong from turn 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|" + " --- |" * 5
+        "| wrong from step 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|" + " --- |" * 5
     )
     sources = [(kind, ReducedModelSource(kind, wing)) for kind in (scenario, plain)]
     twins = [(prepare_knowledge(kind, source, scenario.mission.seed), source) for kind, source in sources]

@@ -135,7 +135,7 @@ def half(twins: int) -> None:
 
 
 def score(known: Knowledge, flown: Flights) -> Float:
-    """Return the mean log probability of the true state ten turns ahead, of each twin: (B,)."""
+    """Return the mean log probability of the true state ten steps ahead, of each twin: (B,)."""
     model, steps = known.model, flown.state.shape[1]
     result = np.zeros(len(flown.state))
     begins = range(5, steps - AHEAD, 10)

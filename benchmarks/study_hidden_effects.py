@@ -5,8 +5,8 @@ hidden effects in the FMU of the wing. The run folder alone is then read as a ca
 is named, or the most probable member of a group, goes into the twin's model, and the mission is flown again
 with the same seed. A drift cannot stand in a table of predicted strains; there the readings are corrected
 before the twin sees them, as with the temperature, which the run records. Printed: the verdict of each
-mission; rms error of the health estimate in points, the share of turns whose 90 % set of states holds the
-truth, and the turns at 3g with z1 truly at or above the limit, before and after; the table compares the
+mission; rms error of the health estimate in points, the share of steps whose 90 % set of states holds the
+truth, and the steps at 3g with z1 truly at or above the limit, before and after; the table compares the
 missions that were flown again.
 """
 
@@ -61,7 +61,7 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of
 from twin_master.store.writing import write_run
 
-TURNS = 50
+STEPS = 50
 LIMIT = 0.6 - 1e-9
 """z1 from which on the policy of the wing without an effect leaves 3g."""
 
@@ -91,7 +91,7 @@ class Hidden:
 HIDDEN = (
     Hidden("", "", (), "nothing"),
     Hidden(
-        "gauge_zero_drift", "g17", (SensorDrift("strain[17]", -8e-4, float(TURNS)),),
+        "gauge_zero_drift", "g17", (SensorDrift("strain[17]", -8e-4, float(STEPS)),),
         "gauge 17 drifts to -800 microstrain",
     ),
     Hidden("gauge_gain", "g17", (SensorGain("strain[17]", -0.12),), "gauge 17 shows 12 % too little"),
@@ -119,9 +119,9 @@ class Flown:
     rms : (2,) ndarray
         Of the mean of z1, z2 less the truth [1].
     coverage : float
-        Share of turns whose 90 % set of states holds the truth.
+        Share of steps whose 90 % set of states holds the truth.
     decided : (2,) ndarray
-        Turns flown at 3g with z1 truly at or above the limit, behind the first of them, and turns beyond it.
+        Steps flown at 3g with z1 truly at or above the limit, behind the first of them, and steps beyond it.
     """
 
     rms: NDArray[np.float64]
@@ -153,7 +153,7 @@ def fly_mission(
     hidden: Sequence[Primitive] = (),
     known: Sequence[Primitive] = (),
     scenario: str = "growing_damage",
-    turns: int = TURNS,
+    steps: int = STEPS,
     draws: int = 100,
 ) -> Flown:
     """Fly a mission into a run folder, without its report.
@@ -170,7 +170,7 @@ def fly_mission(
         What the twin's model has.
     scenario : str
         A shipped one.
-    turns : int
+    steps : int
         Length of the mission.
     draws : int
         Of the calibrated parameter.
@@ -181,7 +181,7 @@ def fly_mission(
             file = atomic_write_text(folder.with_name(f"{folder.name}_{name}.json"), patch_text(primitives))
             lines[name] = f'patch = "{file.name}"\n'
     text = scenario_files()[scenario].read_text(encoding="utf-8")
-    text = text.replace("steps = 50", f"steps = {turns}", 1)
+    text = text.replace("steps = 50", f"steps = {steps}", 1)
     text = text.replace("draws = 100", f"draws = {draws}", 1)
     if depends_on_temperature(hidden):
         text = scenario_in_air(text, folder.parent, f"{folder.name}_wing", patch_text(hidden))
@@ -228,7 +228,7 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Fl
 
 
 def beyond_the_limit(sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the turns at 3g with z1 at or above the limit, and all such turns.
+    """Return the steps at 3g with z1 at or above the limit, and all such steps.
 
     The first of them is left out: its control was decided before.
     """
@@ -274,14 +274,14 @@ def study(
     hidden: Hidden,
     seed: int,
     work: Path,
-    turns: int = TURNS,
+    steps: int = STEPS,
     effects: Sequence[Effect] | None = None,
     again: bool = True,
 ) -> Case:
     """Fly with a hidden effect, find it, and fly again with what was found if that is asked for."""
     began = perf_counter()
     place = work / f"{HIDDEN.index(hidden)}_{seed}"
-    before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives, turns=turns)
+    before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives, steps=steps)
     verdict = investigated(place.with_name(place.name + "_before"), seed, effects)
     after = None
     chosen = believed(verdict)
@@ -291,7 +291,7 @@ def study(
         known = tuple(item for item in found if undone(item) is None)
         after = fly_mission(
             place.with_name(place.name + "_after"), seed, (*hidden.primitives, *corrections), known,
-            turns=turns,
+            steps=steps,
         )  # fmt: skip
     return Case(hidden, seed, verdict, before, after, perf_counter() - began)
 
@@ -313,7 +313,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
-    parser.add_argument("--turns", type=int, default=TURNS)
+    parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--once", action="store_true", help="do not fly again with what was found")
     parser.add_argument("--catalogue", help="identifiers of effects that are looked for, with commas")
     given = parser.parse_args()
@@ -328,7 +328,7 @@ def main() -> int:
         for hidden in chosen:
             cases = []
             for seed in range(given.first_seed, given.first_seed + given.seeds):
-                case = study(hidden, seed, Path(folder), given.turns, effects or None, not given.once)
+                case = study(hidden, seed, Path(folder), given.steps, effects or None, not given.once)
                 cases.append(case)
                 after = (
                     ""

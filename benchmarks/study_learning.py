@@ -2,7 +2,7 @@
 
 `python -m benchmarks.study_learning --missions 3000 --first-seed 0` draws e of each wing from the prior of
 the scenario `level_turns_learning` and flies its mission twice from the same seeds: by a twin that learns,
-and by one that averages over e anew in each turn. Then it flies `--notices` (200) missions of a healthy wing,
+and by one that averages over e anew in each step. Then it flies `--notices` (200) missions of a healthy wing,
 as many with a gauge whose gain is off by 20 %, and half as many with skin that softens where the model has no
 region, and counts alarms. Exit code 1 if a target is missed.
 """
@@ -36,7 +36,7 @@ REACH = (0.9, 1.1)
 THIRD_REGION = {"span_start": 0.5, "span_end": 0.9, "chord_start": 0.1, "chord_end": 0.3}
 """Skin between the two regions of the model [m]."""
 SOFTENING = (10, 0.01, 0.4)
-"""First turn, loss of stiffness per turn, and the loss before which it is to be found."""
+"""First step, loss of stiffness per step, and the loss before which it is to be found."""
 GAIN = 0.2
 NOTICE_TARGETS = {"healthy": 0.01, "gauge": 0.99, "third region": 0.9}
 TARGETS = {"early": 0.08, "within": 0.98, "z1": 0.045, "z2": 0.13, "coverage": (0.85, 0.95)}
@@ -49,7 +49,7 @@ class Result:
     study: Outcomes
     covered: Estimated
     error_of_e: float
-    seconds_per_turn: float
+    seconds_per_step: float
 
 
 def factor_of(scenario: Scenario, seed: int) -> float:
@@ -80,8 +80,8 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
         flight = fly(scenario, twin, plant)
         seconds += time.process_time() - begin
         flights.put(number, flight)
-        # What was learnt at the end: the belief is pure, so the last turn can be asked again.
-        learnt = twin.revise(twin.turns - 1, twin.observed(twin.turns - 1)).learnt
+        # What was learnt at the end: the belief is pure, so the last step can be asked again.
+        learnt = twin.revise(twin.steps - 1, twin.observed(twin.steps - 1)).learnt
         if scenario.calibration.parameter in learnt:
             found = learnt[scenario.calibration.parameter]
             covered.append(found.lower <= e <= found.upper)
@@ -89,8 +89,8 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
     share = float(np.mean(covered)) if covered else float("nan")
     spread = float(np.sqrt(share * (1.0 - share) / max(len(covered), 1)))
     root = float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
-    per_turn = seconds / (len(seeds) * scenario.mission.steps)
-    return Result(outcomes(knowledge, flights), Estimated(share, spread), root, per_turn)
+    per_step = seconds / (len(seeds) * scenario.mission.steps)
+    return Result(outcomes(knowledge, flights), Estimated(share, spread), root, per_step)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Alarms:
 
     Attributes
     ----------
-    turn : (N,)
+    step : (N,)
         Of the first alarm; infinite where there was none.
     named : (N,)
         Whether it named what was wrong.
@@ -108,7 +108,7 @@ class Alarms:
         noise, but whether the fault is there.
     """
 
-    turn: NDArray[np.float64]
+    step: NDArray[np.float64]
     named: NDArray[np.bool_]
     bound: NDArray[np.bool_]
 
@@ -124,12 +124,12 @@ def third_region() -> Callable[[float], NDArray[np.float64]]:
 
 
 def spoiled(asset: Asset, factor: Callable[[int], NDArray[np.float64]]) -> Asset:
-    """Return an asset whose gauges show a factor (G,) more in each turn."""
-    turn = iter(range(1_000_000))
+    """Return an asset whose gauges show a factor (G,) more in each step."""
+    step = iter(range(1_000_000))
 
     def observe(control: object, health: object) -> AssetReading:
         reading = asset.step(control, health)  # type: ignore[arg-type]
-        return replace(reading, values=reading.values * factor(next(turn)))
+        return replace(reading, values=reading.values * factor(next(step)))
 
     return StatelessAsset(observe)
 
@@ -141,21 +141,21 @@ def fly_for_alarms(
     fault: Callable[[int, int], NDArray[np.float64]],
     wrong: Callable[[int], int | None],
 ) -> Alarms:
-    """Fly a mission with each wing; fault(seed, turn) is what its gauges show more, wrong(seed) the gauge."""
-    scenario, turns, named, bound = knowledge.scenario, [], [], []
+    """Fly a mission with each wing; fault(seed, step) is what its gauges show more, wrong(seed) the gauge."""
+    scenario, steps, named, bound = knowledge.scenario, [], [], []
     assert scenario.notice is not None
     noise = scenario.truth.noise.standard_deviation
     for seed in seeds:
         asset = with_factor(scenario, wing, factor_of(scenario, seed)).open()
 
-        def factor(turn: int, seed: int = seed) -> NDArray[np.float64]:
-            return fault(seed, turn)
+        def factor(step: int, seed: int = seed) -> NDArray[np.float64]:
+            return fault(seed, step)
 
         flight = fly(
             scenario, knowledge.twin(lag=1), knowledge.plant(knowledge.truth(seed), spoiled(asset, factor))
         )
-        alarms = [(turn, notice) for turn, notice in flight.notices if notice.kind == "alarm"]
-        turns.append(alarms[0][0] if alarms else np.inf)
+        alarms = [(step, notice) for step, notice in flight.notices if notice.kind == "alarm"]
+        steps.append(alarms[0][0] if alarms else np.inf)
         gauge = wrong(seed)
         said = alarms[0][1] if alarms else None
         if gauge is None:
@@ -163,13 +163,13 @@ def fly_for_alarms(
         else:
             named.append(said is not None and said.sensors == (gauge + 1,))
         shown = flight.observation
-        healthy = shown / np.array([fault(seed, turn) for turn in range(len(shown))])
+        healthy = shown / np.array([fault(seed, step) for step in range(len(shown))])
         gained = ((flight.observed - healthy) ** 2 - (flight.observed - shown) ** 2) / (
             2.0 * np.square(noise)
         )
         evidence = np.cumsum(gained.sum(axis=1))
         bound.append(bool(evidence.max() >= np.log(scenario.notice.threshold)))
-    return Alarms(np.array(turns), np.array(named), np.array(bound))
+    return Alarms(np.array(steps), np.array(named), np.array(bound))
 
 
 def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
@@ -181,29 +181,29 @@ def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
     def gauge_of(seed: int) -> int:
         return int(np.random.default_rng([seed, 2]).integers(sensors))
 
-    def off(seed: int, _turn: int) -> NDArray[np.float64]:
+    def off(seed: int, _step: int) -> NDArray[np.float64]:
         return np.where(np.arange(sensors) == gauge_of(seed), 1.0 + GAIN, 1.0)
 
     cases: dict[str, tuple[range, Callable[[int, int], NDArray[np.float64]], Callable[[int], int | None]]] = {
-        "healthy": (seeds, lambda _seed, _turn: one, lambda _seed: None),
+        "healthy": (seeds, lambda _seed, _step: one, lambda _seed: None),
         "gauge": (seeds, off, gauge_of),
         "third region": (
             seeds[: max(len(seeds) // 2, 1)],
-            lambda _seed, turn: softer(min(rate * max(turn - begin + 1, 0), limit)),
+            lambda _seed, step: softer(min(rate * max(step - begin + 1, 0), limit)),
             lambda _seed: None,
         ),
     }
-    last = begin - 1 + limit / rate  # the turn of the limit
+    last = begin - 1 + limit / rate  # the step of the limit
     print(
-        "\n| mission | alarm | turn, median | named | a test that knows all but whether |\n|" + " --- |" * 5
+        "\n| mission | alarm | step, median | named | a test that knows all but whether |\n|" + " --- |" * 5
     )
     reached = True
     for name, (own, fault, wrong) in cases.items():
         result = fly_for_alarms(knowledge, wing, own, fault, wrong)
-        found = result.turn < (last if name == "third region" else np.inf)
+        found = result.step < (last if name == "third region" else np.inf)
         share, bound = float(found.mean()), float(result.bound.mean())
         error = np.sqrt(share * (1.0 - share) / len(own))
-        median = np.median(result.turn[found]) if found.any() else np.nan
+        median = np.median(result.step[found]) if found.any() else np.nan
         print(
             f"| {name} | {found.sum()} of {len(own)}, {100 * share:.1f} ± {100 * error:.1f} % | {median:.0f} "
             f"| {100 * result.named[found].mean() if found.any() else 0:.0f} % | {100 * bound:.1f} % |",
@@ -222,7 +222,7 @@ def show(name: str, result: Result) -> None:
         f"| {100 * within.value:.1f} ± {100 * within.error:.1f} % "
         f"| {100 * z1.value:.2f} ± {100 * z1.error:.2f} | {100 * z2.value:.2f} ± {100 * z2.error:.2f} "
         f"| {100 * result.covered.value:.1f} ± {100 * result.covered.error:.1f} % "
-        f"| {100 * result.error_of_e:.2f} % | {1.0 / result.seconds_per_turn:.0f} |",
+        f"| {100 * result.error_of_e:.2f} % | {1.0 / result.seconds_per_step:.0f} |",
         flush=True,
     )
 
@@ -242,8 +242,8 @@ def reached(result: Result) -> bool:
 def learning(scenario: Scenario, wing: ReducedModel, knowledge: Knowledge, seeds: range) -> bool:
     """Print what learning is worth; return whether every target is reached."""
     print(
-        "| twin | early 2g | 2g within 2 turns | rms z1, points | rms z2, points | 90 % interval holds e "
-        f"| rms of e | turns a second |\n|{' --- |' * 8}"
+        "| twin | early 2g | 2g within 2 steps | rms z1, points | rms z2, points | 90 % interval holds e "
+        f"| rms of e | steps a second |\n|{' --- |' * 8}"
     )
     learning = fly_wings(knowledge, wing, seeds)
     show("learns", learning)

@@ -94,8 +94,8 @@ class Row:
 
 
 HEADINGS = (
-    "asset", "twin's model", "model error", "first seed", "2g within 2 turns", "early 2g", "rms z1, points",
-    "rms z2, points", "bias z1, points", "bias z2, points", "log evidence per turn", "true state in 90 % set",
+    "asset", "twin's model", "model error", "first seed", "2g within 2 steps", "early 2g", "rms z1, points",
+    "rms z2, points", "bias z1, points", "bias z2, points", "log evidence per step", "true state in 90 % set",
 )  # fmt: skip
 
 
@@ -161,7 +161,7 @@ def show_misfit(scenario: Scenario, wing: AssetSource, library: AssetSource, see
         headings.append(f"misfit at z1 {100 * z1:.0f} %, z2 {100 * z2:.0f} %")
         headings += ["bias of z1, points", "bias of z2, points"]
     control = scenario.control_names.index(scenario.mission.first_control)
-    title = "our model less the library, and what each gauge adds to the estimate of one turn (linearised)"
+    title = "our model less the library, and what each gauge adds to the estimate of one step (linearised)"
     states = [knowledge.model.states.index(place) for place in places]
     show(title, headings, misfit_rows(misfit, control, states), page)
     return misfit
@@ -336,7 +336,7 @@ def main() -> int:
     ]
     show(f"{given.missions} missions each, ± one standard error", HEADINGS, table, given.markdown)
     print(
-        "targets of 300 missions: 2g within 2 turns >= 98 %, early 2g <= 8 %, rms <= 4.5 and 13 points; "
+        "targets of 300 missions: 2g within 2 steps >= 98 %, early 2g <= 8 %, rms <= 4.5 and 13 points; "
         f"{given.missions} missions each, {seconds:.1f} s"
     )
     return 0 if all(fine for row in rows for _, fine in row.cells()) else 1

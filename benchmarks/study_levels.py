@@ -1,8 +1,8 @@
 """Whether beliefs hold a truth that lies between the levels of their states.
 
 `python -m benchmarks.study_levels --missions 300` flies the wing, the bracket and the stiffened panel with
-damage that grows between levels, at the mean rate of the twin: a little in every turn ("creeps"), or in the
-turns in which the twin's damage grows, by anything up to two levels ("jumps"). The noise is what the twin
+damage that grows between levels, at the mean rate of the twin: a little in every step ("creeps"), or in the
+steps in which the twin's damage grows, by anything up to two levels ("jumps"). The noise is what the twin
 assumes. A twin whose states stand for intervals (`observation.between_levels`) stands beside one whose truth
 is at the levels: how often 90 % sets hold the level nearest to the truth, how many states they have, the
 error, and in how many of the first `--watched` missions notices raise an alarm though nothing is wrong.
@@ -56,7 +56,7 @@ class Study:
 
     @property
     def held(self) -> tuple[float, float]:
-        """Share of turns in which the 90 % set holds the nearest state, and its mean number of states."""
+        """Share of steps in which the 90 % set holds the nearest state, and its mean number of states."""
         nearest = [
             np.abs(self.truth[..., f, None] - np.array(level)).argmin(axis=-1)
             for f, level in enumerate(self.levels)
@@ -76,7 +76,7 @@ class Study:
 
 
 def grown(law: str, probability: Float, factors: int, step: float, random: np.random.Generator) -> Float:
-    """Return by how much the damage of missions grows in a turn, (B, F), at the mean rate of the twin."""
+    """Return by how much the damage of missions grows in a step, (B, F), at the mean rate of the twin."""
     shape = (len(probability), factors)
     if law == "creeps":
         return random.gamma(2.0, 0.5 * step * probability[:, None], shape)
@@ -106,7 +106,7 @@ def fly(knowledge: Knowledge, shown: RegularGridInterpolator, law: str, missions
     scenario, sensors, model = knowledge.scenario, knowledge.sensor_model, knowledge.model
     random = np.random.default_rng(2021)
     levels = tuple(factor.levels for factor in model.states.factors)
-    highest, step = np.array([level[-1] for level in levels]), levels[0][1] - levels[0][0]
+    highest, spacing = np.array([level[-1] for level in levels]), levels[0][1] - levels[0][0]
     probability = np.array([float(p) for p in scenario.transition.probability.values()])  # type: ignore[arg-type]
     control = np.full(missions, scenario.control_names.index(scenario.mission.first_control))
     truth, belief = np.zeros((missions, len(levels))), np.tile(model.prior, (missions, 1))
@@ -114,9 +114,10 @@ def fly(knowledge: Knowledge, shown: RegularGridInterpolator, law: str, missions
     carried: list[Carried | None] = [None] * watched
     alarmed = np.zeros(watched, dtype=bool)
     truths, beliefs = [], []
-    for turn in range(scenario.mission.steps):
-        if turn:
-            truth = np.minimum(truth + grown(law, probability[control], len(levels), step, random), highest)
+    for step in range(scenario.mission.steps):
+        if step:
+            growth = grown(law, probability[control], len(levels), spacing, random)
+            truth = np.minimum(truth + growth, highest)
             belief = np.einsum("bi,bij->bj", belief, model.transition.matrix[control])
         seen = shown(truth)[np.arange(missions), control]
         seen = seen + random.standard_normal(seen.shape) * sensors.standard_deviation
@@ -124,7 +125,7 @@ def fly(knowledge: Knowledge, shown: RegularGridInterpolator, law: str, missions
         belief = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
         belief /= belief.sum(axis=1, keepdims=True)
         for b in range(watched):
-            estimate = estimator.turn(carried[b], seen[b], int(control[b]), turn)
+            estimate = estimator.step(carried[b], seen[b], int(control[b]), step)
             carried[b] = estimate.carried
             alarmed[b] |= any(notice.kind == "alarm" for notice in estimate.notices)
         truths.append(truth)

@@ -1,7 +1,7 @@
 """Eight gauges of 24, chosen by what they tell, by pivoted QR, and at random: flown, and compared.
 
 `python -m benchmarks.study_sensors --missions 300` flies `growing_damage` with eight of the wing's gauges,
-and the others lost from the first turn on. Printed for each choice: rms error of z1 and z2 [points], and the
+and the others lost from the first step on. Printed for each choice: rms error of z1 and z2 [points], and the
 share of missions that leave the sharp turn before the damage asks for it. Pivoted QR of what all gauges show
 in all states is how PySensors places sensors.
 """

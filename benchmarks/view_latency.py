@@ -1,7 +1,7 @@
-"""How long a turn takes to the screen: `python -m benchmarks.view_latency RUN`.
+"""How long a step takes to the screen: `python -m benchmarks.view_latency RUN`.
 
 The journal of a flown mission is written again, line by line, at a given rate, while headless browsers look
-at it; each page notes when it had painted a turn.
+at it; each page notes when it had painted a step.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def served(folder: Path) -> Iterator[str]:
 
 
 def latencies(run: Path, rate: float, viewers: int) -> dict[str, float]:
-    """Return milliseconds from the write of a turn to the paint that shows it, of every turn and viewer."""
+    """Return milliseconds from the write of a step to the paint that shows it, of every step and viewer."""
     lines = (run / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
     with tempfile.TemporaryDirectory(prefix="uav_twin_view_") as place, open_browser() as browser:
         folder = Path(place) / "run"
@@ -67,7 +67,7 @@ def latencies(run: Path, rate: float, viewers: int) -> dict[str, float]:
                 taken.append(painted[shown, 1] - np.array(written))
     values = np.concatenate(taken)
     return {
-        "viewers": viewers, "turns": len(written), "turns_per_second": rate,
+        "viewers": viewers, "steps": len(written), "steps_per_second": rate,
         "load_average": os.getloadavg()[0],
         "median_ms": float(np.median(values)), "p95_ms": float(np.quantile(values, 0.95)),
         "largest_ms": float(values.max()), "painted_share": float(np.mean(paints)),
@@ -78,7 +78,7 @@ def main() -> None:
     """Print the figures of a flown run folder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="a run folder that was flown")
-    parser.add_argument("--rate", type=float, default=20.0, help="turns a second")
+    parser.add_argument("--rate", type=float, default=20.0, help="steps a second")
     parser.add_argument("--viewers", type=int, nargs="*", default=[1, 3])
     given = parser.parse_args()
     for viewers in given.viewers:

@@ -13,8 +13,8 @@ PICTURES = {
             "front_mission",
             front.draw_mission,
             (
-                Statement("README.md", "falls back to a gentle turn at turn {change}"),
-                Statement("README.md", "the damage that calls for it is there from turn {damage} on"),
+                Statement("README.md", "falls back to a gentle turn at step {change}"),
+                Statement("README.md", "the damage that calls for it is there from step {damage} on"),
             ),
         ),
         Picture("front_structure", front.draw_structure),
@@ -38,7 +38,7 @@ PICTURES = {
             source=NOTEBOOK_EFFECT,
         ),
         Picture(
-            "front_watch", front.draw_watch, (Statement("README.md", "at turn 10: alarm at turn {alarm},"),)
+            "front_watch", front.draw_watch, (Statement("README.md", "at step 10: alarm at step {alarm},"),)
         ),
         Picture(
             "front_fleet",
@@ -60,13 +60,13 @@ PICTURES = {
         Picture(
             "three_regions",
             missions.draw_three_regions,
-            (Statement("docs/scenarios.md", "![Beliefs in three regions at turn {turn}]"),),
+            (Statement("docs/scenarios.md", "![Beliefs in three regions at step {step}]"),),
             minutes=True,
         ),
         Picture(
             "learnt",
             missions.draw_learnt,
-            (Statement("docs/learning.md", "![What was learnt in {turns} turns of the shipped scenario]"),),
+            (Statement("docs/learning.md", "![What was learnt in {steps} steps of the shipped scenario]"),),
         ),
         Picture("structure_bracket", missions.draw_bracket),
         Picture("structure_stiffened_panel", missions.draw_stiffened_panel),
@@ -89,7 +89,7 @@ PICTURES = {
         Picture(
             "view",
             missions.draw_view,
-            (Statement("docs/view.md", "![The page at turn {turn} of the paper's mission]"),),
+            (Statement("docs/view.md", "![The page at step {step} of the paper's mission]"),),
             browser=True,
         ),
         Picture(

@@ -21,7 +21,7 @@ from twin_master.assets.strain_library_source import StrainLibrarySource, load_s
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.turns import History, Turn
+from twin_master.mission.steps import History, MissionStep
 from twin_master.network.estimator import Estimator
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
@@ -100,7 +100,7 @@ def of_wing(given: str | Scenario, seed: int = 3) -> tuple[Knowledge, ReducedMod
 def flight_of(
     knowledge: Knowledge,
     source: AssetSource,
-    *sinks: Callable[[Turn], None],
+    *sinks: Callable[[MissionStep], None],
     seed: int = 3,
     asset: Asset | None = None,
 ) -> History:
@@ -112,11 +112,11 @@ def flight_of(
 def estimates_of(
     estimator: Estimator, seen: np.ndarray, controls: Sequence[int] | None = None
 ) -> list[Estimate]:
-    """Return what an estimator makes of turns, under their controls or always the first one."""
+    """Return what an estimator makes of steps, under their controls or always the first one."""
     estimates: list[Estimate] = []
-    for turn, (row, control) in enumerate(zip(seen, controls or [0] * len(seen), strict=True)):
+    for step, (row, control) in enumerate(zip(seen, controls or [0] * len(seen), strict=True)):
         before = estimates[-1].carried if estimates else None
-        estimates.append(estimator.turn(before, row, control, turn))
+        estimates.append(estimator.step(before, row, control, step))
     return estimates
 
 
@@ -138,13 +138,13 @@ def journal(folder: Path) -> list[dict[str, Any]]:
 
 
 @contextmanager
-def cut_off_after(turns: int) -> Iterator[None]:
-    """Let the run within die once so many turns are kept."""
+def cut_off_after(steps: int) -> Iterator[None]:
+    """Let the run within die once so many steps are kept."""
     append = JournalFile.append
 
     def dying(self: JournalFile, record: Mapping[str, Any]) -> None:
         append(self, record)
-        if record.get("turn") == turns - 1:
+        if record.get("step") == steps - 1:
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
