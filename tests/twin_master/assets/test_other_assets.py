@@ -329,7 +329,7 @@ def test_the_twin_finds_the_loss_from_records_of_accelerations(file, tmp_path):
     # mode 5, at 8 kHz and strongly damped, is in the record and told by none of the bands: a small bias
     assert np.abs((seen - true) / np.hypot(errors, 5e-3 * np.abs(true))).max() < 5.0
     assert np.all(errors[:, 0] < 1e-3 * true[:, 0])
-    # a record has its own rate, however many steps of the binding make a step
+    # a record has its own rate, however many communication steps of the binding make a step of the mission
     several = ("step_size = 1.0", "step_size = 1.0\ndecimation = 4")
     binding = written(tmp_path, structure_binding_text(load_structure(file)), several)
     once = {"mission": {"steps": 1}, "truth": {"gains": []}, "asset": {"binding": str(binding)}}

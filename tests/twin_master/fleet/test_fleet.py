@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import sys
 from collections.abc import Mapping
@@ -15,6 +16,7 @@ import xarray as xr
 
 from calibration.errors import PosteriorError
 from fmu_asset.errors import FmuEndedError
+from reporting.former_names import FormerNameWarning
 from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, edited, of_library, text_of, written
@@ -52,6 +54,17 @@ def growing(library_file: Path, count: int = 10, shard: int = 4) -> Fleet:
 def whole(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the flown fleet."""
     return fly_fleet(growing(library_file), tmp_path_factory.mktemp("whole") / "fleet").folder
+
+
+def test_a_store_of_an_earlier_version_is_read_with_one_sentence(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "former")
+    for path in folder.rglob("zarr.json"):
+        text = path.read_text(encoding="utf-8")
+        path.write_text(re.sub(r'(?<!: )"step"', '"turn"', text), encoding="utf-8")  # of the dimensions
+    with pytest.warns(FormerNameWarning, match=r"fleet\.zarr: `turn` is now called `step`"):
+        group = open_fleet(folder)["growing_damage"]
+    assert group.identical(open_fleet(folder)["growing_damage"])  # a second warning were an error
+    assert group.identical(open_fleet(whole)["growing_damage"])
 
 
 def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_path):

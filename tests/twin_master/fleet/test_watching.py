@@ -114,6 +114,10 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     last = {decision["asset"]: decision["step"] for decision in decisions}
     assert last == {f"north/wing-{number}": 2 for number in range(3)}
     assert "3 assets, 9 steps, 3 alarms" in done.stderr
+    former = command("fleet", "watch", fleet_file, "--out", tmp_path / "former", "--turns", 3)
+    assert former.stdout == done.stdout
+    assert "The option --turns: `--turns` is now called `--steps`. The former name" in former.stderr
+    assert "--turns" not in said("fleet", "watch", "--help")
     screen = seen("fleet", "watch", fleet_file, "--out", tmp_path / "seen")  # people see a table
     rows = re.findall(r"(north/wing-\d) +5 +2g +.* 2g +1 ", screen)
     assert rows[-3:] == ["north/wing-0", "north/wing-1", "north/wing-2"]

@@ -258,7 +258,7 @@ def test_a_budget_of_inspections_is_kept_in_every_step():
 
 def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path):
     text = 'format = 1\nfleet = { name = "inspected", shard = 20 }\n[[group]]\nname = "all"\n'
-    text += 'scenario = "inspected_wing"\ncount = 30\ninspections_a_step = 2\n'
+    text += 'scenario = "inspected_wing"\ncount = 30\ninspections_per_step = 2\n'
     with pytest.raises(FleetError, match="`shard` be 30 or more"):
         load_fleet(written(tmp_path, text))
     fleet = load_fleet(written(tmp_path, text, ("shard = 20", "shard = 30")))
