@@ -205,7 +205,8 @@ class Watch:
         """Write down a reading and what became of it; return the line."""
         record, told = self.intake.line(step, self.twin), self.teaching.untold
         if self.is_quiet:
-            sentence = f"Step {record['step']}: observations come again, after {self.silence:.0f} s."
+            when = f"{self.scenario.mission.step_name.capitalize()} {record['step']}"
+            sentence = f"{when}: observations come again, after {self.silence:.0f} s."
             told = [*told, Notice("heard", sentence).as_record()]
         if told:
             record["notices"] = record.get("notices", []) + told
