@@ -56,7 +56,7 @@ def with_present_names(
     FormerNameWarning
         If there is a former name; once for each source in a process.
     """
-    renamed: Any = record
+    renamed: object = record
     used: dict[str, str] = {}
     for location, present_name in present_names.items():
         *tables, former_name = location.split(".")
@@ -69,10 +69,12 @@ def with_present_names(
             renamed = changed
     if used:
         warn_of_former_names(source, used)
-    return renamed if isinstance(renamed, dict) else dict(renamed)
+    return renamed if isinstance(renamed, dict) else dict(record)
 
 
-def _with_renamed_key(node: Any, tables: list[str], former_name: str, present_name: str) -> Any:
+def _with_renamed_key(
+    node: object, tables: list[str], former_name: str, present_name: str
+) -> object:
     """Return a table, or a list of tables, in which a key has its present name.
 
     Parameters

@@ -12,17 +12,16 @@ import os
 import re
 import sys
 import tomllib
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TextIO, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
 import reporting.progress
-from reporting.former_names import FormerNameWarning, warn_of_former_names
+from reporting.former_options import former_option, move_former_options
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,7 +81,7 @@ def as_command(
 
     @functools.wraps(function)
     def command(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:
-        _move_former_options(options, former_flags)
+        move_former_options(options, former_flags)
         return function(*arguments, **options)
 
     signature = inspect.signature(function)
@@ -92,54 +91,11 @@ def as_command(
             entry = entries[parameter.name]
             if "former" in entry and not isinstance(entry, str):
                 former_flags[parameter.name] = entry["former"]
-                parameters.append(_former_option(parameter, entry))
+                parameters.append(former_option(parameter, entry))
             parameter = _as_typer_parameter(parameter, entry)
         parameters.append(parameter)
     vars(command)["__signature__"] = signature.replace(parameters=parameters)
     return command
-
-
-_FORMER = "former_"
-"""Begins the name of the hidden parameter that takes an option under its former name."""
-
-
-def _former_option(parameter: inspect.Parameter, entry: Mapping[str, Any]) -> inspect.Parameter:
-    """Return the hidden parameter that takes an option under the name that it had before."""
-    settings = {key: entry[key] for key in ("min", "max") if key in entry}
-    option = typer.Option(entry["former"], hidden=True, **settings)
-    return parameter.replace(
-        name=_FORMER + parameter.name,
-        annotation=Annotated[parameter.annotation, option],
-        default=None,
-    )
-
-
-def _move_former_options(options: dict[str, Any], former_flags: Mapping[str, str]) -> None:
-    """Move the values of options that were given under their former names to the present names.
-
-    Parameters
-    ----------
-    options : dict of str to object
-        The values of all parameters of a command; changed in place.
-    former_flags : dict of str to str
-        The former name of an option, such as `--turns`, by its parameter.
-
-    Raises
-    ------
-    typer.BadParameter
-        If an option is given under both names.
-    """
-    for name, former_flag in former_flags.items():
-        value = options.pop(_FORMER + name, None)
-        if value is None:
-            continue
-        flag = "--" + name.replace("_", "-")
-        if options[name] is not None:
-            raise typer.BadParameter(
-                f"is now called {flag}, and both are given.", param_hint=former_flag
-            )
-        warn_of_former_names(f"The option {former_flag}", {former_flag: flag})
-        options[name] = value
 
 
 def _as_typer_parameter(
@@ -366,30 +322,6 @@ def error_exit(text: str, code: int = 1) -> typer.Exit:
     """
     typer.secho(text, fg="red", err=True)
     return typer.Exit(code)
-
-
-@contextmanager
-def former_names_as_lines() -> Iterator[None]:
-    """Return a context in which a warning about a former name is a line of the error stream."""
-    with warnings.catch_warnings():
-        show_other_warnings = warnings.showwarning
-
-        def show_warning(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
-            if not issubclass(category, FormerNameWarning):
-                show_other_warnings(message, category, filename, lineno, file, line)
-            elif not loudness.quiet:
-                typer.secho(str(message), fg="yellow", err=True)
-
-        warnings.filterwarnings("always", category=FormerNameWarning)
-        warnings.showwarning = show_warning
-        yield
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import typer
 
 from reporting import terminal
 from reporting.errors import ReportingError
+from reporting.former_options import former_names_as_lines
 from reporting.words import counted, number
 from scenarios import scenario_files
 from twin_master import parts
@@ -134,7 +135,7 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
     `others` are base classes of errors of packages that this one may not import.
     """
     try:
-        with terminal.former_names_as_lines():
+        with former_names_as_lines(lambda: terminal.loudness.quiet):
             application()
     except Exception as error:
         if terminal.loudness.verbose:
