@@ -256,7 +256,7 @@ _RING: dict[str, Any] = {"marker": "o", "markersize": 9.0, "markerfacecolor": "n
 
 
 def belief_steps(run: Run) -> list[int]:
-    """Return different turns spread evenly from the first to the last."""
+    """Return different steps spread evenly from the first to the last."""
     return [int(step) for step in np.unique(np.linspace(0, run.steps - 1, _SMALL_PANELS).round().astype(int))]
 
 

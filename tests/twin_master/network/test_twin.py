@@ -95,7 +95,7 @@ def told(step: TwinStep) -> tuple[object, ...]:
 
 
 def test_a_twin_has_no_last_step_and_smooths_over_its_lag(knowledge, seen):
-    """Step by turn it concludes what filter and smoother find in the whole sequence.
+    """Step by step it concludes what filter and smoother find in the whole sequence.
 
     The smoother of a lag is that of the whole history: it needs no likelihood from before.
     """

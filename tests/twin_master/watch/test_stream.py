@@ -31,7 +31,7 @@ def with_section(watch: Watch, **keys: Any) -> Watch:
 
 
 def line(mission: Any, row: int, **others: Any) -> dict[str, Any]:
-    """Return the message of a row of a mission, without saying which turn it is."""
+    """Return the message of a row of a mission, without saying which step it is."""
     control = ("2g", "3g")[mission.control_index[row]]
     return {"control": control, "strain": mission.observed[row].tolist(), **others}
 
