@@ -1,6 +1,7 @@
 """What tests of missions share: scenarios with changes, twins of a strain library, runs cut off."""
 
 import json
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,19 +11,29 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.patch import ModelPatch, Primitive
 from fmu_asset.packing.patch_file import SCHEMA
+from reporting.files import hash_record
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
+from twin_master.mission.journal import (
+    JOURNAL_NAME,
+    JournalFile,
+    line_of,
+    records,
+    state_of,
+    state_text,
+)
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.steps import History, MissionStep
 from twin_master.network.estimator import Estimator
+from twin_master.run_folder import CONFIG_NAME, to_json
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from uav_twin import Estimate, load_scenario, reduced_model
@@ -135,6 +146,30 @@ def figures_of(folder: Path) -> dict[str, Any]:
 def journal(folder: Path) -> list[dict[str, Any]]:
     """Return the records of the journal of a run or watch."""
     return [record for record, *_ in records(folder / JOURNAL_NAME)]
+
+
+def with_former_names(folder: Path) -> None:
+    """Write a run folder as earlier versions did, with `turn` wherever a key says `step`."""
+    config = json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8"))
+    notice = config["scenario"].get("notice") or {}
+    for name in [name for name in notice if name.endswith("_steps")]:
+        notice[name.replace("steps", "turns")] = notice.pop(name)
+    (folder / CONFIG_NAME).write_text(to_json(config), encoding="utf-8")
+    path, content = folder / JOURNAL_NAME, b""
+    for line in path.read_bytes().splitlines():
+        text = re.sub(r'"(\w+_)?step(s?)":', r'"\1turn\2":', line[65:].decode("ascii"))
+        record = json.loads(text)
+        if "config_hash" in record:
+            record["config_hash"] = hash_record(config)
+        if "settled" in record:
+            arrays = arrays_from_bytes(state_of(record["settled"]["state"]), "the state")
+            arrays = {re.sub(r"\bsteps$", "turns", name): values for name, values in arrays.items()}
+            record["settled"]["state"] = state_text(arrays_to_bytes(arrays))
+        if "standing" in record:
+            record["standing"]["begin"] = len(content)
+        content += line_of(record)
+    assert b'"step' not in content
+    path.write_bytes(content)
 
 
 @contextmanager

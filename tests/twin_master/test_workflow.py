@@ -14,7 +14,8 @@ import pytest
 
 from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
-from tests.twin_master.runs import check_same, cut_off_after, noted, written
+from reporting.former_names import FormerNameWarning
+from tests.twin_master.runs import check_same, cut_off_after, noted, with_former_names, written
 from twin_master import workflow
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.run_folder import FIELD_NAME, KIND, create_run_folder, lock_run_folder, read_config
@@ -154,6 +155,21 @@ def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, steps):
     with pytest.raises(MissionInputError):
         fly(tmp_path / "never", library)
     assert not (tmp_path / "never").exists()
+
+
+def test_a_run_of_an_earlier_version_is_taken_up_with_a_sentence_for_each_file(flown, tmp_path, library_file):
+    with cut_off_after(20):
+        fly(tmp_path / "run", library_file)
+    with_former_names(tmp_path / "run")
+    assert "memory_turns" in (tmp_path / "run" / "config.json").read_text(encoding="utf-8")
+    with pytest.warns(FormerNameWarning) as told:
+        resume_run(tmp_path / "run")
+    assert [str(warning.message).removeprefix(f"{tmp_path / 'run'}/") for warning in told] == [
+        "config.json: `memory_turns` is now called `memory_steps` and `onset_turns` is now called "
+        "`onset_steps`. The former names are still read.",
+        "journal.jsonl: `turn` is now called `step`. The former name is still read.",
+    ]
+    check_same(tmp_path / "run", flown.folder, "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
 
 
 def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, tmp_path, monkeypatch):

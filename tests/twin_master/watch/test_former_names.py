@@ -1,20 +1,18 @@
 """Journals, recordings and messages of versions that called a step of a mission `turn`."""
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from reporting import former_names
 from reporting.former_names import FormerNameWarning
-from tests.twin_master.runs import journal
+from tests.twin_master.runs import journal, with_former_names
 from tests.twin_master.watch.conftest import begun, ran, viewed, watchful, write_csv
 from tests.twin_master.watch.test_teaching import tutor
-from twin_master.mission.journal import JOURNAL_NAME, line_of, state_of, state_text
+from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.feeds import CsvFeed, FolderFeed
 from twin_master.watch.message import Message, MessageReader, Refused
 
@@ -23,24 +21,8 @@ SENTENCE = "`turn` is now called `step`"
 
 @pytest.fixture(autouse=True)
 def nothing_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every file be one of which nothing was told yet."""
     monkeypatch.setattr(former_names, "_sources_told", set())
-
-
-def with_former_names(path: Path) -> None:
-    """Write a journal as earlier versions wrote it, with `turn` wherever a key says `step`."""
-    content = b""
-    for line in path.read_bytes().splitlines():
-        text = re.sub(r'"(\w+_)?step(s?)":', r'"\1turn\2":', line[65:].decode("ascii"))
-        record = json.loads(text)
-        if "settled" in record:
-            arrays = arrays_from_bytes(state_of(record["settled"]["state"]), "the state")
-            arrays = {re.sub(r"\bsteps$", "turns", name): values for name, values in arrays.items()}
-            record["settled"]["state"] = state_text(arrays_to_bytes(arrays))
-        if "standing" in record:
-            record["standing"]["begin"] = len(content)
-        content += line_of(record)
-    assert b'"step' not in content
-    path.write_bytes(content)
 
 
 def told_in(folder: Path) -> list[dict[str, Any]]:
@@ -62,7 +44,7 @@ def test_a_journal_of_an_earlier_version_is_read_and_gone_on_with(base, loose, t
     for number, end in enumerate((asked, asked + 5, asked + 15, None)):
         teach = tutor(stopped, tmp_path, "named", -0.3).act
         stopped.run(CsvFeed(loose, stopped.scenario), str, teach, steps=end)
-        with_former_names(stopped.folder / JOURNAL_NAME)
+        with_former_names(stopped.folder)
         with pytest.warns(FormerNameWarning, match=SENTENCE) as told:
             stopped = watchful(stopped, tmp_path / str(number))
         expected = told_in(whole.folder)[: len(told_in(stopped.folder))]
