@@ -89,7 +89,7 @@ def as_command(
     for parameter in signature.parameters.values():
         if parameter.name in entries:
             entry = entries[parameter.name]
-            if "former" in entry and not isinstance(entry, str):
+            if isinstance(entry, dict) and "former" in entry:
                 former_flags[parameter.name] = entry["former"]
                 parameters.append(former_option(parameter, entry))
             parameter = _as_typer_parameter(parameter, entry)

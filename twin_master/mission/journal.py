@@ -231,7 +231,10 @@ def records_of(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[tuple[dic
 
 
 def whole_record(line: bytes, path: Path) -> dict[str, Any] | None:
-    """Return the record of a line of a journal, None of a damaged one: each has a hash of its own."""
+    """Return the record of a line of the journal at `path`, or None where the line was changed.
+
+    Each line has a hash of its own. A line of an earlier version is returned with the present names.
+    """
     text = line[_DIGEST + 1 :].rstrip(b"\n")
     whole = sha256(text).hexdigest().encode("ascii") == line[:_DIGEST]
     record = json.loads(text) if whole else None
