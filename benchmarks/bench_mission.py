@@ -15,7 +15,7 @@ MEBIBYTE = 1024.0
 
 
 def fly(folder: Path, cache: Path) -> tuple[float, float]:
-    """Fly the shipped mission in a process of its own; return its seconds and the steps' seconds."""
+    """Return the seconds of the shipped mission in a process of its own, and those of its steps."""
     begin = time.perf_counter()
     subprocess.run(
         [sys.executable, "-m", "twin_master", "level_turns", "--quiet", "--out", str(folder)],
@@ -37,7 +37,9 @@ def run() -> list[Measurement]:
     whole = min(seconds for seconds, _ in warm)
     steps = min(seconds for _, seconds in warm)
     return [
-        Measurement("mission from nothing, design to report", cold, "s", 90.0, "the same, cache warm", whole),
+        Measurement(
+            "mission from nothing, design to report", cold, "s", 90.0, "the same, cache warm", whole
+        ),
         Measurement("largest process of it", largest, "MiB", 2048.0),
         Measurement("mission with the cache warm", whole, "s", 10.0, "its 50 steps", steps),
         Measurement("50 steps through the worker, checkpoints included", steps, "s", 1.0),
