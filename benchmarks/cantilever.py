@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from fe.runtime.port_laws import port_laws
 from numpy.typing import NDArray
 
 from calibration.result.record import ParameterPrior
@@ -37,6 +36,7 @@ from fe.runtime.patch import (
     RootCompliance,
     Washout,
 )
+from fe.runtime.port_laws import port_laws
 
 FloatArray = NDArray[np.float64]
 

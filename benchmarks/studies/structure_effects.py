@@ -17,7 +17,6 @@ from pathlib import Path
 from time import process_time
 
 import numpy as np
-from fe.runtime.port_laws import port_laws
 from numpy.typing import NDArray
 
 from discrepancy.campaign.protocol import Release
@@ -31,6 +30,7 @@ from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.port_laws import port_laws
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.packing.structure_fmu import build_fmu
