@@ -27,4 +27,5 @@ def draw_force_at_joint() -> Drawing:
         figure = missing_force_figure(missing)
         figure.suptitle("Force that the three-mass chain lacks at its joint", x=0.02, ha="left")
         png = to_png(figure, 110.0)
-    return Drawing(png, {"rms": float(missing.told.rms), "largest": abs(float(missing.told.largest.force))})
+    force = missing.at_port
+    return Drawing(png, {"rms": float(force.rms), "largest": abs(float(force.largest.force))})

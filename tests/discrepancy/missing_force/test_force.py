@@ -19,7 +19,8 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
-from discrepancy.missing_force.shares import ForceShares, explained_variance, missing_force
+from discrepancy.missing_force.port_force import explained_variance, missing_force
+from discrepancy.missing_force.shares import ForceShares
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
