@@ -23,7 +23,7 @@ from .events import GROUND, MOST_EVENTS, Events, events, throughout
 from .explained import ForceHypothesis, with_most_probable_forces
 from .filtered import Process
 from .naming import ForceSearch
-from .shares import evidence_without_force
+from .port_force import evidence_without_force
 from .switched_record import changes
 from .trial import SeenTrial
 from .view import View

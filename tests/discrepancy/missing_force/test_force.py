@@ -21,7 +21,8 @@ from discrepancy.fmu_models.model import FmuModel
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
-from discrepancy.missing_force.shares import ForceShares, explained_variance, missing_force
+from discrepancy.missing_force.port_force import explained_variance, missing_force
+from discrepancy.missing_force.shares import ForceShares
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
