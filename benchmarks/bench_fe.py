@@ -107,37 +107,42 @@ def _against_the_full_model() -> list[Measurement]:
             servo_mass, pitot_mass = random.uniform((0.05, 0.0), (0.30, 0.30)).tolist()
             frequency = eigenmodes(operators, e, z, servo_mass, pitot_mass, count=6).frequency
             masses = {"servo_mass": servo_mass, "pitot_mass": pitot_mass}
-            found = model.modes(masses, z, young_modulus_factor=e).frequency
-            frequency_errors.append(np.abs(found / frequency - 1.0).max())
+            reduced_frequency = model.modes(masses, z, young_modulus_factor=e).frequency
+            frequency_errors.append(np.abs(reduced_frequency / frequency - 1.0).max())
     assert min(effectivities) >= 1.0, "the certified bound does not hold"
 
     state = model.vector(stiffness_loss=(0.4, 0.2), load_factor=3.0)
-    one = median_seconds(lambda: model.static_response(state), inner=500)
+    seconds_of_one = median_seconds(lambda: model.static_response(state), inner=500)
     losses = random.uniform(0, 0.8, (2, 1000))
     vectors = model.vectors({"z1": losses[0], "z2": losses[1], "load_factor": 3.0})
     many = median_seconds(lambda: model.static_outputs(vectors)) / len(vectors)
     modes = median_seconds(lambda: model.modes(state), inner=50)
     integrator = ModalIntegrator(model, model.nominal, *model.damping)
-    at = integrator.released(0.02, (0.0, 0.0), TIP_FORCE)
+    motion = integrator.released(0.02, (0.0, 0.0), TIP_FORCE)
     step = median_seconds(
-        lambda: integrator.outputs(integrator.advance(at, 0.01, (3.0, 0.0))), inner=200
+        lambda: integrator.outputs(integrator.advance(motion, 0.01, (3.0, 0.0))), inner=200
     )
     full_time = float(np.median(full_times))
     return [
         Measurement(
             "reduced strain against the full model, speed-up",
-            full_time / one,
+            full_time / seconds_of_one,
             "x",
             20_000.0,
             larger_is_better=True,
         ),
         Measurement(
             "the same, with mesh and assembly of the full model",
-            (assembly_time + full_time) / one,
+            (assembly_time + full_time) / seconds_of_one,
             "x",
         ),
         Measurement(
-            "24 strains with certified bound", one * 1e6, "us", None, "full model", full_time * 1e6
+            "24 strains with certified bound",
+            seconds_of_one * 1e6,
+            "us",
+            None,
+            "full model",
+            full_time * 1e6,
         ),
         Measurement(
             "24 strains, 1,000 states at once, each",
@@ -145,7 +150,7 @@ def _against_the_full_model() -> list[Measurement]:
             "us",
             None,
             "one by one",
-            one * 1e6,
+            seconds_of_one * 1e6,
         ),
         Measurement("six modes", modes * 1e6, "us"),
         Measurement("transient step with outputs", step * 1e6, "us"),

@@ -89,7 +89,7 @@ def run() -> list[Measurement]:
             )
     return [
         Measurement(
-            f"a watch taken up after {TURNS + 19} turns{what}",
+            f"a watch taken up after {TURNS + 19} turns{suffix}",
             float(seconds[TURNS + 19][kind]),
             "s",
             None,
@@ -97,7 +97,7 @@ def run() -> list[Measurement]:
             float(seconds[turns][kind]),
         )
         for turns in (1, 99)
-        for kind, what in ((0, ", all of its process"), (2, ", what depends on the journal"))
+        for kind, suffix in ((0, ", all of its process"), (2, ", what depends on the journal"))
     ]
 
 

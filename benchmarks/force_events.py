@@ -133,27 +133,33 @@ def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
             {"mass": ("mass", 0.03), "spring": ("stiffness", 0.03), "damper": ("damping", 0.1)},
         ),
     }[slope.__name__]
-    deviations = noise * np.array([item[2] for item in channels.values()])
+    deviations = noise * np.array([channel[2] for channel in channels.values()])
     names = list(channels)
     readings = states[:, : len(names)] + deviations * generator.standard_normal((count, len(names)))
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    rest = deviations * generator.standard_normal((400, len(names)))
-    table(folder / "rest.csv", ["time", *names], np.column_stack((time[1] * np.arange(400), rest)))
+    noise_record = deviations * generator.standard_normal((400, len(names)))
+    table(
+        folder / "rest.csv",
+        ["time", *names],
+        np.column_stack((time[1] * np.arange(400), noise_record)),
+    )
     held = size * np.array([drive(float(t)) for t in time])
     table(folder / "1.csv", ["time", "drive", *names], np.column_stack((time, held, readings)))
     text = f'format = 1\nname = "{kind}"\n\n[noise]\nfile = "rest.csv"\n'
-    for name, (quantity, of, _) in channels.items():
-        text += entry("channel", name=name, quantity=quantity, unit=of, output=name)
-    quantity, of = unit.split()
-    text += entry("input", name="drive", quantity=quantity, unit=of, hold="zero_order")
+    for name, (quantity, channel_unit, _) in channels.items():
+        text += entry("channel", name=name, quantity=quantity, unit=channel_unit, output=name)
+    quantity, channel_unit = unit.split()
+    text += entry("input", name="drive", quantity=quantity, unit=channel_unit, hold="zero_order")
     text += entry("trial", name="record", kind="driven", file="1.csv", begins="still")
     (folder / "campaign.toml").write_text(text, "utf-8")
-    known = "".join(
+    parameter_tables = "".join(
         entry("parameter", name=name, terms=terms, deviation=deviation, low=0.4, high=2.5)
         for name, (terms, deviation) in parameters.items()
     )
-    (folder / "model.toml").write_text(f'format = 1\nname = "{kind}"\n{model}{known}', "utf-8")
+    (folder / "model.toml").write_text(
+        f'format = 1\nname = "{kind}"\n{model}{parameter_tables}', "utf-8"
+    )
     return Case(folder, tuple(windows), length)
 
 
@@ -167,9 +173,9 @@ def problem_of(case: Case) -> Problem:
 def found_in(case: Case) -> FloatArray:
     """Return medians and ends of the 90 % intervals (C, 3) of all changes of a record [s]."""
     search = ForceSearch(problem_of(case))
-    one = search.rough(max(search.at, key=lambda name: search.at[name].log_evidence))
-    ((port, process),) = one.processes.items()
-    return events(one.view, port, process).moments(0)
+    force = search.rough(max(search.at, key=lambda name: search.at[name].log_evidence))
+    ((port, process),) = force.processes.items()
+    return events(force.view, port, process).moments(0)
 
 
 def counted(case: Case, found: FloatArray) -> Counter[str]:

@@ -507,21 +507,21 @@ def _advance(
     while remaining > 0.0:
         _fill_port_displacements(state, structure, history.displacement)
         new = _runge_kutta_step(state, time, remaining, structure, laws, history, force)
-        taken = remaining
+        step = remaining
         has_stopped = False
 
         # Does the sliding port stop within the step?
         may_stop = rigid >= 0 and history.sliding[rigid] != 0.0 and stops < MOST_STOPS
         if may_stop and _modal_velocity(new, structure, rigid) * history.sliding[rigid] < 0.0:
-            taken = _time_until_stop(state, time, remaining, structure, laws, history, force, rigid)
-            new = _runge_kutta_step(state, time, taken, structure, laws, history, force)
+            step = _time_until_stop(state, time, remaining, structure, laws, history, force, rigid)
+            new = _runge_kutta_step(state, time, step, structure, laws, history, force)
             stops += 1
             has_stopped = True
 
         _advance_play(new, structure, laws, history)
         state = new
-        time += taken
-        remaining = remaining - taken if has_stopped else 0.0
+        time += step
+        remaining = remaining - step if has_stopped else 0.0
 
         # From rest the port sticks or slides anew
         if rigid >= 0:
@@ -562,7 +562,7 @@ def integrate(
         Kept states.
     """
     ports = len(laws.kinds)
-    kept = np.empty((sampling.states, len(state)))
+    states = np.empty((sampling.states, len(state)))
     force = np.zeros(ports)
     history = History(np.zeros(ports), play, np.zeros(ports))
     rigid = _port_with_rigid_friction(structure, laws)
@@ -576,10 +576,10 @@ def integrate(
     row = 0
     for step in range(total + 1):
         if step >= lead_steps and (step - lead_steps) % sampling.steps_between == 0:
-            kept[row] = state
+            states[row] = state
             row += 1
         if step == total:
             break
         length = sampling.lead / lead_steps if step < lead_steps else sampling.step
         state, time = _advance(state, time, length, structure, laws, history, force, rigid)
-    return kept
+    return states

@@ -414,7 +414,7 @@ class Structure:
         times = release.times
         interval = (times[-1] - times[0]) / (len(times) - 1)
         steps = int(np.ceil(interval / (split * STEP) - 1e-9)) * refinement
-        kept = integrate(
+        states = integrate(
             state,
             np.vstack([held.play, np.zeros((1, held.play.shape[1]))]),
             ModalStructure(
@@ -435,9 +435,9 @@ class Structure:
         )
 
         # Outputs of the modes and of the flexibility
-        outputs = kept[:, :modes] @ (self.outputs @ shapes).T
-        outputs += kept[:, 2 * modes : 2 * modes + len(ports)] @ (self.outputs @ higher).T
-        fine_times = times[0] + interval / split * np.arange(len(kept))
+        outputs = states[:, :modes] @ (self.outputs @ shapes).T
+        outputs += states[:, 2 * modes : 2 * modes + len(ports)] @ (self.outputs @ higher).T
+        fine_times = times[0] + interval / split * np.arange(len(states))
         return np.asarray(outputs), fine_times
 
     def free_ringdown(self, release: Release) -> FloatArray:

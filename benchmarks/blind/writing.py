@@ -18,7 +18,7 @@ def _text(value: str | float | tuple[float, float] | bool) -> str:
     if isinstance(value, str):
         return json.dumps(value)
     if isinstance(value, tuple):
-        return "[" + ", ".join(_text(item) for item in value) + "]"
+        return "[" + ", ".join(_text(element) for element in value) + "]"
     return repr(float(value))
 
 
@@ -60,7 +60,8 @@ def _trial(trial: TrialPlan, file: str, case: Case) -> list[str]:
         rows["load_place"] = _text(plan.places[trial.place])
     if trial.kind == "ringdown":
         rows["release"] = (
-            f'{{ displacement = {trial.release!r}, unit = "m", deviation = {plan.release_deviation!r}, '
+            f'{{ displacement = {trial.release!r}, unit = "m", '
+            f"deviation = {plan.release_deviation!r}, "
             "at_rest = true, mode_count = 3, time_zero_deviation = 0.0 }"
         )
     return _table("[[trial]]", rows)

@@ -284,11 +284,11 @@ def hidden_values(name: str, truth: Truth) -> dict[str, Any]:
             "free_play": {"stiffness": size / length, "half_width": truth.shape * length},
             "bouc_wen_hysteresis": yields,
         }
-    known = values.get(truth.law, {})
+    true_values = values.get(truth.law, {})
     identifier = "outflow" if truth.law == "natural_convection" else truth.law
     return {
         "place": port if truth.law else "",
-        "values": {f"{identifier}.{key}": value for key, value in known.items()},
+        "values": {f"{identifier}.{key}": value for key, value in true_values.items()},
     }
 
 
@@ -302,9 +302,11 @@ def varied(
     if variant == "held" and bench.rig.drive.startswith(("force", "angle", "acceleration")):
         courses = [
             Course.stepped(
-                tuple(one.value(float(t), 0) for t in time), tuple(time[1:].tolist()), one.push
+                tuple(course.value(float(t), 0) for t in time),
+                tuple(time[1:].tolist()),
+                course.push,
             )
-            for one, time in zip(courses, stamps, strict=True)
+            for course, time in zip(courses, stamps, strict=True)
         ]
     if variant in ("jitter", "all"):
         interval = bench.rig.interval
@@ -314,10 +316,10 @@ def varied(
         ]
         stamps = [time - time[0] for time in stamps]
         courses = [
-            Course.stepped(one.steps, tuple(time[STEP::STEP].tolist()), one.push)
-            if one.steps
-            else one
-            for one, time in zip(courses, stamps, strict=True)
+            Course.stepped(course.steps, tuple(time[STEP::STEP].tolist()), course.push)
+            if course.steps
+            else course
+            for course, time in zip(courses, stamps, strict=True)
         ]
     return courses, stamps, OFFSET * bench.rig.amplitude if variant in ("offset", "all") else offset
 
@@ -363,25 +365,27 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
     quantity, unit, hold = rig.drive.split()
     hold = "zero_order" if courses[0].steps else hold
     text = f'format = 1\nname = "{folder.name}"\n\n[noise]\nfile = "rest.csv"\n'
-    for name, of, in_unit, deviation in rig.channels:
+    for name, channel_quantity, in_unit, deviation in rig.channels:
         text += entry(
             "channel",
             name=name,
-            quantity=of,
+            quantity=channel_quantity,
             unit=in_unit,
             output=name,
             offset_deviation=ZERO * deviation,
         )
-    more: dict[str, bool | float] = {"reference": True} if "[[controller]]" in rig.model else {}
-    more |= {"offset_deviation": offset} if offset else {}
-    text += entry("input", name="drive", quantity=quantity, unit=unit, hold=hold, **more)
+    drive_keys: dict[str, bool | float] = (
+        {"reference": True} if "[[controller]]" in rig.model else {}
+    )
+    drive_keys |= {"offset_deviation": offset} if offset else {}
+    text += entry("input", name="drive", quantity=quantity, unit=unit, hold=hold, **drive_keys)
     folder.mkdir(parents=True)
     colour = COLOUR if variant == "colour" else 0.0
-    rest = bench.noise * noise_of(noise, (NOISE_SAMPLES, len(names)), colour)
+    noise_record = bench.noise * noise_of(noise, (NOISE_SAMPLES, len(names)), colour)
     table(
         folder / "rest.csv",
         ["time", *names],
-        np.column_stack((rig.interval * np.arange(NOISE_SAMPLES), rest)),
+        np.column_stack((rig.interval * np.arange(NOISE_SAMPLES), noise_record)),
     )
     readings = simulate(rig, truth, driven, stamps)
     for number, (course, time_, values) in enumerate(

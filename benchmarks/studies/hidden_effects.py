@@ -261,13 +261,13 @@ def beyond_the_limit(sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> NDArr
 
 def outputs_of(patch: ModelPatch) -> tuple[Primitive, ...]:
     """Return primitives whose channels g1, g2, ... are renamed to FMU outputs strain[1], ..."""
-    found = []
-    for item in patch:
-        channel = getattr(item, "channel", "")
+    primitives = []
+    for primitive in patch:
+        channel = getattr(primitive, "channel", "")
         if channel.startswith("g"):
-            item = replace(item, channel=f"strain[{channel[1:]}]")  # type: ignore[call-arg]
-        found.append(item)
-    return tuple(found)
+            primitive = replace(primitive, channel=f"strain[{channel[1:]}]")  # type: ignore[call-arg]
+        primitives.append(primitive)
+    return tuple(primitives)
 
 
 def undone(item: Primitive) -> Primitive | None:
@@ -354,9 +354,9 @@ def main() -> int:
     )
     arguments = parser.parse_args()
     effects = [
-        effect_by_identifier(item, library())
-        for item in (arguments.catalogue or "").split(",")
-        if item
+        effect_by_identifier(identifier, library())
+        for identifier in (arguments.catalogue or "").split(",")
+        if identifier
     ]
     console = Console(width=150)
     heads = ("rms z1, z2 {}", "90 % sets", "3g beyond the limit")
@@ -364,9 +364,9 @@ def main() -> int:
         "hidden", "verdicts", *(head.format(when) for when in ("before", "after") for head in heads)
     )
     chosen = [
-        item
-        for item in HIDDEN
-        if arguments.only is None or item.identifier in arguments.only.split(",")
+        identifier
+        for identifier in HIDDEN
+        if arguments.only is None or identifier.identifier in arguments.only.split(",")
     ]
     with tempfile.TemporaryDirectory() as folder:
         for hidden in chosen:
@@ -406,9 +406,9 @@ def _row(hidden: Hidden, cases: Sequence[Case]) -> tuple[str, ...]:
 def _shown(flown: Sequence[Flown]) -> tuple[str, str, str]:
     if not flown:
         return "", "", ""
-    values = 100.0 * np.sqrt(np.mean([item.rms**2 for item in flown], axis=0))
-    sharp, beyond = np.sum([item.decided for item in flown], axis=0)
-    coverage = np.mean([item.coverage for item in flown])
+    values = 100.0 * np.sqrt(np.mean([flight.rms**2 for flight in flown], axis=0))
+    sharp, beyond = np.sum([flight.decided for flight in flown], axis=0)
+    coverage = np.mean([flight.coverage for flight in flown])
     return f"{values[0]:.1f}, {values[1]:.1f} points", f"{coverage:.2f}", f"{sharp} of {beyond}"
 
 

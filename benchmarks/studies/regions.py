@@ -128,15 +128,16 @@ def plate(folder: Path, regions: int, around: int = 32, across: int = 8) -> Path
     )
     plane = circle + places[:, :1] * (eighth - circle)
     centre = places[cells[:, :8]].mean(axis=1)
-    near = centre[:, 0] < 0.5
-    region = np.where(near, 1 + (centre[:, 1] * regions).astype(np.int64), 0)
+    is_at_hole = centre[:, 0] < 0.5
+    region = np.where(is_at_hole, 1 + (centre[:, 1] * regions).astype(np.int64), 0)
     middle = 2.0 * np.pi * (np.arange(8) + 0.5) / 8
-    at, along = (
+    radial, tangential = (
         np.array((np.cos(middle), np.sin(middle))).T,
         np.array((-np.sin(middle), np.cos(middle))).T,
     )
     gauges = _gauges(
-        np.column_stack((26.0 * at, np.full(8, 4.0))), np.column_stack((along, np.zeros(8)))
+        np.column_stack((26.0 * radial, np.full(8, 4.0))),
+        np.column_stack((tangential, np.zeros(8))),
     )
     return _written(
         folder, PLATE + COMMON + gauges, np.column_stack((plane, places[:, 2])), cells, region
@@ -157,8 +158,10 @@ def tube(folder: Path, regions: int, along: int = 24) -> Path:
     region = 1 + (centre[:, 2] / 400.0 * regions).astype(np.int64)
     region[centre[:, 1] > 0.5] = 0  # half of each ring
     turn = 0.5 * np.pi * (np.arange(8) % 2)
-    at = np.column_stack((20.0 * np.cos(turn), 20.0 * np.sin(turn), 25.0 + 50.0 * np.arange(8)))
-    gauges = _gauges(at, np.tile((0.0, 0.0, 1.0), (8, 1)))
+    places_of_gauges = np.column_stack(
+        (20.0 * np.cos(turn), 20.0 * np.sin(turn), 25.0 + 50.0 * np.arange(8))
+    )
+    gauges = _gauges(places_of_gauges, np.tile((0.0, 0.0, 1.0), (8, 1)))
     return _written(folder, TUBE + COMMON + gauges, points, cells, region)
 
 
@@ -178,13 +181,13 @@ def bracket(folder: Path, regions: int) -> Path:
     text = text[: text.index("[[damage]]")] + text[text.index("[[gauge]]") :]
     mesh.cell_sets = {
         **mesh.cell_sets,
-        **{f"R{one}": [np.flatnonzero(number == one)] for one in range(1, regions + 1)},
+        **{f"R{region}": [np.flatnonzero(number == region)] for region in range(1, regions + 1)},
     }
     mesh.write(folder / "bracket.inp")
     deck = (folder / "bracket.inp").read_text(encoding="utf-8")
     (folder / "bracket.inp").write_text(deck.replace("C3D20RH", "C3D20"), encoding="utf-8")
     damage = "".join(
-        f'\n[[damage]]\nname = "z{one}"\nset = "R{one}"\n' for one in range(1, regions + 1)
+        f'\n[[damage]]\nname = "z{region}"\nset = "R{region}"\n' for region in range(1, regions + 1)
     )
     (folder / "bracket.toml").write_text(text + damage, encoding="utf-8")
     return folder / "bracket.toml"

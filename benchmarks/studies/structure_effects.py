@@ -239,8 +239,10 @@ def main() -> int:
                 continue
             for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
                 began = process_time()
-                made = campaign(folder / "bracket.toml", hidden, seed, ringdown=arguments.ringdown)
-                verdict = investigate(made, model, seed=seed, thorough=False).verdict
+                simulated = campaign(
+                    folder / "bracket.toml", hidden, seed, ringdown=arguments.ringdown
+                )
+                verdict = investigate(simulated, model, seed=seed, thorough=False).verdict
                 seconds = process_time() - began
                 print(
                     f"{hidden.identifier or 'nothing'}, seed {seed}: {outcome(hidden, verdict)} "
