@@ -54,7 +54,7 @@ def alone(runs: Sequence[Investigation], begins: Sequence[float]) -> Table:
         if investigation.search is None or investigation.problem is None:
             continue
         best: dict[str, CandidateFit] = {}
-        for fit in investigation.search.all().values():  # of all places the most probable
+        for fit in investigation.search.compared_fits().values():  # of all places the most probable
             label = " ".join(fit.candidate.identifiers) or "none"
             if len(fit.candidate.terms) < 2 and (
                 label not in best

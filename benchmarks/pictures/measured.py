@@ -72,7 +72,7 @@ def draw_real_wing_residuals(data: Path) -> Drawing:
     trial: Trial = problem.trials[number].trial
     assert trial.time is not None, "a ring-down has times"
     time = trial.time + BEGIN_OF_RECORDS
-    rows = ((search.none, "wing model, refitted"), (fit, "with the effects"))
+    rows = ((search.no_effect, "wing model, refitted"), (fit, "with the effects"))
     root_mean_squares = []
     with publication_style():
         figure = new_figure(5.2, 6.4)

@@ -38,12 +38,12 @@ from discrepancy.checks.quality import check_data
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.location.locate import locate
 from discrepancy.model_choice import load_model
-from discrepancy.search.honest_evidence import left_by
+from discrepancy.search.wide_noise import residual_process_of
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -356,7 +356,9 @@ def findings(campaign: Campaign, model: Model, seed: int) -> list[str]:
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     best = fit(problem, Candidate(), problem.start(Candidate()))
     location = locate(residual_set(problem, best), seed=seed)
-    gate = absolute_gate(problem, replace(best, remainder=left_by(problem, best)))
+    gate = check_absolute_fit(
+        problem, replace(best, residual_process=residual_process_of(problem, best))
+    )
     is_found = {
         "not explained": gate.passed is False,
         "disagrees": location.disagrees,
