@@ -29,6 +29,14 @@ K x; Bouc-Wen (k, yield displacement, order): k (z - x); viscous (c): c v.
 """
 
 
+SIZE = 0
+"""Column of the coefficient of a law: F0, c, k."""
+EXPONENT, HALF_WIDTH, YIELD = 1, 1, 1
+"""Column of the second number of friction and power, of a gap, and of Bouc-Wen."""
+SIDE, ORDER = 2, 2
+"""Column of the third number of power, and of Bouc-Wen."""
+
+
 @dataclass(frozen=True)
 class Law:
     """A law at a port.
@@ -206,15 +214,14 @@ def elastic_force(
         Value of the Bouc-Wen variable.
     """
     kind = laws.kinds[port]
-    first = laws.numbers[port, 0]
-    second = laws.numbers[port, 1]
+    size = laws.numbers[port, SIZE]
     if kind == POWER:
-        side = laws.numbers[port, 2]
-        if side * displacement < 0.0:
+        if laws.numbers[port, SIDE] * displacement < 0.0:
             return 0.0
-        return first * abs(displacement) ** second * np.sign(displacement)
+        return size * abs(displacement) ** laws.numbers[port, EXPONENT] * np.sign(displacement)
     if kind == GAP:
-        return -first * min(max(displacement, -second), second)
+        half_width = laws.numbers[port, HALF_WIDTH]
+        return -size * min(max(displacement, -half_width), half_width)
     if kind == JENKINS:
         total = 0.0
         for e in range(laws.slip.shape[1]):
@@ -225,7 +232,7 @@ def elastic_force(
                 total += stiffness * (deflection - displacement)
         return total
     if kind == BOUC_WEN:
-        return first * (bouc_wen - displacement)
+        return size * (bouc_wen - displacement)
     return 0.0
 
 
@@ -280,9 +287,9 @@ def _force_without_friction(
     kind = laws.kinds[port]
     if kind == DRAG:
         v = _modal_velocity(state, structure, port)
-        return laws.numbers[port, 0] * abs(v) * v
+        return laws.numbers[port, SIZE] * abs(v) * v
     if kind == VISCOUS:
-        return laws.numbers[port, 0] * _modal_velocity(state, structure, port)
+        return laws.numbers[port, SIZE] * _modal_velocity(state, structure, port)
     if kind == FRICTION:
         return 0.0
     ports, modes = structure.ports.shape
@@ -302,7 +309,7 @@ def _friction_limit(
 ) -> float:
     """Return the largest friction force F0 |x|^a of a port."""
     x = _port_displacement(state, structure, port)
-    return laws.numbers[port, 0] * abs(x) ** laws.numbers[port, 1]
+    return laws.numbers[port, SIZE] * abs(x) ** laws.numbers[port, EXPONENT]
 
 
 @compiled
@@ -376,7 +383,9 @@ def _fill_rates(
         rate[row] = 0.0
         if laws.kinds[j] == BOUC_WEN:
             v = _port_velocity(state, rate, structure, j)
-            rate[row] = v * bouc_wen_rate(state[row], v, laws.numbers[j, 1], laws.numbers[j, 2])
+            rate[row] = v * bouc_wen_rate(
+                state[row], v, laws.numbers[j, YIELD], laws.numbers[j, ORDER]
+            )
 
 
 @compiled

@@ -13,6 +13,8 @@ from benchmarks.blind.laws import (
     BOUC_WEN,
     JENKINS,
     NO_FORCE,
+    ORDER,
+    YIELD,
     Law,
     LawArrays,
     ModalStructure,
@@ -42,8 +44,8 @@ def _bouc_wen_after(
     """Return the Bouc-Wen variable of a port after a motion, by the midpoint rule."""
     increment = displacement - start
     sign = np.sign(increment)
-    yield_displacement = laws.numbers[port, 1]
-    order = laws.numbers[port, 2]
+    yield_displacement = laws.numbers[port, YIELD]
+    order = laws.numbers[port, ORDER]
     middle = bouc_wen + 0.5 * increment * bouc_wen_rate(bouc_wen, sign, yield_displacement, order)
     return bouc_wen + increment * bouc_wen_rate(middle, sign, yield_displacement, order)
 
