@@ -62,7 +62,7 @@ INTERVAL, SAMPLES, DEFLECTION, MODES = 5e-4, 400, 5e-4, 12  # of a ring-down: s,
 
 
 @dataclass(frozen=True)
-class Hidden:
+class BracketEffect:
     """A hidden effect: name, place, laws at the port, and its changes of readings and forces."""
 
     identifier: str
@@ -77,29 +77,29 @@ class Hidden:
 
 
 HIDDEN = (
-    Hidden(""),
-    Hidden(
+    BracketEffect(""),
+    BracketEffect(
         "gauge_gain",
         "heel",
         readings=lambda name, _time, values: values * (1.06 if name == "heel" else 1.0),
     ),
-    Hidden(
+    BracketEffect(
         "gauge_zero_drift",
         "arm",
         readings=lambda name, time, values: values + (3e-5 * time / DAY if name == "arm" else 0.0),
     ),
-    Hidden("load_cell", force=1.05),
-    Hidden("load_cell", tare=4.0),
-    Hidden("cubic_stiffness", PORT, (PowerStiffness(PORT, 40.0, 3.0, 0, 1e-3),)),
-    Hidden("breathing_crack", PORT, (PowerStiffness(PORT, -8.0, 1.0, -1, 1e-3),)),
-    Hidden("joint_micro_slip", PORT, (MicroSlip(PORT, 8.0, 2e4, -0.5, 24),)),
+    BracketEffect("load_cell", force=1.05),
+    BracketEffect("load_cell", tare=4.0),
+    BracketEffect("cubic_stiffness", PORT, (PowerStiffness(PORT, 40.0, 3.0, 0, 1e-3),)),
+    BracketEffect("breathing_crack", PORT, (PowerStiffness(PORT, -8.0, 1.0, -1, 1e-3),)),
+    BracketEffect("joint_micro_slip", PORT, (MicroSlip(PORT, 8.0, 2e4, -0.5, 24),)),
 )
 IN_MOTION = (
     HIDDEN[0],
     HIDDEN[1],
     *HIDDEN[5:],
-    Hidden("coulomb_friction", PORT, (PowerDamping(PORT, 0.4, 0.0, 0.0, 0.1, 1e-3),)),
-    Hidden("quadratic_damping", PORT, (PowerDamping(PORT, 0.5, 2.0, 0.0, 0.1, 1e-3),)),
+    BracketEffect("coulomb_friction", PORT, (PowerDamping(PORT, 0.4, 0.0, 0.0, 0.1, 1e-3),)),
+    BracketEffect("quadratic_damping", PORT, (PowerDamping(PORT, 0.5, 2.0, 0.0, 0.1, 1e-3),)),
 )
 
 
@@ -121,7 +121,7 @@ def rig(folder: Path) -> Path:
     return path
 
 
-def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -> Campaign:
+def campaign(file: Path, hidden: BracketEffect, seed: int, *, ringdown: bool = False) -> Campaign:
     """Return the campaign of a seed on the full bracket with a hidden effect."""
     random = np.random.default_rng(seed)
     structure = load_and_assemble(file)
@@ -199,7 +199,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     return Campaign("Bracket", channels, tuple(trials), None, {}, "")
 
 
-def outcome(hidden: Hidden, verdict: Verdict) -> str:
+def outcome(hidden: BracketEffect, verdict: Verdict) -> str:
     """Return what became of a hidden effect."""
     if not hidden.identifier:
         return (
