@@ -31,9 +31,12 @@ K x; Bouc-Wen (k, yield displacement, order): k (z - x); viscous (c): c v.
 
 SIZE = 0
 """Column of the coefficient of a law: F0, c, k."""
-EXPONENT, HALF_WIDTH, YIELD = 1, 1, 1
+EXPONENT = 1
+HALF_WIDTH = 1
+YIELD = 1
 """Column of the second number of friction and power, of a gap, and of Bouc-Wen."""
-SIDE, ORDER = 2, 2
+SIDE = 2
+ORDER = 2
 """Column of the third number of power, and of Bouc-Wen."""
 
 

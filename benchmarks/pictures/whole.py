@@ -9,8 +9,13 @@ from html import escape
 
 NAME = "whole"
 WIDTH, HEIGHT = 1100, 600
-INK, QUIET, GROUND = "#1f2933", "#52606d", "#ffffff"
-BLUE, GREEN, ORANGE, PURPLE = "#0072b2", "#007a5a", "#b35900", "#8e4585"
+INK = "#1f2933"
+QUIET = "#52606d"
+GROUND = "#ffffff"
+BLUE = "#0072b2"
+GREEN = "#007a5a"
+ORANGE = "#b35900"
+PURPLE = "#8e4585"
 """Colours of the lanes model, calibration, flight and discrepancy (darker Okabe-Ito colours)."""
 TINTS = {BLUE: "#eaf4fb", GREEN: "#e8f6f1", ORANGE: "#fdf1e3", PURPLE: "#f7eef6"}
 

@@ -58,7 +58,8 @@ def maze(discount: float = 0.95) -> DecisionProblem:
         moves[:, number] = start
         likelihood[:, number] = np.eye(6)[symbol]
     reward = np.full((11, 4), -0.04)
-    reward[good], reward[bad] = 1.0, -1.0
+    reward[good] = 1.0
+    reward[bad] = -1.0
     return DecisionProblem(
         TransitionModel((moves,)),
         reward,

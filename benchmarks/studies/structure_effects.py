@@ -58,7 +58,13 @@ NOISE = {Quantity.STRAIN: 1e-6, Quantity.DISPLACEMENT: 2e-6}
 ZERO = {Quantity.STRAIN: 1e-6}
 LEVELS = np.array([20.0, 40.0, 60.0, 80.0, 60.0, 40.0, 20.0])
 DAY = 4000.0  # s, of the campaign
-INTERVAL, SAMPLES, DEFLECTION, MODES = 5e-4, 400, 5e-4, 12  # of a ring-down: s, number, m, number
+INTERVAL = 5e-4
+"""Sampling interval of ring-downs [s]."""
+SAMPLES = 400
+DEFLECTION = 5e-4
+"""Deflection of the end before a release [m]."""
+MODES = 12
+"""Modes of the simulated ring-downs."""
 
 
 @dataclass(frozen=True)
