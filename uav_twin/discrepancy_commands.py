@@ -30,8 +30,8 @@ def run(
     campaign: Path | None = None,
     *,
     from_run: Path | None = None,
-    from_turn: int | None = None,
-    to_turn: int | None = None,
+    from_step: int | None = None,
+    to_step: int | None = None,
     model: str | None = None,
     out: Path | None = None,
     replace: bool = False,
@@ -45,19 +45,19 @@ def run(
     one_thread()
     if (campaign is None) == (from_run is None):
         raise CampaignFileError("Give either the folder of a campaign or --from-run with that of a mission.")
-    if from_run is None and (from_turn is not None or to_turn is not None):
-        raise CampaignFileError("--from-turn and --to-turn belong to --from-run.")
-    if from_turn is not None and to_turn is not None and to_turn < from_turn:
-        raise CampaignFileError(f"--to-turn {to_turn} lies before --from-turn {from_turn}: no turn is left.")
+    if from_run is None and (from_step is not None or to_step is not None):
+        raise CampaignFileError("--from-step and --to-step belong to --from-run.")
+    if from_step is not None and to_step is not None and to_step < from_step:
+        raise CampaignFileError(f"--to-step {to_step} lies before --from-step {from_step}: no step is left.")
     source = campaign or from_run
     assert source is not None
     folder = out if out is not None else Path("verdicts") / source.resolve().name
     parts.check_verdict_folder(folder, replace_it=replace)
     catalogue = parts.load_catalogue(effects or ())
-    data, choice = _compared(campaign, from_run, from_turn, to_turn, model)
+    data, choice = _compared(campaign, from_run, from_step, to_step, model)
     inputs = {"campaign": data.data_hash, "model": choice.source_hash}
     inputs |= {f"effects {path.name}": parts.hash_file(path) for path in effects or ()}
-    asked = {"from-turn": from_turn, "to-turn": to_turn, "model": model and choice.file, "seed": seed}
+    asked = {"from-step": from_step, "to-step": to_step, "model": model and choice.file, "seed": seed}
     origin = parts.Origin(
         data.name,
         choice.model.name,

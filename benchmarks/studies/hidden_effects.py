@@ -6,8 +6,8 @@ and investigated. The named effect, or the most probable member of a group, goes
 model, and the mission is flown again with the same seed. A drift cannot stand in a table of
 predicted strains; there the readings are corrected before the twin sees them, with the temperature
 that the run recorded. Printed are the verdict of each mission and, before and after: the rms error
-of the health estimate in points, the share of turns whose 90 % set of states holds the truth, and
-the turns at 3g with z1 truly at or above the limit. The table compares the missions that were
+of the health estimate in points, the share of steps whose 90 % set of states holds the truth, and
+the steps at 3g with z1 truly at or above the limit. The table compares the missions that were
 flown again.
 """
 
@@ -62,7 +62,7 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of
 from twin_master.store.writing import write_run
 
-TURNS = 50
+STEPS = 50
 LIMIT = 0.6 - 1e-9
 """z1 from which on the policy of the wing without an effect leaves 3g."""
 
@@ -94,7 +94,7 @@ HIDDEN: tuple[MissionEffect, ...] = (
     MissionEffect(
         "gauge_zero_drift",
         "g17",
-        (SensorDrift("strain[17]", -8e-4, float(TURNS)),),
+        (SensorDrift("strain[17]", -8e-4, float(STEPS)),),
         "gauge 17 drifts to -800 microstrain",
     ),
     MissionEffect(
@@ -133,9 +133,9 @@ class MissionErrors:
     rms : (2,) array
         Rms error of the mean of z1 and z2 [1].
     coverage : float
-        Share of turns whose 90 % set of states holds the truth.
+        Share of steps whose 90 % set of states holds the truth.
     sharp_beyond, beyond : int
-        Turns at 3g with z1 truly at or above the limit, and all turns with z1 there.
+        Steps at 3g with z1 truly at or above the limit, and all steps with z1 there.
     """
 
     rms: NDArray[np.float64]
@@ -186,12 +186,12 @@ def scenario_text(
     hidden: Sequence[Primitive],
     known: Sequence[Primitive],
     scenario: str,
-    turns: int,
+    steps: int,
     draws: int,
 ) -> str:
     """Return a shipped scenario with patches of asset and belief; see `fly_mission`."""
     text = scenario_files()[scenario].read_text(encoding="utf-8")
-    text = text.replace("steps = 50", f"steps = {turns}", 1)
+    text = text.replace("steps = 50", f"steps = {steps}", 1)
     text = text.replace("draws = 100", f"draws = {draws}", 1)
     if depends_on_temperature(hidden):
         return scenario_in_air(text, folder.parent, f"{folder.name}_wing", patch_text(hidden))
@@ -209,7 +209,7 @@ def fly_mission(
     hidden: Sequence[Primitive] = (),
     known: Sequence[Primitive] = (),
     scenario: str = "growing_damage",
-    turns: int = TURNS,
+    steps: int = STEPS,
     draws: int = 100,
 ) -> MissionErrors:
     """Fly a mission into a run folder, without its report.
@@ -226,12 +226,12 @@ def fly_mission(
         Effects in the twin's model.
     scenario : str
         Name of a shipped scenario.
-    turns : int
+    steps : int
         Length of the mission.
     draws : int
         Draws of the calibrated parameter.
     """
-    text = scenario_text(folder, hidden, known, scenario, turns, draws)
+    text = scenario_text(folder, hidden, known, scenario, steps, draws)
     loaded = load_scenario(atomic_write_text(folder.with_name(f"{folder.name}.toml"), text))
     resolved = resolve_scenario(loaded, Overrides(seed=seed, in_process=True))
     source = asset_source(resolved)
@@ -280,14 +280,14 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Mi
 
 
 def beyond_the_limit(is_sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> tuple[int, int]:
-    """Return the numbers of turns at 3g with z1 at or above the limit, and of all such turns.
+    """Return the numbers of steps at 3g with z1 at or above the limit, and of all such steps.
 
-    The first turn with z1 there is left out, because its control was decided before.
+    The first step with z1 there is left out, because its control was decided before.
 
     Parameters
     ----------
     is_sharp : (T,) array
-        Whether a turn is flown at 3g.
+        Whether a step is flown at 3g.
     z1 : (T,) array
         True loss of region 1.
     """
@@ -336,7 +336,7 @@ def fly_with_named_effects(
     seed: int,
     hidden: MissionEffect,
     named: Sequence[NamedEffect],
-    turns: int,
+    steps: int,
 ) -> MissionErrors:
     """Fly the mission of a hidden effect again with the named effects in the twin's model.
 
@@ -351,14 +351,14 @@ def fly_with_named_effects(
             known.append(primitive)
         else:
             corrections.append(undone)
-    return fly_mission(folder, seed, (*hidden.primitives, *corrections), known, turns=turns)
+    return fly_mission(folder, seed, (*hidden.primitives, *corrections), known, steps=steps)
 
 
 def study(
     hidden: MissionEffect,
     seed: int,
     work: Path,
-    turns: int = TURNS,
+    steps: int = STEPS,
     effects: Sequence[Effect] | None = None,
     again: bool = True,
 ) -> Case:
@@ -372,7 +372,7 @@ def study(
         Seed of the mission.
     work : Path
         Folder for the runs.
-    turns : int
+    steps : int
         Length of the mission.
     effects : sequence of Effect, optional
         Effects of the search; the whole catalogue by default.
@@ -381,12 +381,12 @@ def study(
     """
     begin = perf_counter()
     name = f"{HIDDEN.index(hidden)}_{seed}"
-    before = fly_mission(work / f"{name}_before", seed, hidden.primitives, turns=turns)
+    before = fly_mission(work / f"{name}_before", seed, hidden.primitives, steps=steps)
     verdict = investigate_run(work / f"{name}_before", seed, effects)
     after = None
     named = believed(verdict)
     if named and again:
-        after = fly_with_named_effects(work / f"{name}_after", seed, hidden, named, turns)
+        after = fly_with_named_effects(work / f"{name}_after", seed, hidden, named, steps)
     return Case(hidden, seed, verdict, before, after, perf_counter() - begin)
 
 
@@ -409,7 +409,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
-    parser.add_argument("--turns", type=int, default=TURNS)
+    parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--once", action="store_true", help="do not fly again with what was found")
     parser.add_argument(
         "--catalogue", help="identifiers of effects that are looked for, with commas"
@@ -440,7 +440,7 @@ def main() -> int:
             cases = []
             for seed in seeds:
                 case = study(
-                    hidden, seed, Path(folder), arguments.turns, effects, not arguments.once
+                    hidden, seed, Path(folder), arguments.steps, effects, not arguments.once
                 )
                 cases.append(case)
                 console.print(
