@@ -36,11 +36,11 @@ def run() -> list[Measurement]:
     together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / steps
     alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     alone /= ALONE * scenario.mission.steps
-    seen = flown.row, flown.control_index
+    observations = flown.row, flown.control_index
     sensors = knowledge.sensor_model
-    likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *seen)) / steps
+    likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *observations)) / steps
     worsening = Worsening.of(scenario)
-    scaled = scaled_likelihood(sensors, *seen)[0]
+    scaled = scaled_likelihood(sensors, *observations)[0]
     points = np.full((POINTS, 2), 0.1)
     transition_evidence(worsening, points[:1], scaled[:1], flown.control_index[:1])
     learning = cpu_seconds(
@@ -52,7 +52,7 @@ def run() -> list[Measurement]:
         fly_fleet(ensemble(quiet, range(1)), folder / "start")
         start = cpu_seconds(lambda: fly_fleet(ensemble(quiet, range(1)), folder / "one"))
         fleet = ensemble(quiet, range(4 * TWINS))
-        whole = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
+        stored_seconds = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
     to_ten_thousand = 10_000 / (4 * TWINS)
     return [
         Measurement(
@@ -63,7 +63,7 @@ def run() -> list[Measurement]:
         ),
         Measurement(
             "10,000 twins stored, beside start-up (from 1,024)",
-            to_ten_thousand * whole,
+            to_ten_thousand * stored_seconds,
             "s",
             8.0,
             "likelihoods alone",

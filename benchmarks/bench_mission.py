@@ -34,13 +34,18 @@ def run() -> list[Measurement]:
         cold, _ = fly(Path(place) / "cold", cache)
         largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / MEBIBYTE
         warm = [fly(Path(place) / f"warm-{index}", cache) for index in range(3)]
-    whole = min(seconds for seconds, _ in warm)
+    fastest = min(seconds for seconds, _ in warm)
     steps = min(seconds for _, seconds in warm)
     return [
         Measurement(
-            "mission from nothing, design to report", cold, "s", 90.0, "the same, cache warm", whole
+            "mission from nothing, design to report",
+            cold,
+            "s",
+            90.0,
+            "the same, cache warm",
+            fastest,
         ),
         Measurement("largest process of it", largest, "MiB", 2048.0),
-        Measurement("mission with the cache warm", whole, "s", 10.0, "its 50 steps", steps),
+        Measurement("mission with the cache warm", fastest, "s", 10.0, "its 50 steps", steps),
         Measurement("50 steps through the worker, checkpoints included", steps, "s", 1.0),
     ]

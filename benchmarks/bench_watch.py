@@ -89,7 +89,7 @@ def run() -> list[Measurement]:
             )
     return [
         Measurement(
-            f"a watch taken up after {STEPS + 19} steps{what}",
+            f"a watch taken up after {STEPS + 19} steps{suffix}",
             float(seconds[STEPS + 19][kind]),
             "s",
             None,
@@ -97,7 +97,7 @@ def run() -> list[Measurement]:
             float(seconds[steps][kind]),
         )
         for steps in (1, 99)
-        for kind, what in ((0, ", all of its process"), (2, ", what depends on the journal"))
+        for kind, suffix in ((0, ", all of its process"), (2, ", what depends on the journal"))
     ]
 
 

@@ -146,13 +146,15 @@ def fly(
             growth = grown(law, probability[control], len(levels), spacing, random)
             truth = np.minimum(truth + growth, highest)
             belief = np.einsum("bi,bij->bj", belief, model.transition.matrix[control])
-        seen = shown(truth)[np.arange(missions), control]
-        seen = seen + random.standard_normal(seen.shape) * sensors.standard_deviation
-        log_belief = np.log(belief.clip(1e-300)) + sensors.log_likelihood_sequence(seen, control)
+        observed = shown(truth)[np.arange(missions), control]
+        observed = observed + random.standard_normal(observed.shape) * sensors.standard_deviation
+        log_belief = np.log(belief.clip(1e-300)) + sensors.log_likelihood_sequence(
+            observed, control
+        )
         belief = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
         belief /= belief.sum(axis=1, keepdims=True)
         for b in range(watched):
-            estimate = estimator.step(carried[b], seen[b], int(control[b]), step)
+            estimate = estimator.step(carried[b], observed[b], int(control[b]), step)
             carried[b] = estimate.carried
             alarmed[b] |= any(notice.kind == "alarm" for notice in estimate.notices)
         truths.append(truth)

@@ -62,18 +62,18 @@ class Watched:
 
 def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
     """Write the scenario of a watch whose twin knows some effects."""
-    kept = []
+    lines = []
     skipping = False
     for line in scenario_files()["level_turns"].read_text(encoding="utf-8").splitlines():
         if line.startswith("["):
             skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
         if not skipping:
-            kept.append(
+            lines.append(
                 line.replace(
                     "standard_deviation_microstrain = 125", "standard_deviation_microstrain = 150"
                 )
             )
-    text = "\n".join([*kept, "", "[notice]", ""])
+    text = "\n".join([*lines, "", "[notice]", ""])
     if known:
         file = atomic_write_text(place / "known.json", patch_text(known))
         text = text.replace("[belief]\n", f'[belief]\npatch = "{file.resolve().as_posix()}"\n')
@@ -131,7 +131,7 @@ def study(name: str, seed: int, work: Path) -> None:
         "taught": taught,
         "knew": watched(place / "run", place / "knew", scenario_of(place, known), teach=False),
     }
-    what, first = said(taught.records)
+    events, first = said(taught.records)
     errors = {
         way: 100.0 * np.sqrt(np.mean((watch.mean[first:] - truth[first:]) ** 2, axis=0))
         for way, watch in ways.items()
@@ -147,7 +147,7 @@ def study(name: str, seed: int, work: Path) -> None:
         f"{way} {z1:.2f} {z2:.2f}, {decided[way]}" for way, (z1, z2) in errors.items()
     )
     print(
-        f"{name}, seed {seed}: {what}. From step {first} on rms of z1, z2, 3g: {figures}",
+        f"{name}, seed {seed}: {events}. From step {first} on rms of z1, z2, 3g: {figures}",
         flush=True,
     )
 

@@ -94,4 +94,4 @@ def scenario_in_air(text: str, folder: Path, name: str, patch: str) -> str:
 
 def depends_on_temperature(primitives: Sequence[Primitive]) -> bool:
     """Return whether one of the primitives depends on the temperature."""
-    return any(item.kind == "thermal_strain" for item in primitives)
+    return any(primitive.kind == "thermal_strain" for primitive in primitives)
