@@ -38,6 +38,7 @@ from .sensor_primitives import SensorDrift as SensorDrift
 from .sensor_primitives import SensorGain as SensorGain
 from .sensor_primitives import SensorRecord as SensorRecord
 from .sensor_primitives import SensorRotation as SensorRotation
+from .sensor_primitives import SensorLag as SensorLag
 from .sensor_primitives import SensorSaturation as SensorSaturation
 from .sensor_primitives import ThermalStrain as ThermalStrain
 
@@ -131,7 +132,7 @@ INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
 """Primitives that change the loads that are known."""
 SENSORS = (
-    SensorGain, SensorSaturation, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, Clock,
+    SensorGain, SensorSaturation, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, SensorLag, Clock,
     LoggerClock, Line, DecayingLine, RunOffset,
 )  # fmt: skip
 """Primitives that change what is read, not what happens."""

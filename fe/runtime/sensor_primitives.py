@@ -190,6 +190,50 @@ class HighPass(Sensor):
     quantity: str = ""
 
 
+class SensorLag(Sensor):
+    """A channel shows what it should have shown `lag` [s] before: a filter's or a logger's delay.
+
+    A lag below zero says that the recorded force is late instead.
+    """
+
+    channel: str
+    lag: Annotated[float, "s"]
+    quantity: str = ""
+
+    def reading(
+        self, record: SensorRecord, values: FloatArray, rates: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what channels show of values (N, C), and its rates, given the rates (N, C) of the values.
+
+        Between samples the values follow a cubic through values and rates (Hermite). Before the first
+        sample they stood still, if the record is settled, and else went on with their first rate.
+        """
+        if not record.is_dynamic or len(record.time) == 1:
+            return values, rates
+        earlier = record.time - self.lag
+        last_interval = len(record.time) - 2
+        interval = np.clip(np.searchsorted(record.time, earlier, side="right") - 1, 0, last_interval)
+        begin = record.time[interval][:, np.newaxis]
+        length = record.time[interval + 1][:, np.newaxis] - begin
+        s = (earlier[:, np.newaxis] - begin) / length
+        value, next_value = values[interval], values[interval + 1]
+        rate, next_rate = rates[interval], rates[interval + 1]
+        # cubic Hermite polynomial over the interval, and its derivative
+        shown = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * value + s**2 * (3.0 - 2.0 * s) * next_value
+        shown += length * s * (1.0 - s) * ((1.0 - s) * rate - s * next_rate)
+        shown_rate = 6.0 * s * (1.0 - s) * (next_value - value) / length
+        shown_rate += (1.0 - s) * (1.0 - 3.0 * s) * rate + s * (3.0 * s - 2.0) * next_rate
+        # beyond the record
+        first_rate = np.zeros_like(rates[:1]) if record.settled else rates[:1]
+        before = earlier < record.time[0]
+        shown[before] = values[:1] + first_rate * (earlier[before, np.newaxis] - record.time[0])
+        shown_rate[before] = first_rate
+        after = earlier > record.time[-1]
+        shown[after] = values[-1:] + rates[-1:] * (earlier[after, np.newaxis] - record.time[-1])
+        shown_rate[after] = rates[-1:]
+        return shown, shown_rate
+
+
 class Clock(Sensor):
     """A sample stamped t was taken at (1 + `rate`) t + `zero` [s], t since the record's first stamp."""
 
