@@ -206,9 +206,10 @@ class SensorLag(Sensor):
         """Return what channels show of values (N, C), and its rates, given the rates (N, C) of the values.
 
         Between samples the values follow a cubic through values and rates (Hermite). Before the first
-        sample they stood still, if the record is settled, and else went on with their first rate.
+        sample they stood still, if the record is settled, and else went on with their first rate. A
+        ring-down has no force that its readings could follow late: its time zero is an unknown anyway.
         """
-        if not record.is_dynamic or len(record.time) == 1:
+        if record.kind not in ("forced", "driven") or len(record.time) == 1:
             return values, rates
         earlier = record.time - self.lag
         last_interval = len(record.time) - 2
