@@ -244,7 +244,7 @@ class HighPass(Sensor):
 
 
 class SensorLag(Sensor):
-    """A channel shows now what it should have shown `lag` [s] earlier: a filter or a logger is late.
+    """A channel shows now what it should have shown `lag` [s] earlier: a late filter or logger.
 
     With a negative lag the recorded force is the late one. Ring-downs have no force that a reading
     could follow late, so that a lag changes forced and driven trials alone.
@@ -257,7 +257,7 @@ class SensorLag(Sensor):
     def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the readings (N, C) of the earlier moments, and their rates; see `Sensor.readings`.
+        """Return the readings (N, C) of earlier moments, and their rates; see `Sensor.readings`.
 
         Before the first sample a settled record stood still; another one had its first rate. After
         the last sample the readings go on with their last rate.
