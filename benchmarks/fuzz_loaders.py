@@ -44,8 +44,8 @@ from fe.structure.design import load_structure
 from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import load_binding
-from fmu_asset.door.experiment import read_histories
+from fmu_asset.client.binding import load_binding
+from fmu_asset.client.experiment import read_histories
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files

@@ -16,11 +16,11 @@ import numpy as np
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import INPUT_ROLES, Binding, Input, load_binding
-from fmu_asset.door.experiment import whole_binding
-from fmu_asset.door.layout import Place, find
-from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import contradictions
+from fmu_asset.client.binding import INPUT_ROLES, Binding, Input, load_binding
+from fmu_asset.client.experiment import whole_binding
+from fmu_asset.client.layout import Place, find
+from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.units import contradictions
 from fmu_asset.errors import BindingError, FmuCallError, FmuError, said, visible
 from fmu_asset.packing.structure_fmu import recorded_content_hash
 from fmu_asset.worker.refusals import watch_for_refusals

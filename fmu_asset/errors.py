@@ -1,4 +1,4 @@
-"""Errors of the FMUs and of their one door, named by cause, and the sentences that say why."""
+"""Errors of FMUs, named by cause, and the lookup of long messages."""
 
 from collections.abc import Sequence
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from fe.structure.design import Load, MatrixDesign, MatrixLoad, MeshDesign, NodeOutput, PointOutput
 from fe.structure.tables import StructureDesign
+from fmu_asset.client.binding import Binding, parse_binding
 from fmu_asset.description import rendered
-from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import BindingError, FmuBuildError, said
 from reporting.toml_file import parse_toml
 

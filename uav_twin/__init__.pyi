@@ -17,7 +17,7 @@ from fe.wing.design import load_design as load_design
 from fe.wing.operators import assemble as assemble
 from fe.wing.operators import eigenmodes as eigenmodes
 from fe.wing.operators import solve_static as solve_static
-from fmu_asset.door.session import FmiAsset as FmiAsset
+from fmu_asset.client.session import FmiAsset as FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
 from scenarios import structure_files as structure_files
 from twin_master.assets.resolution import Overrides as Overrides

@@ -8,7 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.system.time_history import RecordedHistory
-from fmu_asset.door.runs import State
+from fmu_asset.client.runs import State
 
 
 class FmuExcitation(NamedTuple):

@@ -18,7 +18,7 @@ from discrepancy.fmu_models.system_motion import LawPorts, system_motion
 from discrepancy.system.excitation import Excitation, Load
 from fe.compilation import compiled_kernel
 from fe.runtime.motion import ALIKE, Laws, static_solution
-from fmu_asset.door.runs import Run, StateSpace
+from fmu_asset.client.runs import Run, StateSpace
 
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the motion."""

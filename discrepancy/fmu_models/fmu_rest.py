@@ -13,7 +13,7 @@ from discrepancy.fmu_models.fmu_excitation import FmuExcitation
 from discrepancy.fmu_models.identified_fmu import LINEAR, RECORD, IdentifiedFmu
 from fe.compilation import compiled_kernel
 from fe.runtime.motion import Laws, StaticSolution, static_solution
-from fmu_asset.door.runs import State
+from fmu_asset.client.runs import State
 
 STATIC_ITERATIONS = 30
 """Iterations after which a law and an FMU at rest are given up."""

@@ -18,7 +18,7 @@ from discrepancy.fmu_models.system_motion import MOST_SYSTEMS, system_motion
 from discrepancy.fmu_models.variables import FmuVariables
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.time_history import RecordedHistory, equivalent_ramps
-from fmu_asset.door.runs import FmuRuns, Run, State, StateSpace, realised
+from fmu_asset.client.runs import FmuRuns, Run, State, StateSpace, realised
 from fmu_asset.errors import FmuError
 from reporting.memory import ResultCache
 

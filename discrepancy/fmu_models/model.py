@@ -26,7 +26,7 @@ from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
-from fmu_asset.door.runs import State, StateSpace
+from fmu_asset.client.runs import State, StateSpace
 from reporting.words import comma_list
 
 LATEST = 100.0

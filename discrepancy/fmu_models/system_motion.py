@@ -13,7 +13,7 @@ from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
-from fmu_asset.door.runs import StateSpace
+from fmu_asset.client.runs import StateSpace
 
 MOST_SYSTEMS = 64
 """Number of systems that are kept."""

@@ -10,7 +10,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.description import FmuModelDescription, FmuOutputSection
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding
+from fmu_asset.client.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding
 from reporting.words import counted
 
 REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")

@@ -11,13 +11,13 @@ from typing import Literal, Self, cast
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fmu_asset.door.binding import Binding
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.life import PackedState
-from fmu_asset.door.placement import Housing, ResetTrial, Start
-from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import IDENTITY
-from fmu_asset.door.values import Values
+from fmu_asset.client.binding import Binding
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.life import PackedState
+from fmu_asset.client.placement import Housing, ResetTrial, Start
+from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.units import IDENTITY
+from fmu_asset.client.values import Values
 from fmu_asset.errors import (
     BindingError,
     CouplingError,

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
-from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.units import IDENTITY
+from fmu_asset.client.binding import Binding, Header, Input, Parameter, Vector
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError, said
 from fmu_asset.instances.plan import Settings
 

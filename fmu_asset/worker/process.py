@@ -34,7 +34,7 @@ _CONFINED = ", or needs what its sandbox does not grant ([limits] of its binding
 
 
 class WorkerProcess:
-    """The process, its keeper and its two pipes.
+    """The process, its supervisor and its two pipes.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ class WorkerProcess:
         self._remark = _CONFINED if grants is not None and landlock_version() else ""
         root = str(Path(__file__).parents[2])
         program = (
-            "import sys; sys.path.append(sys.argv[1]); from fmu_asset.worker.keeper import keep; "
-            "keep(*sys.argv[2:])"
+            "import sys; sys.path.append(sys.argv[1]); from fmu_asset.worker.supervisor import supervise; "
+            "supervise(*sys.argv[2:])"
         )
         # One thread: the matrices are small, and results do not depend on the number of cores.
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -103,11 +103,13 @@ class WorkerProcess:
             self._process.terminate()
             try:
                 self._process.wait(_KILL_LIMIT)
-            except subprocess.TimeoutExpired:  # the worker dies with its keeper
+            except subprocess.TimeoutExpired:  # the worker dies with its supervisor
                 self._process.kill()
                 self._process.wait()
             os.close(self._ended)
-            if self._process.returncode == -signal.SIGKILL:  # of the worker, or of the keeper before its work
+            if (
+                self._process.returncode == -signal.SIGKILL
+            ):  # of the worker, or of the supervisor before its work
                 end_processes(self._folder)
 
     def end(self, limit: float) -> None:

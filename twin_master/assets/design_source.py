@@ -13,7 +13,7 @@ import numpy as np
 from fe.runtime.state import wing_names
 from fe.structure.tables import StructureDesign
 from fe.wing.design import WingDesign, load_design, wing_structure
-from fmu_asset.door.binding import Binding
+from fmu_asset.client.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress
 from twin_master.assets.asset_source import (

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.client.binding import INPUT_ROLES, Binding, Parameter, load_binding
+from fmu_asset.client.exchange import Exchange
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
@@ -17,8 +19,6 @@ from fmu_asset.coupling.structure import (
 )
 from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.binding import INPUT_ROLES, Binding, Parameter, load_binding
-from fmu_asset.door.exchange import Exchange
 from fmu_asset.folders import scratch_folder
 from fmu_asset.packing.structure_fmu import pack_wing
 from fmu_asset.ssp.package import write_ssp

@@ -13,9 +13,9 @@ from calibration.virtual_wing import (
 )
 from fe.runtime.state import DigitalState, losses_of
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.experiment import from_here
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.experiment import from_here
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.slaves.variables import QUASI_STATIC, TRANSIENT
 from scenarios import binding_files
 

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.placement import say_sandbox
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.placement import say_sandbox
+from fmu_asset.client.session import FmiAsset
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors, hash_file
 from reporting.folders import closing_lock, lock_folder

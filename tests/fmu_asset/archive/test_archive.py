@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import extract_fmu, inspect_fmu, read_fmu
 from fmu_asset.check import FmuCheck, check_file, check_fmu
-from fmu_asset.door.draft import draft_binding
-from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import HOSTILE, WING_BINDING
+from fmu_asset.client.draft import draft_binding
+from fmu_asset.client.session import FmiAsset
+from tests.fmu_asset.client.kinds import HOSTILE, WING_BINDING
 from tests.fmu_asset.making import DESCRIPTION, MODELS, archive_of, bound, edited, members, tables
 
 REFUSED = tables(__file__)["refused"]

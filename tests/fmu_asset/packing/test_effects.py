@@ -19,13 +19,13 @@ from fe.high_pass import filtered_record
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors
 from fe.runtime.state import DigitalState
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.effects import output_channels
 from tests.command_line import command, refused, said
-from tests.fmu_asset.door.kinds import BINDINGS, KINDS
+from tests.fmu_asset.client.kinds import BINDINGS, KINDS
 from tests.fmu_asset.making import tables
 from tests.fmu_asset.ours import wing_arrays
 from tests.refusals import refused as no_line_end

@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from fmu_asset import errors
+from fmu_asset.client import placement
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
-from fmu_asset.door import placement
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.folders import remove_folder
 from fmu_asset.worker.sandbox import landlock_version
-from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE, SPRING_BINDING
+from tests.fmu_asset.client.kinds import BINDINGS_FOLDER, HOSTILE, SPRING_BINDING
 from tests.fmu_asset.making import ROOT, bound, changed, run_python, system
 from tests.fmu_asset.worker.test_hostile import MISBEHAVIOURS
 from twin_master.library.grid import SamplingGrid

@@ -12,9 +12,17 @@ import pytest
 
 from fmu_asset import errors
 from fmu_asset.check import check_fmu
-from fmu_asset.door import session
-from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import BINDINGS, HOSTILE, INPUTS, KINDS, SPRING_BINDING, WING_BINDING, bounces
+from fmu_asset.client import session
+from fmu_asset.client.session import FmiAsset
+from tests.fmu_asset.client.kinds import (
+    BINDINGS,
+    HOSTILE,
+    INPUTS,
+    KINDS,
+    SPRING_BINDING,
+    WING_BINDING,
+    bounces,
+)
 from tests.fmu_asset.making import archive_of, bound, changed, members
 
 # ---------------------------------------------------------------------- the wing

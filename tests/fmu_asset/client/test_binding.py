@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import Binding, load_binding, parse_binding
-from fmu_asset.door.draft import draft_binding
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.experiment import default_experiment
-from fmu_asset.door.placement import limits_of
-from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import Conversion, contradictions, conversion, same_dimension
+from fmu_asset.client.binding import Binding, load_binding, parse_binding
+from fmu_asset.client.draft import draft_binding
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.experiment import default_experiment
+from fmu_asset.client.placement import limits_of
+from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from reporting import units
 from reporting.units import Meaning, exact_meaning, meaning_of
-from tests.fmu_asset.door.kinds import WING_BINDING
+from tests.fmu_asset.client.kinds import WING_BINDING
 from tests.fmu_asset.making import MODELS, changed, tables
 from tests.refusals import refused
 

@@ -1,4 +1,4 @@
-"""What holds of every asset behind the door, whatever its FMU is: of our own, of others, of systems."""
+"""What holds of every asset, whatever its FMU is: one of our own, of others, or a system of several."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fmu_asset.client.layout import Observation
+from fmu_asset.client.life import SavedState
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.door.layout import Observation
-from fmu_asset.door.life import SavedState
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
+from tests.fmu_asset.client.kinds import INPUTS, KINDS, STEPS, Kind
 from tests.fmu_asset.coupling.reference import coupled, of_ours
-from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind
 from tests.fmu_asset.ours import NAMES, OurFmus
 
 Open = Callable[..., FmiAsset]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from fmu_asset import errors
+from fmu_asset.client.binding import Binding
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
-from fmu_asset.door.binding import Binding
-from fmu_asset.door.session import FmiAsset
 from tests.fmu_asset.making import bound, changed, system
 
 

@@ -9,9 +9,9 @@ import pytest
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.check import check_fmu
-from fmu_asset.door.binding import parse_binding
-from fmu_asset.door.experiment import default_experiment, ending_with_histories, fly
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import parse_binding
+from fmu_asset.client.experiment import default_experiment, ending_with_histories, fly
+from fmu_asset.client.session import FmiAsset
 from tests.fmu_asset.making import bound, edited
 
 DAY = 86400.0

@@ -1,4 +1,4 @@
-"""The keeper: a process between twin and worker that ends what is left when one of them is gone.
+"""The supervisor: a process between twin and worker that ends what is left when one of them is gone.
 
 The worker is a fork of it, made before any library is loaded, and nothing of the FMU ever runs in it:
 neither an endless loop nor an FMU in Python that holds the interpreter keeps it from its work. The system
@@ -29,10 +29,10 @@ _LONGEST_END = 5.0
 _DEATH_SIGNAL, _CHILD_SUBREAPER = 1, 36  # of prctl(2)
 _ALL_THREADS = 0x40000000  # __WALL of waitpid(2)
 _MOST_STOPS = 1000
-"""After how many stops of a traced worker the keeper looks at the twin."""
+"""After how many stops of a traced worker the supervisor looks at the twin."""
 
 
-def keep(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
+def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
     """Start the worker, await its end or the twin's, clear up, and end as the worker did.
 
     The pipes to the twin are the standard input and output; the worker has them elsewhere, and there what an
@@ -49,7 +49,7 @@ def keep(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
     """
     import resource
 
-    twin, keeper = os.getppid(), os.getpid()
+    twin, supervisor = os.getppid(), os.getpid()
     gone = os.pidfd_open(twin)  # the pipe's end does not tell: an FMU can open its other side for itself
     if os.getppid() != twin:
         os._exit(0)
@@ -82,7 +82,7 @@ def keep(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
             os.close(int(report))
         os.setpgid(0, 0)
         prctl(_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
-        if os.getppid() != keeper:
+        if os.getppid() != supervisor:
             os._exit(0)
         _work(incoming, outgoing, scratch, shared, grants)
     ended = os.pidfd_open(worker)
@@ -104,7 +104,7 @@ def keep(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
         number = os.WTERMSIG(status)
         if number != signal.SIGKILL:
             signal.signal(number, signal.SIG_DFL)
-        os.kill(keeper, number)
+        os.kill(supervisor, number)
     os._exit(os.waitstatus_to_exitcode(status) % 256)
 
 
@@ -121,7 +121,7 @@ def _tracer_of(worker: int, report: str) -> "RefusalTracer | None":
 
 def _work(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -> NoReturn:
     """Be the worker."""
-    # Here, so that the keeper has nothing of it; before the sandbox, since some libraries start programs.
+    # Here, so that the supervisor has nothing of it; before the sandbox, since some libraries start programs.
     try:
         import json
 
@@ -197,7 +197,7 @@ def _await_end(
 
 
 def _end_descendants() -> None:
-    """End what the worker has left; the children of one that is ended are the keeper's children next."""
+    """End what the worker has left; the children of one that is ended are the supervisor's children next."""
     deadline = time.monotonic() + _LONGEST_END
     while time.monotonic() < deadline:
         try:
@@ -213,7 +213,7 @@ def _end_descendants() -> None:
 
 
 def _children() -> list[int]:
-    """Return the numbers of the keeper's children."""
+    """Return the numbers of the supervisor's children."""
     found = []
     for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would be loaded for this alone
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Assets of every kind behind the one door, as `kinds.toml` names them, and the oracles of what they show."""
+"""Assets of every kind, as `kinds.toml` names them, and the oracles of what they show."""
 
 import math
 import tomllib
@@ -15,8 +15,8 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import parse_structure
+from fmu_asset.client.binding import Binding, load_binding, parse_binding
 from fmu_asset.companions.damage_growth import DamageGrowth
-from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.structures import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
