@@ -16,9 +16,9 @@ import numpy as np
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.client.binding import INPUT_ROLES, Binding, Input, load_binding
+from fmu_asset.client.binding import INPUT_ROLES, Binding, InputBinding, load_binding
 from fmu_asset.client.experiment import whole_binding
-from fmu_asset.client.layout import Place, find
+from fmu_asset.client.layout import VariableElements, find_variable
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.units import contradictions
 from fmu_asset.errors import BindingError, FmuCallError, FmuError, said, visible
@@ -128,7 +128,7 @@ def check_fmu(
     found = list(check_file(description))
     try:
         used = given or drafted_binding(description, step_size)
-        flights = Flights(description, used, step_timeout, memory_limit)
+        flights = CheckRuns(description, used, step_timeout, memory_limit)
     except FmuError as error:
         undrafted = isinstance(error, BindingError) and given is None
         why = "No binding can be drafted for it: " if undrafted else ""
@@ -220,7 +220,7 @@ def _ranges(description: FmuDescription) -> list[Told]:
     return found
 
 
-class Flights:
+class CheckRuns:
     """Flights of one FMU with one binding, each in a worker of its own.
 
     Parameters
@@ -298,8 +298,8 @@ class Flights:
                     base[role][name] = [0.0] * len(place.elements)
         return base
 
-    def _place(self, role: str, name: str, item: Input) -> Place:
-        return find(self._description, item.variable, f"{role}.{name}", "input")
+    def _place(self, role: str, name: str, item: InputBinding) -> VariableElements:
+        return find_variable(self._description, item.variable, f"{role}.{name}", "input")
 
     def _fly(self, asset: FmiAsset | None = None) -> Float:
         """Return the outputs (N, n) of a flight at the start values, from the start."""

@@ -185,14 +185,14 @@ def simulate(
         with closing(
             parts.FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)
         ) as asset:
-            _finish(asset, parts.fly(asset, planned), file, out, plot)
+            _finish(asset, parts.run_experiment(asset, planned), file, out, plot)
         return
     assert inputs is not None  # it goes with a binding
     bound = _interpolated(parts.load_binding(binding), interpolation)
     steps, histories = parts.read_histories(inputs, bound)
     bound = parts.ending_with_histories(bound, steps)
     with closing(parts.FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)) as asset:
-        _finish(asset, parts.fly_histories(asset, steps, histories), file, out, plot)
+        _finish(asset, parts.run_histories(asset, steps, histories), file, out, plot)
 
 
 def simulate_system(
@@ -231,7 +231,7 @@ def simulate_system(
             isolated=not in_process,
             parameters=planned.parameters,
         ) as asset:
-            _finish(asset, parts.fly(asset, planned), file, out, plot)
+            _finish(asset, parts.run_experiment(asset, planned), file, out, plot)
 
 
 def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:

@@ -18,7 +18,7 @@ from discrepancy.fmu_models.system_motion import LawPorts, system_motion
 from discrepancy.system.excitation import Excitation, Load
 from fe.compilation import compiled_kernel
 from fe.runtime.motion import ALIKE, Laws, static_solution
-from fmu_asset.client.runs import Run, StateSpace
+from fmu_asset.client.runs import FmuRun, FmuStateSpace
 
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the motion."""
@@ -99,7 +99,7 @@ class FmuSimulator(FmuAtRest):
 
     def _motion_of_system(
         self,
-        system: StateSpace,
+        system: FmuStateSpace,
         excitation: FmuExcitation,
         trial: Trial,
         laws: Laws,
@@ -112,7 +112,7 @@ class FmuSimulator(FmuAtRest):
 
         Parameters
         ----------
-        system : StateSpace
+        system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
             What moves the FMU.
@@ -179,7 +179,7 @@ class FmuSimulator(FmuAtRest):
 
     def _start_with_laws(
         self,
-        system: StateSpace,
+        system: FmuStateSpace,
         excitation: FmuExcitation,
         laws: Laws,
         ports: LawPorts,
@@ -189,7 +189,7 @@ class FmuSimulator(FmuAtRest):
 
         Parameters
         ----------
-        system : StateSpace
+        system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
             What moves the FMU.
@@ -268,14 +268,14 @@ class FmuSimulator(FmuAtRest):
         outputs = outputs_by(parts)[:, list(columns)]
         return SteppedOutputs(outputs, fixed_step or longest / parts)
 
-    def _settled_with_laws(self, run: Run, laws: Laws, trial: str) -> "SettledRun":
+    def _settled_with_laws(self, run: FmuRun, laws: Laws, trial: str) -> "SettledRun":
         """Return a run that has settled with laws under its first loads."""
         outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
         if not run.courses or not np.any(outputs[:, columns]):
             return SettledRun(run, None)
 
-        def run_under(forces: FloatArray) -> Run:
+        def run_under(forces: FloatArray) -> FmuRun:
             loads = {name: np.full(1, value) for name, value in run.begin.items()}
             begin = self.loads_less_laws(loads, laws, forces)
             return run._replace(begin={name: float(values[0]) for name, values in begin.items()})
@@ -286,12 +286,12 @@ class FmuSimulator(FmuAtRest):
         _, solution = self.rest_with_laws(laws, outputs_under, outputs, run.state, trial)
         return SettledRun(run_under(solution.forces), solution.memory)
 
-    def _outputs_at_begin(self, run: Run) -> FloatArray:
+    def _outputs_at_begin(self, run: FmuRun) -> FloatArray:
         """Return the outputs (1, C) at the begin of a run."""
         _, outputs, _ = self.begun(run)
         return outputs[None]
 
-    def _outputs_with_laws(self, run: Run, laws: Laws, trial: str) -> FloatArray:
+    def _outputs_with_laws(self, run: FmuRun, laws: Laws, trial: str) -> FloatArray:
         """Return the outputs (K, C) of a run with laws; NaN if the coupling is unstable."""
         run, memory = self._settled_with_laws(run, laws, trial)
         ports = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
@@ -330,13 +330,13 @@ class FmuSimulator(FmuAtRest):
         return np.array(outputs)
 
     def _speed_gain(
-        self, run: Run, inputs: Sequence[str], speed_columns: list[int]
+        self, run: FmuRun, inputs: Sequence[str], speed_columns: list[int]
     ) -> tuple[FloatArray, FloatArray]:
         """Return speeds (2, P) around the first step, and what unit forces add in it (P, P).
 
         Parameters
         ----------
-        run : Run
+        run : FmuRun
             The run without laws.
         inputs : sequence of str
             Force input of each port.
@@ -431,7 +431,7 @@ class SteppedOutputs(NamedTuple):
 class SettledRun(NamedTuple):
     """A run that begins at rest with laws, and their memory; None if they were never loaded."""
 
-    run: Run
+    run: FmuRun
     memory: FloatArray | None
 
 

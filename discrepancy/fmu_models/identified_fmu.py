@@ -18,7 +18,13 @@ from discrepancy.fmu_models.system_motion import MOST_SYSTEMS, system_motion
 from discrepancy.fmu_models.variables import FmuVariables
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.time_history import RecordedHistory, equivalent_ramps
-from fmu_asset.client.runs import FmuRuns, Run, State, StateSpace, realised
+from fmu_asset.client.runs import (
+    FmuRun,
+    FmuRuns,
+    FmuStateSpace,
+    OperatingPoint,
+    realise_state_space,
+)
 from fmu_asset.errors import FmuError
 from reporting.memory import ResultCache
 
@@ -49,7 +55,7 @@ class Pace(NamedTuple):
 class PacedSystem(NamedTuple):
     """The system at a step that shows all modes, if the FMU is linear; parts of an interval."""
 
-    system: StateSpace | None
+    system: FmuStateSpace | None
     excitation: FmuExcitation
     parts: int
 
@@ -66,7 +72,7 @@ class IdentifiedFmu(FmuRuns):
 
     Attributes
     ----------
-    nominal : State
+    nominal : OperatingPoint
         State of motions at the means of the parameters; set by the model.
     ports, port_inputs : list of str
         Names of the ports, and inputs of their forces.
@@ -76,7 +82,7 @@ class IdentifiedFmu(FmuRuns):
         Parameter or input that releases the FMU, and the parameter of its velocity.
     """
 
-    nominal = State()
+    nominal = OperatingPoint()
 
     def __init__(self, description: FmuModelDescription, folder: Path) -> None:
         self.description = description
@@ -135,7 +141,7 @@ class IdentifiedFmu(FmuRuns):
     def excitation(
         self,
         trial: Trial,
-        state: State,
+        state: OperatingPoint,
         ports: Sequence[str],
         levers: Mapping[str, float] | None = None,
     ) -> FmuExcitation:
@@ -145,7 +151,7 @@ class IdentifiedFmu(FmuRuns):
         ----------
         trial : Trial
             A dynamic trial.
-        state : State
+        state : OperatingPoint
             Parameters and constant inputs.
         ports : sequence of str
             Ports at which laws act.
@@ -160,7 +166,7 @@ class IdentifiedFmu(FmuRuns):
 
     # ------------------------------------------------------------ its linear system
 
-    def system(self, excitation: FmuExcitation) -> StateSpace | None:
+    def system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the FMU as a linear system; None if it is not linear.
 
         It is linear where one system gives its answers to single forces and releases, and predicts
@@ -173,23 +179,23 @@ class IdentifiedFmu(FmuRuns):
         if not may_be_linear or self._is_linear.get(kind) is False:
             return None
         key = (kind, *excitation.recording)
-        system: StateSpace | None = self._systems.get(key, lambda: self._identify(excitation))
+        system: FmuStateSpace | None = self._systems.get(key, lambda: self._identify(excitation))
         if system is not None and kind not in self._is_linear:
             self._is_linear[kind] = self._predicts(system, excitation, LINEAR)
         return system if self._is_linear.get(kind) else None
 
-    def _identify(self, excitation: FmuExcitation) -> StateSpace | None:
+    def _identify(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the linear system of the answers to unit forces and releases, if there is one."""
         answers = [self._answer_to_force(excitation, name) for name in excitation.inputs]
         answers += [self._answer_to_release(excitation, name) for name in excitation.releases]
         records = np.stack(answers, axis=2)[1:]
-        return realised(records, len(excitation.inputs), excitation.step)
+        return realise_state_space(records, len(excitation.inputs), excitation.step)
 
     def _answer_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (record + 1, C) after a unit force over the first step."""
         size = self.size(name)
         impulse = size * np.eye(1, excitation.record).ravel()
-        run = Run(*excitation.recording, courses={name: impulse})
+        run = FmuRun(*excitation.recording, courses={name: impulse})
         key = (*excitation.recording, name, False)
         return self.remembered(key, lambda: self._motion(excitation, run) / size)
 
@@ -207,24 +213,24 @@ class IdentifiedFmu(FmuRuns):
         """Return whether a name is an input of the FMU, not a parameter."""
         return name in self.names.binding.load
 
-    def _motion(self, excitation: FmuExcitation, run: Run) -> FloatArray:
+    def _motion(self, excitation: FmuExcitation, run: FmuRun) -> FloatArray:
         """Return the outputs (steps + 1, C) of a run, less those of the undisturbed FMU."""
         return self.followed(run) - self._undisturbed_outputs(excitation)
 
     def _undisturbed_outputs(self, excitation: FmuExcitation) -> FloatArray:
         """Return the outputs (C,) at the start if nothing moves the FMU."""
         state, step, _ = excitation.recording
-        run = Run(state, step, 0)
+        run = FmuRun(state, step, 0)
         return self.remembered((state, step), lambda: self.begun(run)[1])
 
-    def _predicts(self, system: StateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
+    def _predicts(self, system: FmuStateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
         """Return whether a system gives the motion of the FMU under all that moves it at once.
 
         Inputs of laws get random forces.
 
         Parameters
         ----------
-        system : StateSpace
+        system : FmuStateSpace
             The system.
         excitation : FmuExcitation
             What moves the FMU.
@@ -302,11 +308,11 @@ class IdentifiedFmu(FmuRuns):
             )
         return amounts | {name: amount}
 
-    def _run(self, excitation: FmuExcitation, amounts: Mapping[str, float]) -> Run:
+    def _run(self, excitation: FmuExcitation, amounts: Mapping[str, float]) -> FmuRun:
         """Return the run by which the FMU follows an excitation, released by amounts."""
         begin = {name: amount for name, amount in amounts.items() if self._is_input(name)}
         parameters = {name: amount for name, amount in amounts.items() if name not in begin}
-        run = Run(excitation.state.having(parameters), excitation.step, excitation.record, begin)
+        run = FmuRun(excitation.state.having(parameters), excitation.step, excitation.record, begin)
         if excitation.force is None:
             return run
         for name, lever in excitation.levers.items():
@@ -320,7 +326,7 @@ class IdentifiedFmu(FmuRuns):
         return run._replace(courses=courses)
 
     def _start_state(
-        self, system: StateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
+        self, system: FmuStateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
     ) -> FloatArray:
         """Return the state (n,) at the begin: as released, and at rest under the first force."""
         start: FloatArray = system.starts @ np.array([*amounts.values()])
@@ -331,7 +337,7 @@ class IdentifiedFmu(FmuRuns):
 
     # ------------------------------------------------------------ pace
 
-    def pace(self, trial: Trial, state: State) -> Pace:
+    def pace(self, trial: Trial, state: OperatingPoint) -> Pace:
         """Return the first mode of the FMU and the communication step of a trial.
 
         The mode is the one that is most flexible at the first port; without a port, the loudest.

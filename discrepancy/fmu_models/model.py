@@ -26,7 +26,7 @@ from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
-from fmu_asset.client.runs import State, StateSpace
+from fmu_asset.client.runs import FmuStateSpace, OperatingPoint
 from reporting.words import comma_list
 
 LATEST = 100.0
@@ -170,7 +170,7 @@ class FmuModel(DescribedModel):
                 return self._stiffnesses_of_system(system)
         return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]
 
-    def _stiffnesses_of_system(self, system: StateSpace) -> list[PortStiffness]:
+    def _stiffnesses_of_system(self, system: FmuStateSpace) -> list[PortStiffness]:
         """Return the stiffness of each port of a linear system."""
         stiffnesses = []
         for port, column in enumerate(self.fmu.displacement_columns):
@@ -347,7 +347,7 @@ class FmuModel(DescribedModel):
             through=direct.T,
         )
 
-    def _system_at(self, trial: Trial, parameters: FloatArray) -> StateSpace | None:
+    def _system_at(self, trial: Trial, parameters: FloatArray) -> FmuStateSpace | None:
         """Return the linear system at values of the parameters; None if the FMU is not linear."""
         conditions = Conditions(parameters, health=trial.health[:1])
         state = self._state(trial, conditions, self.patch)
@@ -404,7 +404,7 @@ class FmuModel(DescribedModel):
 
     def _state(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH, row: int = 0
-    ) -> State:
+    ) -> OperatingPoint:
         """Return parameters and constant inputs of a row of a trial, with effects of a patch.
 
         Parameters
@@ -436,4 +436,4 @@ class FmuModel(DescribedModel):
         values = conditions.parameters.tolist()
         parameters |= dict(zip(self._parameter_keys, values, strict=True))
         parameters |= effect_parameters(patch, self.description.effects, parameters, self.what)
-        return State((), tuple(sorted(inputs.items()))).having(parameters)
+        return OperatingPoint((), tuple(sorted(inputs.items()))).having(parameters)

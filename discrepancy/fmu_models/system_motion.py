@@ -13,7 +13,7 @@ from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
-from fmu_asset.client.runs import StateSpace
+from fmu_asset.client.runs import FmuStateSpace
 
 MOST_SYSTEMS = 64
 """Number of systems that are kept."""
@@ -52,7 +52,7 @@ class SystemMotion(NamedTuple):
 
 
 def system_motion(
-    system: StateSpace,
+    system: FmuStateSpace,
     excitation: Excitation,
     start: FloatArray,
     laws: Laws = NO_LAWS,
@@ -67,7 +67,7 @@ def system_motion(
 
     Parameters
     ----------
-    system : StateSpace
+    system : FmuStateSpace
         The system that moves.
     excitation : Excitation
         Forces, with directions (E,).
@@ -137,7 +137,7 @@ class SystemWithPorts(NamedTuple):
 
 @lru_cache(maxsize=MOST_SYSTEMS)
 def _with_ports(
-    system: StateSpace,
+    system: FmuStateSpace,
     names: tuple[str, ...],
     columns: tuple[int, ...],
     force_numbers: tuple[int, ...],
@@ -146,7 +146,7 @@ def _with_ports(
 
     Parameters
     ----------
-    system : StateSpace
+    system : FmuStateSpace
         The system, of order n.
     names : tuple of str
         Port of each law.

@@ -99,7 +99,7 @@ def expand(pattern: str) -> tuple[str, ...]:
 _Names = Annotated[tuple[_Text, ...], BeforeValidator(_expanded)]
 
 
-class Scalar(Section):
+class ScalarBinding(Section):
     """One variable: its name in the FMU and the unit in which the caller gives or takes it.
 
     The name is that of a scalar, of one element of an FMI 3 array (`p[3]`, `a[2,1]`; from 1), or of a whole
@@ -110,7 +110,7 @@ class Scalar(Section):
     unit: _Text
 
 
-class Input(Scalar):
+class InputBinding(ScalarBinding):
     """An input with a range of its own, in `unit`, within that of the FMU."""
 
     minimum: Number | None = None
@@ -131,7 +131,7 @@ class Input(Scalar):
         )
 
 
-class Parameter(Input):
+class ParameterBinding(InputBinding):
     """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another.
 
     It is a text for a parameter that is one (of the unit "1"), and may be the name of an enumeration's item.
@@ -140,7 +140,7 @@ class Parameter(Input):
     value: Number | str | None = None
 
 
-class Vector(Section):
+class VectorBinding(Section):
     """Several variables in order; a text with `{a..b}` stands for all numbers from a to b.
 
     `unit` is one for all variables, or one for each.
@@ -167,7 +167,7 @@ class Vector(Section):
         yield came != count, said("binding.unit_count", count=count, came=came)
 
 
-class Port(Section):
+class PortBinding(Section):
     """A mechanical port: where another FMU can be coupled.
 
     Force goes one way and motion the other: an FMU takes the force and gives displacement or velocity, or the
@@ -175,9 +175,9 @@ class Port(Section):
     `Observation.extra` under the same names.
     """
 
-    force: Vector
-    displacement: Vector | None = None
-    velocity: Vector | None = None
+    force: VectorBinding
+    displacement: VectorBinding | None = None
+    velocity: VectorBinding | None = None
 
     def faults(self) -> Iterator[Fault]:
         """Yield a port without motion, and units that it cannot have."""
@@ -192,7 +192,7 @@ class Port(Section):
                 yield wrong, said("binding.port_unit", name=name, vector=vector, wanted=wanted)
 
     @property
-    def quantities(self) -> dict[str, Vector]:
+    def quantities(self) -> dict[str, VectorBinding]:
         """What the port has, in the order of `PORT_QUANTITIES`."""
         given = {name: getattr(self, name) for name in PORT_QUANTITIES}
         return {name: vector for name, vector in given.items() if vector is not None}
@@ -203,13 +203,13 @@ class Port(Section):
         return self.model_copy(update=changed)
 
 
-class Record(Section):
+class RecordBinding(Section):
     """The table `[record]`: further variables to be recorded, in the FMU's own units."""
 
     variables: _Names = ()
 
 
-class Header(Section):
+class BindingHeader(Section):
     """The table `[binding]`.
 
     Attributes
@@ -268,33 +268,33 @@ class Binding(Section):
 
     Attributes
     ----------
-    binding : Header
+    binding : BindingHeader
         Name, FMI version, step size.
-    control, health, load : dict of str to Input
+    control, health, load : dict of str to InputBinding
         Inputs by role and by the caller's name.
-    observation : dict of str to Vector
+    observation : dict of str to VectorBinding
         What is measured, in order.
-    parameter : dict of str to Parameter
+    parameter : dict of str to ParameterBinding
         Parameters by the caller's name.
-    monitor : dict of str to Scalar
+    monitor : dict of str to ScalarBinding
         Further scalars to be recorded.
-    port : dict of str to Port
+    port : dict of str to PortBinding
         Where other FMUs can be coupled.
-    record : Record
+    record : RecordBinding
         Further variables to be recorded, in the FMU's units.
     limits : WorkerLimits
         What the worker may take.
     """
 
-    binding: Header
-    control: dict[str, Input] = Field(default_factory=dict)
-    health: dict[str, Input] = Field(default_factory=dict)
-    load: dict[str, Input] = Field(default_factory=dict)
-    observation: dict[str, Vector] = Field(default_factory=dict)
-    parameter: dict[str, Parameter] = Field(default_factory=dict)
-    monitor: dict[str, Scalar] = Field(default_factory=dict)
-    port: dict[str, Port] = Field(default_factory=dict)
-    record: Record = Field(default_factory=Record)
+    binding: BindingHeader
+    control: dict[str, InputBinding] = Field(default_factory=dict)
+    health: dict[str, InputBinding] = Field(default_factory=dict)
+    load: dict[str, InputBinding] = Field(default_factory=dict)
+    observation: dict[str, VectorBinding] = Field(default_factory=dict)
+    parameter: dict[str, ParameterBinding] = Field(default_factory=dict)
+    monitor: dict[str, ScalarBinding] = Field(default_factory=dict)
+    port: dict[str, PortBinding] = Field(default_factory=dict)
+    record: RecordBinding = Field(default_factory=RecordBinding)
     limits: WorkerLimits = Field(default_factory=WorkerLimits)
 
     @property
@@ -312,9 +312,9 @@ class Binding(Section):
         """Time between two observations [s]."""
         return self.binding.step_size * self.binding.decimation
 
-    def inputs(self, role: str) -> Mapping[str, Input]:
+    def inputs(self, role: str) -> Mapping[str, InputBinding]:
         """Return the variables of one of `INPUT_ROLES` by the caller's names."""
-        table: Mapping[str, Input] = getattr(self, role)
+        table: Mapping[str, InputBinding] = getattr(self, role)
         return table
 
     @property
@@ -356,7 +356,7 @@ class Binding(Section):
         An input that the binding has for a region stays as it is; the others have the names of their regions.
         """
         bound = {entry.variable: (name, entry) for name, entry in self.health.items()}
-        own = {region: Input(variable=f"health.{region}", unit="1") for region in regions}
+        own = {region: InputBinding(variable=f"health.{region}", unit="1") for region in regions}
         health = dict(bound.get(entry.variable, (region, entry)) for region, entry in own.items())
         return self.model_copy(update={"health": health})
 
@@ -404,7 +404,7 @@ def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> 
         raise BindingError(f"In {where}, there is no [observation.<name>] table; say what is measured.")
     taken: dict[str, str] = {}
     for role in (*INPUT_ROLES, "parameter"):
-        table: Mapping[str, Scalar] = getattr(parsed, role)
+        table: Mapping[str, ScalarBinding] = getattr(parsed, role)
         for key, scalar in table.items():
             here = f"{role}.{key}"
             if scalar.variable in taken:

@@ -12,8 +12,16 @@ from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuInputError, said
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
-from .binding import INPUT_ROLES, Binding, Input, Vector
-from .layout import BlockLayout, OutputTable, Place, Slot, configured, find, start_values
+from .binding import INPUT_ROLES, Binding, InputBinding, VectorBinding
+from .layout import (
+    BlockLayout,
+    InputSlot,
+    OutputTable,
+    VariableElements,
+    find_variable,
+    start_values,
+    with_structural_parameters,
+)
 from .units import IDENTITY, conversion
 from .values import Histories, Values
 
@@ -40,7 +48,7 @@ class Exchange:
         Names of all values of the reply block.
     sent, read : tuple of VariableInfo
         What stands in the request and in the reply block, in order.
-    health_slots : dict of str to Slot
+    health_slots : dict of str to InputSlot
         Health that is a parameter or start value of the FMU, which is set before the initialisation only.
 
     Raises
@@ -54,7 +62,7 @@ class Exchange:
         wanted = binding.binding.fmi_version
         if wanted is not None and wanted[0] != description.fmi_version[0]:
             raise BindingError(said("binding.fmi_version", binding=binding, wanted=wanted, fmu=description))
-        description, configuration = configured(description, binding)
+        description, configuration = with_structural_parameters(description, binding)
         self.description = description
         self.binding = binding.with_arrays(self._elements)
         self._whose = f"of the binding {binding.name}"
@@ -81,10 +89,10 @@ class Exchange:
         variable = self.description.variable(name)
         return (name,) if variable is None else variable.elements
 
-    def _find(self, name: str, label: str, causality: str) -> Place:
-        return find(self.description, name, f"{label} {self._whose}", causality)
+    def _find(self, name: str, label: str, causality: str) -> VariableElements:
+        return find_variable(self.description, name, f"{label} {self._whose}", causality)
 
-    def _port_vectors(self) -> list[tuple[str, Vector, bool]]:
+    def _port_vectors(self) -> list[tuple[str, VectorBinding, bool]]:
         """Return what ports have: name, vector, and whether it is read, which is so of force or of motion."""
         found = []
         for name, port in self.binding.port.items():
@@ -114,14 +122,14 @@ class Exchange:
         health_at_start = {
             name: item for name, item in self.binding.health.items() if self._is_set_at_start(item.variable)
         }
-        wanted: list[tuple[str, str, Input, tuple[str, ...]]] = [
+        wanted: list[tuple[str, str, InputBinding, tuple[str, ...]]] = [
             (role, name, item, (item.variable,))
             for role in INPUT_ROLES
             for name, item in self.binding.inputs(role).items()
             if not (role == "health" and name in health_at_start)
         ]
         wanted += [
-            ("port", name, Input(variable=vector.variables[0], unit=vector.units[0]), vector.variables)
+            ("port", name, InputBinding(variable=vector.variables[0], unit=vector.units[0]), vector.variables)
             for name, vector, read in self._ports
             if not read
         ]
@@ -133,7 +141,7 @@ class Exchange:
         linear = self.binding.binding.interpolation == "linear"
         self._inputs = BlockLayout(self.description, sent, begin=2, linear=linear)
         self._check_lines()
-        self._slots: dict[str, dict[str, Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
+        self._slots: dict[str, dict[str, InputSlot]] = {role: {} for role in (*INPUT_ROLES, "port")}
         taken: dict[int, str] = {}
         for (role, name, item, _), found in zip(wanted, places, strict=True):
             label = f"{role}.{name}"
@@ -159,7 +167,7 @@ class Exchange:
             name: self._start_slot(f"health.{name}", item) for name, item in health_at_start.items()
         }
         self._text_parameters: dict[str, VariableInfo] = {}
-        self._parameter_slots: dict[str, Slot] = {}
+        self._parameter_slots: dict[str, InputSlot] = {}
         for name, item in self.binding.parameter.items():
             text = self.description.variable(item.variable)
             if text is not None and text.is_text_parameter:
@@ -175,7 +183,7 @@ class Exchange:
         tunable = variable.variability == "tunable" and self.description.interface == "co-simulation"
         return variable.startable or (variable.causality == "parameter" and not tunable)
 
-    def _start_slot(self, label: str, item: Input) -> Slot:
+    def _start_slot(self, label: str, item: InputBinding) -> InputSlot:
         """Return where a value goes before initialisation; positions count from the variable's own values."""
         place = self._find(item.variable, label, "parameter")
         return self._slot(label, item, place.variable, place.elements)
@@ -196,14 +204,14 @@ class Exchange:
         if not any(group.linear for group in self._inputs.groups):
             raise BindingError(f"{asked} none of them is a continuous real number in {path}; leave it out.")
 
-    def _own_slot(self, name: str) -> Slot:
+    def _own_slot(self, name: str) -> InputSlot:
         """Return the slot of a parameter by its name in the FMU, which the binding does not name."""
         variable = self.description.variable(name)
         bound = {slot.variable.name for slot in self._parameter_slots.values()}
         if variable is None or variable.causality != "parameter" or name in bound:
             known = self.binding.parameter
             raise BindingError(said("binding.no_parameter", self=self, name=name, known=known))
-        return self._start_slot(f"parameter.{name}", Input(variable=name, unit=variable.unit or "1"))
+        return self._start_slot(f"parameter.{name}", InputBinding(variable=name, unit=variable.unit or "1"))
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
         """Return the text that a name of the binding, or else of the FMU, means; None if it means none."""
@@ -214,14 +222,16 @@ class Exchange:
         is_own = variable is not None and variable.is_text_parameter and name not in bound
         return variable if is_own else None
 
-    def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
+    def _slot(
+        self, label: str, item: InputBinding, variable: VariableInfo, positions: Sequence[int]
+    ) -> InputSlot:
         scale = conversion(item.unit, variable, self.description.units_of(variable), where=label)
         low, high = variable.bounds
         least, most = sorted(scale.to_fmu(end) for end in item.ends)
         if least > high or most < low:
             ends, what = (low, high), f"{label} {self._whose}"
             raise BindingError(said("binding.range", what=what, variable=variable, ends=ends))
-        return Slot(label, positions, max(low, least), min(high, most), scale, variable)
+        return InputSlot(label, positions, max(low, least), min(high, most), scale, variable)
 
     def _make_outputs(self) -> None:
         """Lay out the reply block: observations, monitors, records, outputs of ports."""
@@ -303,7 +313,7 @@ class Exchange:
         fixed = {n: entry.value for n, entry in self.binding.parameter.items() if entry.value is not None}
         set_values: dict[str, tuple[str, int, list[float]]] = {}
         texts: Settings = []
-        slots: list[tuple[Slot, Any]] = []
+        slots: list[tuple[InputSlot, Any]] = []
         for name, value in {**fixed, **parameters}.items():
             text_parameter = self._text_parameter(name)
             if text_parameter is None:
@@ -399,7 +409,7 @@ class Exchange:
         return rows
 
     @staticmethod
-    def step_count(histories: Sequence[tuple[Slot, npt.NDArray[np.float64]]], steps: int | None) -> int:
+    def step_count(histories: Sequence[tuple[InputSlot, npt.NDArray[np.float64]]], steps: int | None) -> int:
         """Return the number of steps that histories, and who asks for them, agree on.
 
         Raises
@@ -424,7 +434,7 @@ class Exchange:
             raise FmuInputError(said("inputs.no_steps"))
         return count
 
-    def slot(self, role: str, name: str) -> Slot:
+    def slot(self, role: str, name: str) -> InputSlot:
         """Return where an input goes.
 
         Raises

@@ -18,12 +18,12 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table, table_text
 
-from .binding import INPUT_ROLES, Binding, Header, Input, Parameter, Vector
+from .binding import INPUT_ROLES, Binding, BindingHeader, InputBinding, ParameterBinding, VectorBinding
 from .draft import bindable, observable
 from .layout import ObservationHistory
 from .session import FmiAsset
 
-Roles = dict[str, dict[str, Float]]
+InputHistories = dict[str, dict[str, Float]]
 """Inputs of N steps by role and name, (N,) or (N, n) for an array: what `FmiAsset.simulate` takes."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]", re.DOTALL)
@@ -32,7 +32,7 @@ _TIME = "time"
 _TIME_TOLERANCE = 1e-6
 
 
-def read_histories(path: Path, binding: Binding) -> tuple[int, Roles]:
+def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
     """Return how many steps a CSV file has, and their inputs.
 
     The first line names the columns: `time` [s], which begins at the binding's start time and goes on by its
@@ -78,7 +78,7 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, Roles]:
         if element in taken or (taken and 0 in (element, *taken)):
             raise FmuInputError(f"{path} gives {'.'.join(key)} in more than one column; keep one.")
         taken[element] = table.numbers(column, "a simulation")
-    roles: Roles = {}
+    roles: InputHistories = {}
     for (role, name), elements in columns.items():
         lost = {*range(1, len(elements) + 1)} - elements.keys()
         if lost and 0 not in elements:
@@ -143,10 +143,10 @@ _STEPS = 500
 _MOST_STEPS = 10_000_000
 
 Value = float | str | list[float] | list[str]
-Bound = TypeVar("Bound", Input, Parameter)
+Bound = TypeVar("Bound", InputBinding, ParameterBinding)
 
 
-class Experiment(NamedTuple):
+class FmuExperiment(NamedTuple):
     """What is simulated.
 
     Attributes
@@ -173,7 +173,7 @@ def default_experiment(
     stop_time: float | None = None,
     step_size: float | None = None,
     values: Mapping[str, Value] | None = None,
-) -> Experiment:
+) -> FmuExperiment:
     """Return the default experiment of an FMU, or what is wanted instead.
 
     Parameters
@@ -219,7 +219,7 @@ def default_experiment(
     last_step_end = start + steps * size
     told_end = last_step_end if last_step_end > end + _TIME_TOLERANCE * size else end
     binding = binding.with_header(structural_parameters=sizes, stop_time=told_end)
-    return Experiment(binding, steps, parameters, {"load": load})
+    return FmuExperiment(binding, steps, parameters, {"load": load})
 
 
 def value_of_text(variable: VariableInfo, text: str) -> Value:
@@ -275,16 +275,17 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
         return {v.name: kind(variable=v.name, unit=v.unit or "1") for v in found}
 
     return Binding(
-        binding=Header(
+        binding=BindingHeader(
             name=description.model_name or "fmu",
             step_size=description.step_of(step_size) or 1.0,
             start_time=description.start_time or 0.0,
             interface=description.interface,
         ),
-        load=of("input", Input),
-        parameter=of("parameter", Parameter),
+        load=of("input", InputBinding),
+        parameter=of("parameter", ParameterBinding),
         observation={
-            v.name: Vector(variables=(v.name,), unit=v.unit or "1") for v in observable(description, usable)
+            v.name: VectorBinding(variables=(v.name,), unit=v.unit or "1")
+            for v in observable(description, usable)
         },
     )
 
@@ -324,7 +325,7 @@ def ending_with_histories(binding: Binding, steps: int) -> Binding:
     return binding.with_header(stop_time=header.start_time + moves * binding.interval)
 
 
-def fly_histories(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
+def run_histories(asset: FmiAsset, steps: int, roles: InputHistories) -> ObservationHistory:
     """Simulate an asset under the histories of a file, as `read_histories` returns them.
 
     Each row holds over the step that begins at its time. Under linear interpolation lines lead from row to
@@ -344,10 +345,10 @@ def fly_histories(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHisto
     first = {role: {name: v[0] for name, v in table.items()} for role, table in roles.items()}
     rest = {role: {name: v[1:] for name, v in table.items()} for role, table in roles.items()}
     asset.reset(**first)
-    return from_here(asset, steps - 1, rest)
+    return simulate_from_now(asset, steps - 1, rest)
 
 
-def from_here(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
+def simulate_from_now(asset: FmiAsset, steps: int, roles: InputHistories) -> ObservationHistory:
     """Return this moment and what comes out of the steps after it."""
     first, then = asset.observe(), asset.simulate(**roles, steps=steps, progress=None)
     return ObservationHistory(
@@ -358,14 +359,14 @@ def from_here(asset: FmiAsset, steps: int, roles: Roles) -> ObservationHistory:
     )
 
 
-def fly(asset: FmiAsset, experiment: Experiment) -> ObservationHistory:
+def run_experiment(asset: FmiAsset, experiment: FmuExperiment) -> ObservationHistory:
     """Start an asset, and return its start and what came out of the steps after it.
 
     Parameters
     ----------
     asset : FmiAsset or CoupledAsset
         The asset.
-    experiment : Experiment
+    experiment : FmuExperiment
         Steps, parameters and inputs, which hold already in the initialisation.
 
     Returns
@@ -379,4 +380,4 @@ def fly(asset: FmiAsset, experiment: Experiment) -> ObservationHistory:
         As `FmiAsset.simulate`.
     """
     asset.reset(experiment.parameters, **experiment.inputs)
-    return from_here(asset, experiment.steps, {})
+    return simulate_from_now(asset, experiment.steps, {})

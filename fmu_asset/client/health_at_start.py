@@ -8,7 +8,7 @@ import numpy as np
 from .exchange import Exchange
 
 
-class Course(NamedTuple):
+class ConstantHealthRun(NamedTuple):
     """Steps that are made one after the other in one health.
 
     Attributes
@@ -26,9 +26,9 @@ class Course(NamedTuple):
     steps: int
 
 
-def courses_of_equal_health(
+def split_where_health_changes(
     exchange: Exchange, roles: Mapping[str, Mapping[str, Any] | None], steps: int | None
-) -> list[Course]:
+) -> list[ConstantHealthRun]:
     """Return the courses that histories consist of.
 
     Parameters
@@ -71,7 +71,7 @@ def courses_of_equal_health(
             first.setdefault(role, {})[name] = part[0] if varies[role, name] else part
             if not (role == "health" and name in exchange.health_slots):
                 histories.setdefault(role, {})[name] = part
-        courses.append(Course(first, histories, end - begin))
+        courses.append(ConstantHealthRun(first, histories, end - begin))
     return courses
 
 

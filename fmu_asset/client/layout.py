@@ -11,7 +11,7 @@ import numpy as np
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError, said
-from fmu_asset.instances.plan import Group, Settings
+from fmu_asset.instances.plan import Settings, VariableGroup
 from reporting.arrays import Float
 
 from .binding import Binding
@@ -28,14 +28,14 @@ _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\s*\d+)*)\]", re.DOTALL)
 _KIND_ORDER = ("Real", "Float64", "Integer", "Boolean")
 
 
-class Place(NamedTuple):
+class VariableElements(NamedTuple):
     """A variable, and which of its values are meant: one, or all."""
 
     variable: VariableInfo
     elements: range
 
 
-def find(description: FmuDescription, name: str, label: str, causality: str) -> Place:
+def find_variable(description: FmuDescription, name: str, label: str, causality: str) -> VariableElements:
     """Return what a name of a binding means in an FMU.
 
     Parameters
@@ -56,7 +56,11 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
         If there is none, or one of another causality or type.
     """
     variable = description.variable(name)
-    place = _element(description, name, label) if variable is None else Place(variable, range(variable.size))
+    place = (
+        _element(description, name, label)
+        if variable is None
+        else VariableElements(variable, range(variable.size))
+    )
     if place is None:
         unknown = f"{label} names {name!r}, which is not a variable of {description.label}"
         raise BindingError(unknown + description.hint(name))
@@ -77,7 +81,7 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     return place
 
 
-def _element(description: FmuDescription, name: str, label: str) -> Place | None:
+def _element(description: FmuDescription, name: str, label: str) -> VariableElements | None:
     found = _ELEMENT.fullmatch(name)
     variable = description.variable(found.group(1)) if found else None
     if found is None or variable is None or not variable.shape:
@@ -90,7 +94,7 @@ def _element(description: FmuDescription, name: str, label: str) -> Place | None
         raise BindingError(
             said("binding.element", label=label, name=name, variable=variable, shape=shape)
         ) from None
-    return Place(variable, range(element, element + 1))
+    return VariableElements(variable, range(element, element + 1))
 
 
 class BlockLayout:
@@ -130,11 +134,11 @@ class BlockLayout:
         self._begins = dict(zip((variable.name for variable in self.variables), begins, strict=False))
         groups = [(key, list(members)) for key, members in groupby(self.variables, kind)]
         self.groups = tuple(
-            Group(name, tuple(v.reference for v in members), sum(v.size for v in members), not held)
+            VariableGroup(name, tuple(v.reference for v in members), sum(v.size for v in members), not held)
             for (held, _, name), members in groups
         )
 
-    def positions(self, place: Place) -> list[int]:
+    def positions(self, place: VariableElements) -> list[int]:
         """Return where the values of a place stand."""
         return [self._begins[place.variable.name] + element for element in place.elements]
 
@@ -173,7 +177,7 @@ def start_values(description: FmuDescription, variable: VariableInfo, *, given: 
     return values
 
 
-class Slot(NamedTuple):
+class InputSlot(NamedTuple):
     """Where an input goes: positions in the request block, range in the FMU's unit, conversion."""
 
     label: str
@@ -281,7 +285,9 @@ class Slot(NamedTuple):
         )
 
 
-def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescription, Settings]:
+def with_structural_parameters(
+    description: FmuDescription, binding: Binding
+) -> tuple[FmuDescription, Settings]:
     """Return what an FMU declares with the structural parameters of a binding, and what is set for them.
 
     Raises
@@ -296,8 +302,8 @@ def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescri
     for name, value in binding.binding.structural_parameters.items():
         label = f"structural_parameters.{name}"
         where = f"{label} of the binding {binding.name}"
-        variable = find(description, name, where, "structuralParameter").variable
-        numbers = Slot(label, (0,), *variable.bounds, IDENTITY, variable).numbers(value).tolist()
+        variable = find_variable(description, name, where, "structuralParameter").variable
+        numbers = InputSlot(label, (0,), *variable.bounds, IDENTITY, variable).numbers(value).tolist()
         found.append((variable.kind, variable.reference, numbers))
         lengths[name] = int(numbers[0])
     if not lengths:

@@ -25,7 +25,7 @@ from fmu_asset.worker.client import WorkerInstance
 from .binding import Binding, load_binding
 from .exchange import Exchange
 from .layout import Observation
-from .placement import Housing, Start, limits_of
+from .placement import InstanceHost, InstanceStart, worker_limits
 from .values import Inputs, PlainValue, Values, check_roles, plain_values
 
 StateMethod = Literal["serialised", "replay"]
@@ -167,16 +167,16 @@ class OpenedFmu:
         parameters: Values | None = None,
     ) -> None:
         given = binding if isinstance(binding, Binding) else load_binding(binding)
-        limits = limits_of(given, step_timeout, load_timeout, memory_limit)
+        limits = worker_limits(given, step_timeout, load_timeout, memory_limit)
         if isinstance(fmu_path, FmuDescription):
             description = fmu_path
         else:
             description = read_fmu(fmu_path, given.binding.interface)
         exchange = Exchange(description, given)
-        housing = Housing(exchange.description, exchange.plan, limits, isolated=isolated)
+        housing = InstanceHost(exchange.description, exchange.plan, limits, isolated=isolated)
         self._settle(exchange, housing, parameters or {})
 
-    def _settle(self, exchange: Exchange, housing: Housing, parameters: Values) -> None:
+    def _settle(self, exchange: Exchange, housing: InstanceHost, parameters: Values) -> None:
         """Begin with what is exchanged, and with where the instance lives."""
         self._exchange, self._housing = exchange, housing
         self.description, self.binding = exchange.description, exchange.binding
@@ -380,7 +380,7 @@ class OpenedFmu:
     ) -> None:
         """Bring an instance to its start, which is the moment after `index` steps of the asset."""
         time = self._start_time + index * self._interval
-        start = Start(time, self._settings, request, with_inputs)
+        start = InstanceStart(time, self._settings, request, with_inputs)
         try:
             instance = self._housing.start(start, renewed=renewed)
             self._adopt(instance)

@@ -33,7 +33,7 @@ from .binding import Binding
 
 
 @dataclass(frozen=True)
-class Start:
+class InstanceStart:
     """How an instance is brought to its first communication point.
 
     Attributes
@@ -65,7 +65,7 @@ class Start:
         instance.initialise(self.time, self.settings, with_inputs=self.with_inputs)
 
 
-class Way(IntEnum):
+class RestartMethod(IntEnum):
     """How an instance is brought back to its start, the fastest first."""
 
     RESET = 0
@@ -87,9 +87,9 @@ class ResetTrial:
         What is wrong with it, one sentence; empty as long as nothing is known to be.
     lies : bool
         Whether it returns OK and does nothing of use.
-    way : Way
+    way : RestartMethod
         The fastest way to start again that has shown no difference.
-    first : (Start, bytes), optional
+    first : (InstanceStart, bytes), optional
         How the first instance was started, and the request block of its first step.
     reply : (n,) ndarray
         The outputs after that step.
@@ -99,8 +99,8 @@ class ResetTrial:
     works: bool | None = None
     fault: str = ""
     lies: bool = False
-    way: Way = Way.RESET
-    first: tuple[Start, bytes] | None = None
+    way: RestartMethod = RestartMethod.RESET
+    first: tuple[InstanceStart, bytes] | None = None
     reply: Float = field(default_factory=lambda: np.empty(0))
 
     def first_step(self, instance: Instance) -> Float:
@@ -114,17 +114,17 @@ class ResetTrial:
 
     def refused(self) -> None:
         """Remember that the FMU has no reset."""
-        self.works, self.way = False, Way.RENEWAL
+        self.works, self.way = False, RestartMethod.RENEWAL
         self.fault = "It cannot be reset; every start takes a new instance."
 
-    def agrees(self, label: str, way: Way, reply: Float) -> bool:
+    def agrees(self, label: str, way: RestartMethod, reply: Float) -> bool:
         """Return whether a start can be believed; if not, say it once and turn to the next way for good.
 
         Parameters
         ----------
         label : str
             What the FMU is called.
-        way : Way
+        way : RestartMethod
             How it was started.
         reply : (n,) ndarray
             Outputs after the first step, which was asked as that of `first`.
@@ -132,15 +132,15 @@ class ResetTrial:
         true = self.reply
         different = ~((reply == true) | (np.isnan(reply) & np.isnan(true)))
         if not different.any():
-            if way == Way.RESET:
+            if way == RestartMethod.RESET:
                 self.works = True
             return True
-        if way == Way.LOADING:
-            self.comparable, self.first, self.way = False, None, Way.RENEWAL
+        if way == RestartMethod.LOADING:
+            self.comparable, self.first, self.way = False, None, RestartMethod.RENEWAL
             return True
         at = np.flatnonzero(different)[0]
         doubted = " Flights that began by a reset before may be wrong." * bool(self.works)
-        self.works, self.lies, self.way = False, True, Way(way + 1)
+        self.works, self.lies, self.way = False, True, RestartMethod(way + 1)
         what, instead = _FAULTS[way]
         self.fault = (
             f"{what} (an output is {reply[at]:.9g} where that of a new instance is {true[at]:.9g}); "
@@ -153,8 +153,11 @@ class ResetTrial:
 
 
 _FAULTS = {
-    Way.RESET: ("Its reset returns OK and does not bring it back to its start", "instance"),
-    Way.RENEWAL: ("Another instance in the same process does not begin as the first one did", "process"),
+    RestartMethod.RESET: ("Its reset returns OK and does not bring it back to its start", "instance"),
+    RestartMethod.RENEWAL: (
+        "Another instance in the same process does not begin as the first one did",
+        "process",
+    ),
 }
 
 
@@ -185,7 +188,7 @@ class Extraction:
         weakref.finalize(self, remove_folder, self.folder)
 
 
-class Housing:
+class InstanceHost:
     """The life of one instance at a time.
 
     Parameters
@@ -216,24 +219,24 @@ class Housing:
         self.instance: Instance | None = None
         # Where there can be no instance after the first one, there is nothing to compare a reset with.
         self.reset_trial = ResetTrial(comparable=isolated or not description.once_per_process)
-        self._way = Way.LOADING
-        self._start: Start | None = None
+        self._way = RestartMethod.LOADING
+        self._start: InstanceStart | None = None
 
-    def sibling(self) -> "Housing":
+    def sibling(self) -> "InstanceHost":
         """Return an empty housing beside this one, which shares the extracted FMU.
 
         The folder stays until every sibling that was made of it is closed or collected, used or not.
         """
-        other = Housing(self._description, self._plan, self._limits, isolated=self._isolated)
+        other = InstanceHost(self._description, self._plan, self._limits, isolated=self._isolated)
         other._extraction, other.reset_trial = self._extraction, self.reset_trial
         return other
 
-    def start(self, start: Start, *, renewed: bool = False) -> Instance:
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> Instance:
         """Return an instance at its start; never one that a fatal error has touched.
 
         Parameters
         ----------
-        start : Start
+        start : InstanceStart
             The start.
         renewed : bool
             Whether the instance has just been made by `renew`.
@@ -245,9 +248,9 @@ class Housing:
         """
         instance = self.instance
         if instance is None or instance.lost:
-            instance, self._way = self._another(), Way.LOADING
+            instance, self._way = self._another(), RestartMethod.LOADING
         elif renewed:
-            self._way = Way.RENEWAL
+            self._way = RestartMethod.RENEWAL
         else:
             instance = self._restarted()
         self._start = start
@@ -294,11 +297,11 @@ class Housing:
     def _restarted(self) -> Instance:
         """Return an instance as after its instantiation, by the fastest way that is seen to work."""
         trial = self.reset_trial
-        ways: list[tuple[Way, Callable[[], Instance]]] = [(Way.RESET, self._reset)]
+        ways: list[tuple[RestartMethod, Callable[[], Instance]]] = [(RestartMethod.RESET, self._reset)]
         if self._isolated and not self._description.once_per_process:
-            ways.append((Way.RENEWAL, self.renew))
+            ways.append((RestartMethod.RENEWAL, self.renew))
         for self._way, again in ways:
-            unproved = self._way == Way.RESET and trial.first is None and trial.comparable
+            unproved = self._way == RestartMethod.RESET and trial.first is None and trial.comparable
             if self._way < trial.way or unproved:
                 continue
             with suppress(FmuError):  # a worker that does not survive it is replaced
@@ -307,7 +310,7 @@ class Housing:
                     return instance
                 if trial.agrees(self._description.label, self._way, trial.first_step(instance)):
                     return again()
-        self._way = Way.LOADING
+        self._way = RestartMethod.LOADING
         return self._another()
 
     def _reset(self) -> Instance:
@@ -344,7 +347,7 @@ class Housing:
         grants = self._limits.grants
         if grants is not None and (missing := missing_path(grants, plan.folder)):
             raise FmuInputError(said("binding.grant", missing=missing))
-        say_sandbox(self._description.label, grants)
+        warn_without_sandbox(self._description.label, grants)
         scratch = plain_folder()
         try:
             return WorkerInstance(plan, scratch, limits=self._limits)
@@ -365,7 +368,7 @@ def _release(instance: Instance, extraction: Extraction) -> None:
         forget_modules(str(extraction.folder))
 
 
-def say_sandbox(label: str, grants: Grants | None) -> None:
+def warn_without_sandbox(label: str, grants: Grants | None) -> None:
     """Say once that FMUs, or that this one, are not kept from the user's files, where that is so."""
     if grants is None:
         said = f"{label}: its binding turns the sandbox off, so that it has all rights of its user."
@@ -381,7 +384,7 @@ def say_sandbox(label: str, grants: Grants | None) -> None:
         _logger.warning(said)
 
 
-def limits_of(
+def worker_limits(
     binding: Binding, step_timeout: float | None, load_timeout: float | None, memory_limit: float | None
 ) -> WorkerLimits:
     """Return what the caller says, else what the binding says, else the defaults.

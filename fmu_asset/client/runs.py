@@ -32,25 +32,25 @@ SETTLE_CHUNK = 200
 """Steps after which it is asked whether the motion has come to rest."""
 
 
-class State(NamedTuple):
+class OperatingPoint(NamedTuple):
     """Parameters and constant inputs of a run, sorted by name; by the names of the binding."""
 
     parameters: tuple[tuple[str, float], ...] = ()
     inputs: tuple[tuple[str, float], ...] = ()
 
-    def having(self, more: Mapping[str, float]) -> "State":
+    def having(self, more: Mapping[str, float]) -> "OperatingPoint":
         """Return it with other values of parameters."""
         return self._replace(parameters=tuple(sorted({**dict(self.parameters), **more}.items())))
 
 
-class Run(NamedTuple):
+class FmuRun(NamedTuple):
     """A motion that is asked of an FMU: in which state, communication step [s], how many of them.
 
     `begin` has what is added to inputs before it, under which the FMU is at rest, `courses` (steps,) what is
     added over its steps.
     """
 
-    state: State
+    state: OperatingPoint
     step: float
     steps: int
     begin: Mapping[str, float] = MappingProxyType({})
@@ -113,12 +113,14 @@ class FmuRuns:
         low, high = self.asset.input_range("load", name)
         return min(1.0, 0.1 * abs(low), 0.1 * abs(high))
 
-    def _inputs(self, state: State, more: Mapping[str, float] = MappingProxyType({})) -> dict[str, float]:
+    def _inputs(
+        self, state: OperatingPoint, more: Mapping[str, float] = MappingProxyType({})
+    ) -> dict[str, float]:
         """Return all inputs in a state, with more on some of them."""
         found = {**dict.fromkeys(self._of[1].load, 0.0), **dict(state.inputs)}
         return found | {name: found[name] + value for name, value in more.items()}
 
-    def _opened(self, state: State, step: float, begin: Mapping[str, float]) -> FmiAsset:
+    def _opened(self, state: OperatingPoint, step: float, begin: Mapping[str, float]) -> FmiAsset:
         """Return the instance of a step size [s] at its start."""
         path, binding, isolated = self._of
         own = binding.with_header(step_size=step)
@@ -141,7 +143,7 @@ class FmuRuns:
                 output, moves = asset.binding.observation_variables[worst], high[worst] - low[worst]
                 raise FmuOutputError(said("running.unrest", limit=self._limit, output=output, moves=moves))
 
-    def begun(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
+    def begun(self, run: FmuRun) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come.
 
         Raises
@@ -156,14 +158,14 @@ class FmuRuns:
             first = self._settled(asset) if any(run.begin.values()) else np.array(asset.observe().values)
         return asset, first, courses
 
-    def followed(self, run: Run) -> FloatArray:
+    def followed(self, run: FmuRun) -> FloatArray:
         """Return the outputs (steps + 1, C) of a motion; raises `FmuError`."""
         asset, first, courses = self.begun(run)
         with self.refusals():
             return np.vstack((first, asset.simulate(load=courses, steps=run.steps).values))
 
     def resting(
-        self, states: Sequence[State], loads: Mapping[str, FloatArray], step: float, *, settle: bool
+        self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray], step: float, *, settle: bool
     ) -> FloatArray:
         """Return the outputs (L, C) at rest in states that differ in inputs, under more (L,) on some.
 
@@ -196,7 +198,7 @@ FIT = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class StateSpace:
+class FmuStateSpace:
     """What E forces f and R releases do to C outputs of a linear FMU, beside what it shows without.
 
     s' = G s + B f, y = C s + D f, f being that just before where it jumps.
@@ -213,7 +215,7 @@ class StateSpace:
     direct: FloatArray
     starts: FloatArray
 
-    def in_state_of(self, base: "StateSpace") -> "StateSpace":
+    def in_state_of(self, base: "FmuStateSpace") -> "FmuStateSpace":
         """Return the same system in the state of another of its order.
 
         Outputs and their rates say what that state is: those of a structure do not change with its
@@ -223,7 +225,7 @@ class StateSpace:
         size = _not_zero(np.linalg.norm(others, axis=1, keepdims=True))
         way = np.linalg.lstsq(mine / size, others / size, rcond=None)[0]
         back = np.linalg.inv(way)
-        return StateSpace(
+        return FmuStateSpace(
             back @ self.generator @ way, back @ self.push, self.outputs @ way, self.direct, back @ self.starts
         )
 
@@ -306,7 +308,7 @@ def _logarithm(transition: FloatArray) -> FloatArray:
         return np.asarray(np.real(logm(transition)))
 
 
-def realised(records: FloatArray, forces: int, step: float) -> StateSpace | None:
+def realise_state_space(records: FloatArray, forces: int, step: float) -> FmuStateSpace | None:
     """Return the linear system of answers to unit forces, held over the first step only, and to releases.
 
     The realisation of Ho and Kalman (1966) as by Juang and Pappa (1985), from mixtures of the outputs.
@@ -359,5 +361,7 @@ def realised(records: FloatArray, forces: int, step: float) -> StateSpace | None
             whole = np.block([[transition, held], [np.zeros((forces, order)), np.eye(forces)]])
             generator, push = np.split(_logarithm(whole)[:order] / step, [order], axis=1)
             rows, first = rows * size[:, None], records[0, :, :forces] * size[:, None] * amount[:forces]
-            return StateSpace(generator, push, rows, first - rows @ held, np.linalg.solve(transition, starts))
+            return FmuStateSpace(
+                generator, push, rows, first - rows @ held, np.linalg.solve(transition, starts)
+            )
     return None

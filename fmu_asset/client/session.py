@@ -10,7 +10,7 @@ from fmu_asset.instances.plan import Instance
 from reporting.arrays import Float
 from reporting.progress import Progress, Stage, reporter
 
-from .health_at_start import courses_of_equal_health
+from .health_at_start import split_where_health_changes
 from .layout import Observation, ObservationHistory, joined_histories
 from .life import OpenedFmu, SavedState
 from .values import Histories, Values, plain_values
@@ -198,7 +198,7 @@ class FmiAsset(OpenedFmu):
     ) -> ObservationHistory:
         """Make many steps, each run of equal health after a start of its own."""
         histories = []
-        for course in courses_of_equal_health(self._exchange, roles, steps):
+        for course in split_where_health_changes(self._exchange, roles, steps):
             self._enter_health(course.first_inputs)
             histories.append(self._simulate(course.histories, course.steps, progress))
             if histories[-1].ended:

@@ -11,7 +11,7 @@ from typing import Any
 
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.packing.contents import python_members, sealed
-from fmu_asset.slaves.variables import Table
+from fmu_asset.slaves.variables import VariableTable
 
 _IMPORTS = """import json
 
@@ -52,7 +52,7 @@ def declared_companion(name: str, told: dict[str, Any]) -> Declaration:
 
     An output depends directly on the input that `of` names, if it does; losses are states.
     """
-    table, dependencies = Table({}), {"status": list[str]()}
+    table, dependencies = VariableTable({}), {"status": list[str]()}
     for group in told["group"]:
         for number in range(1, group.get("repeat", 1) + 1):
             for row in group["variables"]:

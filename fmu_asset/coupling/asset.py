@@ -14,7 +14,7 @@ from fe.runtime.arrays import FloatArray
 from fmu_asset.client.binding import Binding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.life import PackedState
-from fmu_asset.client.placement import Housing, ResetTrial, Start
+from fmu_asset.client.placement import InstanceHost, InstanceStart, ResetTrial
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.units import IDENTITY
 from fmu_asset.client.values import Values
@@ -92,7 +92,7 @@ def naming(component: str) -> Iterator[None]:
         raise type(error)(sentence, error.messages, time) from error
 
 
-class CoupledFmus(Housing):
+class CoupledFmus(InstanceHost):
     """Several FMUs as one instance, and where it lives: what `FmiAsset` asks of an instance and its housing.
 
     Parameters
@@ -149,7 +149,7 @@ class CoupledFmus(Housing):
 
     # ------------------------------------------------------------------ life
 
-    def start(self, start: Start, *, renewed: bool = False) -> Self:
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> Self:
         """Bring the components to their start."""
         start.make(self)
         return self

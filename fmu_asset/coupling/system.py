@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
-from fmu_asset.client.binding import Binding, Header, Input, Parameter, Vector
+from fmu_asset.client.binding import Binding, BindingHeader, InputBinding, ParameterBinding, VectorBinding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError, said
@@ -231,7 +231,7 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
         return {key: variables[key].unit or "1" for group in groups for key in group}
 
     own = Binding(
-        binding=Header(
+        binding=BindingHeader(
             name=name,
             step_size=binding.step_size / component.substeps,
             decimation=component.substeps if linear else 1,
@@ -242,10 +242,14 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
             tolerance=binding.binding.tolerance,
         ),
         limits=binding.limits,
-        load={key: Input(variable=key, unit=unit) for key, unit in units(fed, given, constants).items()},
-        parameter={key: Parameter(variable=key, unit=unit) for key, unit in units(settings, tuned).items()},
+        load={
+            key: InputBinding(variable=key, unit=unit) for key, unit in units(fed, given, constants).items()
+        },
+        parameter={
+            key: ParameterBinding(variable=key, unit=unit) for key, unit in units(settings, tuned).items()
+        },
         observation={
-            key: Vector(variables=(key,), unit=unit)
+            key: VectorBinding(variables=(key,), unit=unit)
             for key, unit in units(end.variable for end in ends).items()
         },
     )

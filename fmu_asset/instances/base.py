@@ -27,7 +27,7 @@ from fmu_asset.errors import (
     visible,
 )
 
-from .plan import Group, Instance, Lines, Plan, Settings, exchanged, prepared
+from .plan import Instance, LinearInputs, Plan, Settings, VariableGroup, exchanged, prepared
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
@@ -106,7 +106,7 @@ class FmuInstance(Instance):
         self._size = ctypes.c_double.from_buffer(self.request, 8)
         self._plan, self._version = plan, plan.fmu.major_version
         self._prefix = "fmi" if self._version == 1 else f"fmi{self._version}"
-        self._lines = Lines(self.request, plan) if plan.linear_count else None
+        self._lines = LinearInputs(self.request, plan) if plan.linear_count else None
         self._name = f"{plan.instance_name}-{os.getpid()}-{next(_instance_numbers)}"
         self.messages: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
         self._errors = 0
@@ -173,7 +173,7 @@ class FmuInstance(Instance):
         """Make one communication step from `_begin` over `_size`; the inputs are set."""
 
     @abstractmethod
-    def _calls_of(self, lines: Lines) -> Calls:
+    def _calls_of(self, lines: LinearInputs) -> Calls:
         """Return what makes inputs move: calls that tell how fast, or that set them again."""
 
     def _send(self) -> None:
@@ -182,7 +182,7 @@ class FmuInstance(Instance):
             self._lines.aim()
         self._make(self._set + self._moving)
 
-    def _follow(self, lines: Lines) -> None:
+    def _follow(self, lines: LinearInputs) -> None:
         """Set the inputs where their lines are at a later communication point of the step."""
         lines.move(self._begin.value)
         self._make(self._set + self._moving)
@@ -308,7 +308,7 @@ class FmuInstance(Instance):
         function = getattr(self._fmu.dll, before + self._prefix + name)
         return prepared(function, ctypes.c_void_p.from_param(self._fmu.component), *arguments)
 
-    def _blocks(self, verb: str, groups: tuple[Group, ...], doubles: Any, begin: int) -> Calls:
+    def _blocks(self, verb: str, groups: tuple[VariableGroup, ...], doubles: Any, begin: int) -> Calls:
         calls: Calls = []
         for group in groups:
             arguments, convert = exchanged(self._version, group, doubles, begin, sent=verb == "Set")
@@ -322,7 +322,7 @@ class FmuInstance(Instance):
                 self._fmu.setString([reference], values)
                 continue
             doubles = (ctypes.c_double * len(values))(*map(float, values))
-            self._make(self._blocks("Set", (Group(kind, (reference,), len(values)),), doubles, 0))
+            self._make(self._blocks("Set", (VariableGroup(kind, (reference,), len(values)),), doubles, 0))
 
     def _make(self, calls: Calls, what: str = "setting inputs") -> None:
         """Make calls that set values, with the conversion before, or that read them."""

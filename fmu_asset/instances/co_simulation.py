@@ -19,7 +19,7 @@ from fmpy.sundials.nvector_serial import N_VDestroy_Serial
 from fmu_asset.errors import FmuCallError, FmuError, said
 
 from .base import ACCEPTED, DISCARD, OK, Calls, FmuInstance
-from .plan import Lines, Plan, Settings
+from .plan import LinearInputs, Plan, Settings
 
 _LAST_SUCCESSFUL_TIME, _TERMINATED = 2, 3
 """Of the enumeration `fmi2StatusKind`."""
@@ -67,7 +67,7 @@ class CoSimulation(FmuInstance):
         # The C functions themselves: fmpy's methods log and look up names at every call.
         self._do_step = self._prepared("DoStep", self._begin, self._size, *further[self._version])
 
-    def _calls_of(self, lines: Lines) -> Calls:
+    def _calls_of(self, lines: LinearInputs) -> Calls:
         name = "SetRealInputDerivatives"
         references = [number for group in self._plan.inputs if group.linear for number in group.references]
         count = len(references)
@@ -305,10 +305,10 @@ class ModelExchange(FmuInstance):
             if self._solver is not None:
                 self._solver.reset(self.request[0])
 
-    def _calls_of(self, lines: Lines) -> Calls:
+    def _calls_of(self, lines: LinearInputs) -> Calls:
         return self._blocks("Set", tuple(g for g in self._plan.inputs if g.linear), self._values, 2)
 
-    def _follow(self, lines: Lines) -> None:
+    def _follow(self, lines: LinearInputs) -> None:
         """Leave the inputs: they move with the solver's time."""
 
     def apply(self, time: float) -> None:

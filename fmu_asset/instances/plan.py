@@ -25,7 +25,7 @@ Settings = list[tuple[str, int, list[float] | list[str]]]
 
 
 @dataclass(frozen=True)
-class Group:
+class VariableGroup:
     """Variables of one base type, set or read in one call.
 
     Attributes
@@ -88,7 +88,7 @@ class Plan:
         Which FMU it is.
     instance_name : str
         As FMI wants it.
-    inputs, outputs : tuple of Group
+    inputs, outputs : tuple of VariableGroup
         What is set and read at every step, in the order of the request and of the reply block.
     substeps : int
         Communication steps of the FMU between two observations.
@@ -105,8 +105,8 @@ class Plan:
     folder: str
     fmu: FmuIdentity
     instance_name: str
-    inputs: tuple[Group, ...]
-    outputs: tuple[Group, ...]
+    inputs: tuple[VariableGroup, ...]
+    outputs: tuple[VariableGroup, ...]
     substeps: int = 1
     tolerance: float | None = None
     solver_tolerance: float = SOLVER_TOLERANCE
@@ -138,7 +138,7 @@ def values_of(block: Any) -> Float:
 
 
 def exchanged(
-    fmi_version: int, group: Group, doubles: Any, begin: int, *, sent: bool
+    fmi_version: int, group: VariableGroup, doubles: Any, begin: int, *, sent: bool
 ) -> tuple[tuple[Any, ...], Callable[[], object] | None]:
     """Return what a C function that sets or reads variables takes after the instance, and a conversion.
 
@@ -146,7 +146,7 @@ def exchanged(
     ----------
     fmi_version : int
         1, 2 or 3.
-    group : Group
+    group : VariableGroup
         The variables, of one base type; enumerations are integers, see `FmuDescription.exchange_kind`.
     doubles : ctypes array of double
         The block of their values.
@@ -206,7 +206,7 @@ _ROUNDING = 1e-12
 """Of the step: what the moment of its end may lack."""
 
 
-class Lines:
+class LinearInputs:
     """What the FMU is given within a step, of a request that says where each line begins and ends.
 
     Parameters

@@ -37,7 +37,7 @@ class UnacceptableValuesError(ValueError):
     """The values lie in their ranges, but the asset cannot have them; one sentence with its full stop."""
 
 
-class Contents(NamedTuple):
+class SlaveContents(NamedTuple):
     """What the FMU's resources hold.
 
     Attributes
@@ -76,11 +76,11 @@ class Slave:
     content_tag : str
         The content hash of the FMU; a state that was saved by another FMU is refused.
     load_contents : static method
-        Takes the folder of resources and returns `Contents`.
+        Takes the folder of resources and returns `SlaveContents`.
     """
 
     content_tag: ClassVar[str] = ""
-    load_contents: ClassVar[staticmethod[[Path], Contents]]
+    load_contents: ClassVar[staticmethod[[Path], SlaveContents]]
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)

@@ -21,19 +21,19 @@ from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
-from .base import Contents, UnacceptableValuesError
-from .table import MODE_COUNT, Roles, structure_table
+from .base import SlaveContents, UnacceptableValuesError
+from .table import MODE_COUNT, StructureRoles, structure_table
 from .variables import TRANSIENT, FmuVariable
 
 if TYPE_CHECKING:
-    from .effects import Acting, Effects
+    from .effects import ActiveEffects, SwitchableEffects
 
 
 BOUND, POINT_OR_BOUND, MODES = range(3)
 """Groups of outputs that are computed when they are read."""
 
 
-def later_outputs(table: Sequence[FmuVariable], roles: Roles) -> tuple[slice, ...]:
+def later_outputs(table: Sequence[FmuVariable], roles: StructureRoles) -> tuple[slice, ...]:
     """Return the rows of the groups `BOUND`, `POINT_OR_BOUND` and `MODES`."""
     reference = {row.name: row.reference for row in table}
     other = reference[roles.load_point or roles.displacement_bound or ""]
@@ -54,14 +54,18 @@ class StructureBehaviour:
         The reduced structure.
     table : sequence of FmuVariable
         Its variables, the inputs first.
-    roles : Roles
+    roles : StructureRoles
         Which of them is what.
-    effects : Effects, optional
+    effects : SwitchableEffects, optional
         Missing effects of a wing.
     """
 
     def __init__(
-        self, model: ReducedModel, table: Sequence[FmuVariable], roles: Roles, effects: Effects | None = None
+        self,
+        model: ReducedModel,
+        table: Sequence[FmuVariable],
+        roles: StructureRoles,
+        effects: SwitchableEffects | None = None,
     ) -> None:
         self._model, self._roles, self._effects = model, roles, effects
         self._inputs = [row.name for row in table if row.causality == "input"]
@@ -70,7 +74,7 @@ class StructureBehaviour:
         self._parameters: Mapping[str, float] = {}
         self._tuned: tuple[Mapping[str, float], float] = ({}, 0.0)
         self._moves, self._begun = False, 0.0
-        self._acting: Acting | None = None  # of the effects
+        self._acting: ActiveEffects | None = None  # of the effects
         self._vector: FloatArray | None = None
         self._integrator: ModalIntegrator | None = None
         self._state: TransientState | None = None  # without an integrator, the model itself is at rest
@@ -211,7 +215,7 @@ class StructureBehaviour:
         holding = integrator.structure.holding
         return self._roles.point_load if holding is None else holding
 
-    def _take_effects(self, effects: Effects) -> bool:
+    def _take_effects(self, effects: SwitchableEffects) -> bool:
         """Take the effects as they are tuned; return whether they changed."""
         values = effects.values(self._tuned[0])
         old = self._acting
@@ -250,7 +254,7 @@ class StructureBehaviour:
         return self._effects.integrator(vector, self._damping, self._acting)
 
 
-def load_contents(resources: Path) -> Contents:
+def load_contents(resources: Path) -> SlaveContents:
     """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
     model = ReducedModel.load(resources / "reduced_model.npz")
     start = json.loads((resources / "start.json").read_text(encoding="utf-8"))
@@ -258,14 +262,16 @@ def load_contents(resources: Path) -> Contents:
     table, roles = structure_table(model, own)
     later, behaviour = later_outputs(table, roles), partial(StructureBehaviour, model, table, roles)
     if not (resources / "effects.json").is_file():
-        return Contents(table, behaviour, later)
+        return SlaveContents(table, behaviour, later)
     # a plain structure needs nothing of these
     from fe.runtime.wing_rows import PatchArrays
 
-    from .effects import Effects, effect_rows
+    from .effects import SwitchableEffects, effect_rows
 
     effects = json.loads((resources / "effects.json").read_text(encoding="utf-8"))
     file = resources / "patch_arrays.npz"
     arrays = PatchArrays.load(file) if file.is_file() else None
     rows = effect_rows(effects, len(table), start)
-    return Contents(table + rows, lambda: behaviour(Effects(effects, len(model.gauges), arrays)), later)
+    return SlaveContents(
+        table + rows, lambda: behaviour(SwitchableEffects(effects, len(model.gauges), arrays)), later
+    )

@@ -22,7 +22,7 @@ from fe.runtime.transient import ModalIntegrator
 from fe.runtime.wing_rows import PatchArrays
 
 from .base import UnacceptableValuesError
-from .variables import FmuVariable, Table
+from .variables import FmuVariable, VariableTable
 
 TEMPERATURE = "temperature_difference"
 """Input of FMUs with an effect of temperature: the wing's temperature less the reference temperature [K]."""
@@ -77,7 +77,7 @@ def _unit(primitive: Mapping[str, Any], key: str) -> str:
     return (turning if turning and primitive.get("port") == ROTATING_PORT else moving).replace(" ", ".")
 
 
-def switch_of(effect: Mapping[str, Any]) -> str:
+def switch_name(effect: Mapping[str, Any]) -> str:
     """Return the name of the switch of an effect."""
     return f"effect.{effect['id']}.active"
 
@@ -96,10 +96,10 @@ def effect_rows(
     start : mapping of str to float
         Start values by variable name; a switch that is not there is off, a number has its value in the patch.
     """
-    table = Table({}, first)
+    table = VariableTable({}, first)
     for effect in effects:
         words = " and ".join(dict.fromkeys(str(item["kind"]) for item in effect["primitives"]))
-        switch = switch_of(effect)
+        switch = switch_name(effect)
         table.add(
             switch, "parameter",
             f"Whether the effect {effect['id']} ({words.replace('_', ' ')}) acts: 0 off, 1 on",
@@ -139,7 +139,7 @@ def active_primitives(
     """
     rows: list[dict[str, Any]] = []
     for effect in effects:
-        if value[switch_of(effect)] <= 0.5:
+        if value[switch_name(effect)] <= 0.5:
             continue
         own = [dict(primitive) for primitive in effect["primitives"]]
         for name, (number, key) in numbers_of(effect).items():
@@ -148,7 +148,7 @@ def active_primitives(
     return rows
 
 
-class Acting(NamedTuple):
+class ActiveEffects(NamedTuple):
     """Effects with the values of their variables.
 
     Attributes
@@ -172,7 +172,7 @@ class Acting(NamedTuple):
     filters: list[tuple[str, str, float]]
 
 
-class Effects:
+class SwitchableEffects:
     """Missing effects that can be switched on and changed between steps.
 
     Parameters
@@ -197,22 +197,24 @@ class Effects:
         """Return the values of the variables in their order."""
         return tuple(tuned[name] for name in self._names)
 
-    def acting(self, values: Sequence[float]) -> Acting:
+    def acting(self, values: Sequence[float]) -> ActiveEffects:
         """Return the effects as values of the variables have them; raises `InvalidPatchError`."""
         named = dict(zip(self._names, values, strict=True))
         patch = ModelPatch.from_list(active_primitives(self._effects, named))
         filters = [(item.channel, item.quantity, item.order) for item in patch if isinstance(item, HighPass)]
-        return Acting(tuple(values), patch, named.get(TEMPERATURE, 0.0), needs_structure(patch), filters)
+        return ActiveEffects(
+            tuple(values), patch, named.get(TEMPERATURE, 0.0), needs_structure(patch), filters
+        )
 
     def shown(
-        self, acting: Acting, values: FloatArray, across: FloatArray | None,
+        self, acting: ActiveEffects, values: FloatArray, across: FloatArray | None,
         memory: Sequence[float] | None, duration: float, *, time: float, **record: Any,
     ) -> tuple[list[float], list[float]]:  # fmt: skip
         """Return what sensors show of the values (C,) of the channels, and what they remember.
 
         Parameters
         ----------
-        acting : Acting
+        acting : ActiveEffects
             The effects.
         values, across : (C,), (2, C) ndarray
             What there is, and strains across and in shear; None: no sensor needs them.
@@ -240,7 +242,9 @@ class Effects:
             raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
         return shown.tolist(), filters.after
 
-    def integrator(self, vector: FloatArray, damping: tuple[float, float], acting: Acting) -> ModalIntegrator:
+    def integrator(
+        self, vector: FloatArray, damping: tuple[float, float], acting: ActiveEffects
+    ) -> ModalIntegrator:
         """Return the wing for patches in time, the last one where nothing changed."""
         assert self.wing is not None
         key = (vector[:-2].tobytes(), damping, acting.values)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, WING
 
-from .variables import QUASI_STATIC, TRANSIENT, Causality, FmuVariable, Table
+from .variables import QUASI_STATIC, TRANSIENT, Causality, FmuVariable, VariableTable
 
 RESERVED = ("response", "status", "strain_error_bound", "displacement_error_bound")
 """Names that controls and parameters of a structure cannot have: its FMU has variables of that name."""
@@ -40,7 +40,7 @@ _CHOSEN: Mapping[str, tuple[str, Causality, str, str, str | None]] = {
 
 
 @dataclass(frozen=True)
-class Roles:
+class StructureRoles:
     """Which variables of a table are what; the outputs of the model come first among the outputs.
 
     Attributes
@@ -67,7 +67,9 @@ def is_wing(model: ReducedModel) -> bool:
     return model.name == WING and len(model.followed_shapes) > 0
 
 
-def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tuple[FmuVariable, ...], Roles]:
+def structure_table(
+    model: ReducedModel, start: Mapping[str, float]
+) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
     """Return the table, inputs, parameters and outputs, and which of its rows is what.
 
     Parameters
@@ -85,7 +87,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     for name in (*model.controls, *model.parameters):
         if name in RESERVED:
             raise ValueError(f"a structure with an FMU can have no control or parameter named {name!r}")
-    table, wing = Table(start), is_wing(model)
+    table, wing = VariableTable(start), is_wing(model)
     texts = _OF_THE_WING if wing else {}
     nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
     control_unit = dict(zip(model.controls, model.control_units, strict=True))
@@ -160,6 +162,6 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     chosen = tuple(variables[name] for name in model.chosen)
     if wing:
         names = ("initial_tip_displacement", "load_point_displacement")
-        return table.rows(), Roles(chosen, None, TIP_FORCE, *names)
+        return table.rows(), StructureRoles(chosen, None, TIP_FORCE, *names)
     table.add_status()
-    return table.rows(), Roles(chosen, "displacement_error_bound")
+    return table.rows(), StructureRoles(chosen, "displacement_error_bound")

@@ -100,7 +100,7 @@ class FmuVariable:
     enumeration: str | None = None
 
 
-class Table:
+class VariableTable:
     """A table of variables that grows by rows.
 
     Parameters

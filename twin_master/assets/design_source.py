@@ -319,13 +319,13 @@ def strains_with_effects(
     It is asked with the factor of Young's modulus, the tip force [N], the control, and the losses by region.
     """
     from fmu_asset.slaves.behaviour import StructureBehaviour
-    from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
+    from fmu_asset.slaves.effects import SwitchableEffects, effect_rows, switch_name
     from fmu_asset.slaves.table import structure_table
 
     effects = patch.plain
     rows, roles = structure_table(wing, {})
-    behaviour = StructureBehaviour(wing, rows, roles, Effects(effects, len(wing.gauges), arrays))
-    on = {switch_of(effect): 1.0 for effect in effects}
+    behaviour = StructureBehaviour(wing, rows, roles, SwitchableEffects(effects, len(wing.gauges), arrays))
+    on = {switch_name(effect): 1.0 for effect in effects}
     behaviour.tune({row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, on)}, 0.0)
     nominal = {row.name: row.start or 0.0 for row in rows}
     inputs = [row.name for row in rows if row.causality == "input"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.client.binding import INPUT_ROLES, Binding, Parameter, load_binding
+from fmu_asset.client.binding import INPUT_ROLES, Binding, ParameterBinding, load_binding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.coupling.structure import (
     Component,
@@ -109,7 +109,7 @@ def _with_own_names(binding: Binding, fmu: Path, parameters: Mapping[str, float]
     """Return a binding that also has the parameters which go by their own names in the FMU."""
     description = read_fmu(fmu)
     added = {
-        name: Parameter(variable=name, unit=variable.unit or "1")
+        name: ParameterBinding(variable=name, unit=variable.unit or "1")
         for name in parameters
         if name not in binding.parameter and (variable := description.variable(name)) is not None
     }

@@ -15,7 +15,7 @@ from fmu_asset.client.binding import Binding, load_binding, parse_binding
 from fmu_asset.client.draft import draft_binding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.experiment import default_experiment
-from fmu_asset.client.placement import limits_of
+from fmu_asset.client.placement import worker_limits
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
@@ -51,11 +51,11 @@ def test_bad_files_are_one_sentence(tmp_path, case) -> None:
 
 def test_limits_come_from_the_caller_then_from_the_binding() -> None:
     limited = changed(WING_BINDING, limits={"step_time": 3.0, "memory": 500.0})
-    assert limits_of(limited, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
-    assert limits_of(limited, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
+    assert worker_limits(limited, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
+    assert worker_limits(limited, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(FmuInputError, match=r"the limits of the worker: memory: .*, but .* came"):
-            limits_of(limited, None, None, wrong)
+            worker_limits(limited, None, None, wrong)
 
 
 # ---------------------------------------------------------------------- units

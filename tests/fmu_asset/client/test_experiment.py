@@ -10,7 +10,7 @@ from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.check import check_fmu
 from fmu_asset.client.binding import parse_binding
-from fmu_asset.client.experiment import default_experiment, ending_with_histories, fly
+from fmu_asset.client.experiment import default_experiment, ending_with_histories, run_experiment
 from fmu_asset.client.session import FmiAsset
 from tests.fmu_asset.making import bound, edited
 
@@ -23,7 +23,7 @@ def flown(path: Path, **wanted: Any) -> np.ndarray:
     """Return the outputs of an FMU's default experiment, or what is wanted instead."""
     experiment = default_experiment(read_fmu(path), **wanted)
     with FmiAsset(path, experiment.binding, isolated=False) as asset:
-        return fly(asset, experiment).values
+        return run_experiment(asset, experiment).values
 
 
 # ---------------------------------------------------------------- the end of the experiment
