@@ -57,7 +57,7 @@ class FmuAtRest(IdentifiedFmu):
         """
         static = self.description.static
         if not static.settle:
-            return self.resting(states, loads, static.step, settle=False)
+            return self.outputs_at_rest(states, loads, static.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
         amounts = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
         # the largest load says whether the FMU is linear
@@ -109,14 +109,14 @@ class FmuAtRest(IdentifiedFmu):
         loads = dict(zip(names, amounts[:, None], strict=True))
         key = (state, names, amounts.tobytes())
         step = self.description.static.step
-        return self.remembered(key, lambda: self.resting([state], loads, step, settle=True)[0])
+        return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
     def flexibility(self, state: OperatingPoint) -> FloatArray:
         """Return the displacements (P, P) of the ports at rest under a unit force at each."""
         if not self.ports:
             # loads of zero may be outside of what the FMU takes
             return np.zeros((0, 0))
-        pushes = np.diag([self.size(name) for name in self.port_inputs])
+        pushes = np.diag([self.probing_amplitude(name) for name in self.port_inputs])
         # the first row is without a force
         loads = dict.fromkeys(self.port_inputs, np.zeros(len(pushes) + 1))
         for name, push in zip(self.port_inputs, pushes, strict=True):

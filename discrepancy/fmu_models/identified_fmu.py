@@ -18,13 +18,8 @@ from discrepancy.fmu_models.system_motion import MOST_SYSTEMS, system_motion
 from discrepancy.fmu_models.variables import FmuVariables
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.time_history import RecordedHistory, equivalent_ramps
-from fmu_asset.client.runs import (
-    FmuRun,
-    FmuRuns,
-    FmuStateSpace,
-    OperatingPoint,
-    realise_state_space,
-)
+from fmu_asset.client.runs import FmuRun, FmuRuns, OperatingPoint
+from fmu_asset.client.state_space import FmuStateSpace, realise_state_space
 from fmu_asset.errors import FmuError
 from reporting.memory import ResultCache
 
@@ -87,7 +82,7 @@ class IdentifiedFmu(FmuRuns):
     def __init__(self, description: FmuModelDescription, folder: Path) -> None:
         self.description = description
         static = description.static
-        with self.refusals():
+        with self.refusal_context():
             self.names = FmuVariables(description, folder)
             super().__init__(
                 self.names.path,
@@ -134,7 +129,7 @@ class IdentifiedFmu(FmuRuns):
             variables.append(self.names.variable(release.hold))
         return variables
 
-    def refusals(self) -> AbstractContextManager[None]:
+    def refusal_context(self) -> AbstractContextManager[None]:
         """Return the context that adds the model's name to what the FMU refuses."""
         return ModelError.instead_of(FmuError, before=f"The FMU model {self.description.name!r}: ")
 
@@ -193,21 +188,21 @@ class IdentifiedFmu(FmuRuns):
 
     def _answer_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (record + 1, C) after a unit force over the first step."""
-        size = self.size(name)
+        size = self.probing_amplitude(name)
         impulse = size * np.eye(1, excitation.record).ravel()
-        run = FmuRun(*excitation.recording, courses={name: impulse})
+        run = FmuRun(*excitation.recording, offsets={name: impulse})
         key = (*excitation.recording, name, False)
-        return self.remembered(key, lambda: self._motion(excitation, run) / size)
+        return self.cached(key, lambda: self._motion(excitation, run) / size)
 
     def _answer_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (record + 1, C) after a release by one unit."""
         usual = excitation.releases[name] or 1.0
         if self._is_input(name):
-            usual = self.size(name)
+            usual = self.probing_amplitude(name)
         size = self._release_sizes.setdefault(name, usual)
         run = self._run(excitation._replace(force=None), {name: size})
         key = (*excitation.recording, name, True)
-        return self.remembered(key, lambda: self._motion(excitation, run) / size)
+        return self.cached(key, lambda: self._motion(excitation, run) / size)
 
     def _is_input(self, name: str) -> bool:
         """Return whether a name is an input of the FMU, not a parameter."""
@@ -215,13 +210,13 @@ class IdentifiedFmu(FmuRuns):
 
     def _motion(self, excitation: FmuExcitation, run: FmuRun) -> FloatArray:
         """Return the outputs (steps + 1, C) of a run, less those of the undisturbed FMU."""
-        return self.followed(run) - self._undisturbed_outputs(excitation)
+        return self.outputs_of_run(run) - self._undisturbed_outputs(excitation)
 
     def _undisturbed_outputs(self, excitation: FmuExcitation) -> FloatArray:
         """Return the outputs (C,) at the start if nothing moves the FMU."""
         state, step, _ = excitation.recording
         run = FmuRun(state, step, 0)
-        return self.remembered((state, step), lambda: self.begun(run)[1])
+        return self.cached((state, step), lambda: self.start_run(run)[1])
 
     def _predicts(self, system: FmuStateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
         """Return whether a system gives the motion of the FMU under all that moves it at once.
@@ -241,11 +236,11 @@ class IdentifiedFmu(FmuRuns):
         run = self._run(excitation, amounts)
         random = np.random.default_rng(0)
         forces = {
-            name: self.size(name) * random.uniform(-1.0, 1.0, run.steps)
+            name: self.probing_amplitude(name) * random.uniform(-1.0, 1.0, run.steps)
             for name in excitation.inputs
         }
-        forces |= run.courses
-        motion = self._motion(excitation, run._replace(courses=forces))
+        forces |= run.offsets
+        motion = self._motion(excitation, run._replace(offsets=forces))
         # the same by the system
         time = excitation.step * np.arange(run.steps + 1.0)
         loads = []
@@ -254,7 +249,7 @@ class IdentifiedFmu(FmuRuns):
             loads.append(Load(direction, history))
         start = self._start_state(system, excitation, amounts)
         states, acting = system_motion(system, Excitation(time, time, loads), start)
-        predicted = motion - states @ system.outputs.T - acting @ system.direct.T
+        predicted = motion - states @ system.output_matrix.T - acting @ system.feedthrough.T
         error = np.max(np.abs(predicted)[1:], axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(motion), axis=0) + 1e-300))
 
@@ -293,11 +288,11 @@ class IdentifiedFmu(FmuRuns):
             at_begin = excitation._replace(force=None, record=0)
             run = self._run(at_begin, {name: amount})
             key = (excitation.state, excitation.step, name, amount, "begin")
-            outputs = self.remembered(key, lambda: self.begun(run)[1])
+            outputs = self.cached(key, lambda: self.start_run(run)[1])
             moved = float((outputs - self._undisturbed_outputs(excitation))[column])
             return moved - displacement
 
-        guess = self.size(name) if self._is_input(name) else displacement
+        guess = self.probing_amplitude(name) if self._is_input(name) else displacement
         solution = root_scalar(missing_displacement, x0=0.0, x1=guess, rtol=1e-10, maxiter=20)
         amount = float(solution.root)
         if not abs(missing_displacement(amount)) <= 1e-6 * abs(displacement):
@@ -312,7 +307,9 @@ class IdentifiedFmu(FmuRuns):
         """Return the run by which the FMU follows an excitation, released by amounts."""
         begin = {name: amount for name, amount in amounts.items() if self._is_input(name)}
         parameters = {name: amount for name, amount in amounts.items() if name not in begin}
-        run = FmuRun(excitation.state.having(parameters), excitation.step, excitation.record, begin)
+        run = FmuRun(
+            excitation.state.with_parameters(parameters), excitation.step, excitation.record, begin
+        )
         if excitation.force is None:
             return run
         for name, lever in excitation.levers.items():
@@ -323,16 +320,16 @@ class IdentifiedFmu(FmuRuns):
         courses = {
             name: 0.5 * lever * (at_begin + at_end) for name, lever in excitation.levers.items()
         }
-        return run._replace(courses=courses)
+        return run._replace(offsets=courses)
 
     def _start_state(
         self, system: FmuStateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
     ) -> FloatArray:
         """Return the state (n,) at the begin: as released, and at rest under the first force."""
-        start: FloatArray = system.starts @ np.array([*amounts.values()])
+        start: FloatArray = system.release_states @ np.array([*amounts.values()])
         first_force = excitation.first_force
         if first_force:
-            return start + system.at_rest(first_force * excitation.lever_values)
+            return start + system.state_at_rest(first_force * excitation.lever_values)
         return start
 
     # ------------------------------------------------------------ pace
@@ -355,10 +352,12 @@ class IdentifiedFmu(FmuRuns):
         # the first mode
         mode = None
         if system is not None and self.ports:
-            mode = system.most_flexible(self.displacement_columns[0], 0)
+            mode = system.most_flexible_mode(self.displacement_columns[0], 0)
         frequency = self.description.scales.angular_frequency
         if not frequency:
-            frequency = self._loudest_frequency(excitation) if mode is None else mode[0]
+            frequency = (
+                self._loudest_frequency(excitation) if mode is None else mode.angular_frequency
+            )
         least_parts = max(parts, ceil(frequency * interval / PHASE))
         return Pace(frequency, self.description.motion.step or interval / least_parts)
 

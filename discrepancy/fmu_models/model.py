@@ -26,7 +26,8 @@ from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
-from fmu_asset.client.runs import FmuStateSpace, OperatingPoint
+from fmu_asset.client.runs import OperatingPoint
+from fmu_asset.client.state_space import FmuStateSpace
 from reporting.words import comma_list
 
 LATEST = 100.0
@@ -321,8 +322,8 @@ class FmuModel(DescribedModel):
         is_usable = (
             at_mean is not None
             and system is not None
-            and len(at_mean.push) == len(system.push)
-            and not system.jumps(
+            and len(at_mean.input_matrix) == len(system.input_matrix)
+            and not system.has_jumping_speed(
                 np.array(displacement_columns, dtype=np.int64), np.arange(len(displacement_columns))
             )
         )
@@ -332,15 +333,15 @@ class FmuModel(DescribedModel):
                 "its ports move; it is not linear, or they are too few or too rough, or speeds "
                 "jump with forces."
             )
-        system = system.in_state_of(at_mean)
-        positions, _ = system.rows(displacement_columns, 0)
-        speeds, _ = system.rows(displacement_columns, 1)
+        system = system.in_coordinates_of(at_mean)
+        positions, _ = system.output_rows(displacement_columns, 0)
+        speeds, _ = system.output_rows(displacement_columns, 1)
         columns = self._output_columns(outputs)
-        rows, direct = system.rows(columns.columns, columns.derivatives)
+        rows, direct = system.output_rows(columns.columns, columns.derivatives)
         return PortedSystem(
-            generator=system.generator,
+            generator=system.state_matrix,
             ports=self.ports,
-            actions=system.push.T,
+            actions=system.input_matrix.T,
             positions=positions,
             speeds=speeds,
             outputs=rows,
@@ -436,4 +437,4 @@ class FmuModel(DescribedModel):
         values = conditions.parameters.tolist()
         parameters |= dict(zip(self._parameter_keys, values, strict=True))
         parameters |= effect_parameters(patch, self.description.effects, parameters, self.what)
-        return OperatingPoint((), tuple(sorted(inputs.items()))).having(parameters)
+        return OperatingPoint((), tuple(sorted(inputs.items()))).with_parameters(parameters)

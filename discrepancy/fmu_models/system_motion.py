@@ -13,7 +13,7 @@ from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
-from fmu_asset.client.runs import FmuStateSpace
+from fmu_asset.client.state_space import FmuStateSpace
 
 MOST_SYSTEMS = 64
 """Number of systems that are kept."""
@@ -98,13 +98,13 @@ def system_motion(
     begin, end = equivalent_ramps(
         lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time
     )
-    direct_displacement = excitation.loads_at(boundaries.time, system.direct[ports.columns].T)
+    direct_displacement = excitation.loads_at(boundaries.time, system.feedthrough[ports.columns].T)
     steps = steps_under(modal, boundaries, begin, end, direct_displacement)
     # ports follow from the state at the begin
-    port_rows = system.outputs[ports.columns[coupled.first_laws]]
+    port_rows = system.output_matrix[ports.columns[coupled.first_laws]]
     rest_positions = ports.rest_positions[coupled.first_laws]
     positions = port_rows @ start + rest_positions
-    speeds = port_rows @ system.generator @ start
+    speeds = port_rows @ system.state_matrix @ start
     first = Begin(
         q=np.concatenate((positions, 0.0 * start)),
         v=np.concatenate((speeds, start)),
@@ -112,7 +112,7 @@ def system_motion(
     )
     motion = advance(modal, laws, steps, first, compiled_kernel())
     # what acts on the system, laws too
-    forces = excitation.loads_at(excitation.sample_times, np.eye(system.push.shape[1]))
+    forces = excitation.loads_at(excitation.sample_times, np.eye(system.input_matrix.shape[1]))
     np.subtract.at(forces.T, ports.force_numbers, motion.port_forces.T)
     return SystemMotion(motion.v[:, len(positions) :], forces)
 
@@ -155,16 +155,16 @@ def _with_ports(
     """
     ports, first_laws = np.unique(names, return_index=True)
     count = len(first_laws)
-    order = len(system.generator)
+    order = len(system.state_matrix)
     column = np.array(columns, dtype=np.int64)[first_laws]
     number = np.array(force_numbers, dtype=np.int64)[first_laws]
     # rates of ports and state
-    port_rates = system.outputs[column] @ system.generator
-    directions = np.vstack((port_rates @ system.push, system.push))
+    port_rates = system.output_matrix[column] @ system.state_matrix
+    directions = np.vstack((port_rates @ system.input_matrix, system.input_matrix))
     damping = np.zeros((count + order, count + order))
-    damping[:, count:] = -np.vstack((port_rates @ system.generator, system.generator))
+    damping[:, count:] = -np.vstack((port_rates @ system.state_matrix, system.state_matrix))
     # displacement that comes at once with the force
-    at_once = system.direct[column, number]
+    at_once = system.feedthrough[column, number]
     at_rest = system.gain[column, number]
     modal = ModalSystem(
         np.zeros(count + order),

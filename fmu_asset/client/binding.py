@@ -41,7 +41,11 @@ from .units import same_dimension
 INPUT_ROLES = ("control", "health", "load")
 """Roles whose variables are sent at every step, in the order in which they are sent; ports follow."""
 
-PORT_QUANTITIES = {"force": ("N", "N.m"), "displacement": ("m", "rad"), "velocity": ("m/s", "rad/s")}
+PORT_QUANTITIES = {
+    "force": ("N", "N.m"),
+    "displacement": ("m", "rad"),
+    "velocity": ("m/s", "rad/s"),
+}
 """What a mechanical port consists of, with its units where it is one of translation or of rotation."""
 
 StandardVersion = Literal["1.0", "2.0", "3.0"]
@@ -73,7 +77,9 @@ def _expanded(given: object) -> object:
     if isinstance(given, str):
         return expand(given)
     if isinstance(given, list):
-        return tuple(name for item in given for name in (expand(item) if isinstance(item, str) else (item,)))
+        return tuple(
+            name for item in given for name in (expand(item) if isinstance(item, str) else (item,))
+        )
     return given
 
 
@@ -188,7 +194,10 @@ class PortBinding(Section):
             if isinstance(unit, tuple):
                 yield True, f"{name} must have one unit, and {len(unit)} came"
             else:
-                wrong = [same_dimension(unit, able) for able in PORT_QUANTITIES[name]] == [False, False]
+                wrong = [same_dimension(unit, able) for able in PORT_QUANTITIES[name]] == [
+                    False,
+                    False,
+                ]
                 yield wrong, said("binding.port_unit", name=name, vector=vector, wanted=wanted)
 
     @property
@@ -259,7 +268,9 @@ class BindingHeader(Section):
     def faults(self) -> Iterator[Fault]:
         """Yield an end that does not come after the start."""
         if self.stop_time is not None:
-            sentence = f"stop_time {self.stop_time:g} s must come after start_time {self.start_time:g} s"
+            sentence = (
+                f"stop_time {self.stop_time:g} s must come after start_time {self.start_time:g} s"
+            )
             yield self.stop_time <= self.start_time, sentence
 
 
@@ -376,7 +387,9 @@ class Binding(Section):
                 monitor[label] = scalar.model_copy(update={"variable": name})
         recorded = tuple(element for name in self.record.variables for element in elements(name))
         changed = {
-            "observation": {key: vector.by_element(elements) for key, vector in self.observation.items()},
+            "observation": {
+                key: vector.by_element(elements) for key, vector in self.observation.items()
+            },
             "monitor": monitor,
             "port": {key: port.by_element(elements) for key, port in self.port.items()},
             "record": self.record.model_copy(update={"variables": recorded}),
@@ -401,7 +414,9 @@ def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> 
     """Check a binding that was read from elsewhere; see `load_binding`."""
     parsed = validate(Binding, dict(content), where, BindingError, what="a binding")
     if not parsed.observation:
-        raise BindingError(f"In {where}, there is no [observation.<name>] table; say what is measured.")
+        raise BindingError(
+            f"In {where}, there is no [observation.<name>] table; say what is measured."
+        )
     taken: dict[str, str] = {}
     for role in (*INPUT_ROLES, "parameter"):
         table: Mapping[str, ScalarBinding] = getattr(parsed, role)

@@ -15,7 +15,8 @@ from .units import same_dimension
 
 _HEALTH = re.compile(r"health|damage|wear|foul|crack|degrad|fault|stiffness_?loss", re.IGNORECASE)
 _LOAD = re.compile(
-    r"load(?!_?factor)|force|torque|moment|press|ambient|outside|disturb|wind|gust|weight", re.IGNORECASE
+    r"load(?!_?factor)|force|torque|moment|press|ambient|outside|disturb|wind|gust|weight",
+    re.IGNORECASE,
 )
 _LOAD_UNITS = ("N", "N.m", "Pa", "N/m")
 _AUXILIARY = re.compile(r"status|error|bound|count|iteration|frequency|ratio", re.IGNORECASE)
@@ -68,7 +69,9 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
         ports=[(keys.of("port", stem or "port"), port) for stem, port in ports.items()],
         recorded=_groups(v for v in usable if v.causality == "output" and v.name not in shown),
         others=[v.name for v in usable if v.causality in _INNER],
-        left_out=[v.name for v in description.variables if v.name not in known and v.causality != "local"],
+        left_out=[
+            v.name for v in description.variables if v.name not in known and v.causality != "local"
+        ],
         float_kinds=FLOAT_KINDS,
         pattern=_pattern,
         comment=_comment,
@@ -138,7 +141,9 @@ def _ports(variables: Sequence[VariableInfo]) -> dict[str, dict[str, VariableInf
         # The force stands alone on its side.
         sides = [variable.causality for variable in port.values()]
         if len(port) > 1 and "force" in port and sides.count(port["force"].causality) == 1:
-            ports[stem] = {quantity: port[quantity] for quantity in PORT_QUANTITIES if quantity in port}
+            ports[stem] = {
+                quantity: port[quantity] for quantity in PORT_QUANTITIES if quantity in port
+            }
     return ports
 
 

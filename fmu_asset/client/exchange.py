@@ -61,7 +61,9 @@ class Exchange:
     def __init__(self, description: FmuDescription, binding: Binding) -> None:
         wanted = binding.binding.fmi_version
         if wanted is not None and wanted[0] != description.fmi_version[0]:
-            raise BindingError(said("binding.fmi_version", binding=binding, wanted=wanted, fmu=description))
+            raise BindingError(
+                said("binding.fmi_version", binding=binding, wanted=wanted, fmu=description)
+            )
         description, configuration = with_structural_parameters(description, binding)
         self.description = description
         self.binding = binding.with_arrays(self._elements)
@@ -78,7 +80,8 @@ class Exchange:
             outputs=self._outputs.groups,
             substeps=binding.binding.decimation,
             tolerance=binding.binding.tolerance or description.tolerance,
-            solver_tolerance=binding.binding.tolerance or min(description.tolerance or 1.0, SOLVER_TOLERANCE),
+            solver_tolerance=binding.binding.tolerance
+            or min(description.tolerance or 1.0, SOLVER_TOLERANCE),
             stop_time=binding.binding.stop_time,
             configuration=configuration,
         )
@@ -100,11 +103,16 @@ class Exchange:
             for quantity, vector in port.quantities.items():
                 label = f"port.{name}.{quantity}"
                 if len(vector.variables) != len(port.force.variables):
-                    what, came = f"{label} {self._whose}", (len(vector.variables), len(port.force.variables))
+                    what, came = (
+                        f"{label} {self._whose}",
+                        (len(vector.variables), len(port.force.variables)),
+                    )
                     raise BindingError(said("binding.port_values", what=what, came=came))
                 read = {not self._is_input(variable) for variable in vector.variables}
                 if len(read) > 1:
-                    raise BindingError(f"{label} {self._whose} mixes inputs and outputs of the FMU.")
+                    raise BindingError(
+                        f"{label} {self._whose} mixes inputs and outputs of the FMU."
+                    )
                 reads[quantity] = read.pop()
                 found.append((f"{name}.{quantity}", vector, reads[quantity]))
             force = reads.pop("force")
@@ -114,13 +122,17 @@ class Exchange:
         return found
 
     def _is_input(self, name: str) -> bool:
-        variable = self.description.variable(name) or self.description.variable(name.rpartition("[")[0])
+        variable = self.description.variable(name) or self.description.variable(
+            name.rpartition("[")[0]
+        )
         return variable is not None and variable.causality == "input"
 
     def _make_inputs(self) -> None:
         """Lay out the request block: time, step size, all inputs."""
         health_at_start = {
-            name: item for name, item in self.binding.health.items() if self._is_set_at_start(item.variable)
+            name: item
+            for name, item in self.binding.health.items()
+            if self._is_set_at_start(item.variable)
         }
         wanted: list[tuple[str, str, InputBinding, tuple[str, ...]]] = [
             (role, name, item, (item.variable,))
@@ -129,7 +141,12 @@ class Exchange:
             if not (role == "health" and name in health_at_start)
         ]
         wanted += [
-            ("port", name, InputBinding(variable=vector.variables[0], unit=vector.units[0]), vector.variables)
+            (
+                "port",
+                name,
+                InputBinding(variable=vector.variables[0], unit=vector.units[0]),
+                vector.variables,
+            )
             for name, vector, read in self._ports
             if not read
         ]
@@ -151,7 +168,9 @@ class Exchange:
             for position in positions:
                 if position in taken:
                     both, variable = f"{label} and {taken[position]}", found[0].variable
-                    raise BindingError(said("binding.same_value", self=self, both=both, variable=variable))
+                    raise BindingError(
+                        said("binding.same_value", self=self, both=both, variable=variable)
+                    )
                 taken[position] = label
             self._slots[role][name] = self._slot(label, item, found[0].variable, positions)
         # What is sent as it is: real numbers within these limits, which NaN and infinities are not.
@@ -177,10 +196,14 @@ class Exchange:
 
     def _is_set_at_start(self, name: str) -> bool:
         """Return whether a variable can be set before the initialisation only."""
-        variable = self.description.variable(name) or self.description.variable(name.rpartition("[")[0])
+        variable = self.description.variable(name) or self.description.variable(
+            name.rpartition("[")[0]
+        )
         if variable is None:
             return False
-        tunable = variable.variability == "tunable" and self.description.interface == "co-simulation"
+        tunable = (
+            variable.variability == "tunable" and self.description.interface == "co-simulation"
+        )
         return variable.startable or (variable.causality == "parameter" and not tunable)
 
     def _start_slot(self, label: str, item: InputBinding) -> InputSlot:
@@ -202,7 +225,9 @@ class Exchange:
             )
             raise BindingError(said("binding.no_derivatives", asked=asked, path=path, why=why))
         if not any(group.linear for group in self._inputs.groups):
-            raise BindingError(f"{asked} none of them is a continuous real number in {path}; leave it out.")
+            raise BindingError(
+                f"{asked} none of them is a continuous real number in {path}; leave it out."
+            )
 
     def _own_slot(self, name: str) -> InputSlot:
         """Return the slot of a parameter by its name in the FMU, which the binding does not name."""
@@ -211,7 +236,9 @@ class Exchange:
         if variable is None or variable.causality != "parameter" or name in bound:
             known = self.binding.parameter
             raise BindingError(said("binding.no_parameter", self=self, name=name, known=known))
-        return self._start_slot(f"parameter.{name}", InputBinding(variable=name, unit=variable.unit or "1"))
+        return self._start_slot(
+            f"parameter.{name}", InputBinding(variable=name, unit=variable.unit or "1")
+        )
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
         """Return the text that a name of the binding, or else of the FMU, means; None if it means none."""
@@ -242,7 +269,10 @@ class Exchange:
             for name, unit in zip(vector.variables, vector.units, strict=True)
         ]
         count = len(wanted)
-        wanted += [(name, one.variable, one.unit, f"monitor.{name}") for name, one in binding.monitor.items()]
+        wanted += [
+            (name, one.variable, one.unit, f"monitor.{name}")
+            for name, one in binding.monitor.items()
+        ]
         wanted += [(name, name, "", "record.variables") for name in binding.record.variables]
         for label, vector, read in self._ports:
             several = len(vector.variables) > 1
@@ -310,7 +340,9 @@ class Exchange:
         FmuInputError
             If a value is not finite or outside its range.
         """
-        fixed = {n: entry.value for n, entry in self.binding.parameter.items() if entry.value is not None}
+        fixed = {
+            n: entry.value for n, entry in self.binding.parameter.items() if entry.value is not None
+        }
         set_values: dict[str, tuple[str, int, list[float]]] = {}
         texts: Settings = []
         slots: list[tuple[InputSlot, Any]] = []
@@ -334,7 +366,9 @@ class Exchange:
                 set_values[variable.name][2][position] = number
         return [*set_values.values(), *texts]
 
-    def without_start_health(self, inputs: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    def without_start_health(
+        self, inputs: Mapping[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return inputs by role without the health that is set at a start only, and that health."""
         health = inputs.get("health") or {}
         at_start = {name: value for name, value in health.items() if name in self.health_slots}
@@ -369,12 +403,17 @@ class Exchange:
                     target[position] = value
                     continue
                 slot = self.slot(role, name)
-                for position, number in zip(slot.positions, slot.numbers(value).tolist(), strict=True):
+                for position, number in zip(
+                    slot.positions, slot.numbers(value).tolist(), strict=True
+                ):
                     target[position] = number
         return there
 
     def rows(
-        self, held: npt.NDArray[np.float64], roles: Mapping[str, Histories | None], steps: int | None
+        self,
+        held: npt.NDArray[np.float64],
+        roles: Mapping[str, Histories | None],
+        steps: int | None,
     ) -> npt.NDArray[np.float64]:
         """Return the request blocks of many steps, without their times; histories are checked as a whole.
 
@@ -400,7 +439,9 @@ class Exchange:
             If a value is no number, not finite or out of range, or the histories have different lengths.
         """
         given = [
-            (self.slot(role, name), v) for role, part in roles.items() for name, v in (part or {}).items()
+            (self.slot(role, name), v)
+            for role, part in roles.items()
+            for name, v in (part or {}).items()
         ]
         arrays = [(slot, slot.numbers(values, history=True)) for slot, values in given]
         rows = np.tile(held, (self.step_count(arrays, steps), 1))
@@ -409,7 +450,9 @@ class Exchange:
         return rows
 
     @staticmethod
-    def step_count(histories: Sequence[tuple[InputSlot, npt.NDArray[np.float64]]], steps: int | None) -> int:
+    def step_count(
+        histories: Sequence[tuple[InputSlot, npt.NDArray[np.float64]]], steps: int | None
+    ) -> int:
         """Return the number of steps that histories, and who asks for them, agree on.
 
         Raises
@@ -429,7 +472,9 @@ class Exchange:
                 count, source = len(array), slot.label
             elif len(array) != count:
                 came = len(array)
-                raise FmuInputError(said("inputs.steps", slot=slot, came=came, source=source, of=count))
+                raise FmuInputError(
+                    said("inputs.steps", slot=slot, came=came, source=source, of=count)
+                )
         if not count:
             raise FmuInputError(said("inputs.no_steps"))
         return count
@@ -447,5 +492,7 @@ class Exchange:
             slot = self.health_slots.get(name)
         if slot is None:
             known = ", ".join(self._slots.get(role, {})) or "none"
-            raise BindingError(f"The binding {self.binding.name} has no {role} {name!r}; it has {known}.")
+            raise BindingError(
+                f"The binding {self.binding.name} has no {role} {name!r}; it has {known}."
+            )
         return slot

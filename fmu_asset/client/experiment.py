@@ -18,7 +18,14 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table, table_text
 
-from .binding import INPUT_ROLES, Binding, BindingHeader, InputBinding, ParameterBinding, VectorBinding
+from .binding import (
+    INPUT_ROLES,
+    Binding,
+    BindingHeader,
+    InputBinding,
+    ParameterBinding,
+    VectorBinding,
+)
 from .draft import bindable, observable
 from .layout import ObservationHistory
 from .session import FmiAsset
@@ -58,12 +65,20 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
     wanted = binding.binding.start_time + binding.interval * np.arange(len(time))
     for step in np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval).tolist():
         times = time[step], wanted[step]
-        raise FmuInputError(said("inputs.times", path=path, times=times, step=step, binding=binding))
+        raise FmuInputError(
+            said("inputs.times", path=path, times=times, step=step, binding=binding)
+        )
     keys = [(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
-    keys += [("port", f"{name}.{item}") for name, port in binding.port.items() for item in port.quantities]
+    keys += [
+        ("port", f"{name}.{item}")
+        for name, port in binding.port.items()
+        for item in port.quantities
+    ]
     named = Counter(name for _, name in keys)
     # A column may be called by the name alone where it is of one role.
-    names = {key[1]: key for key in keys if named[key[1]] == 1} | {".".join(key): key for key in keys}
+    names = {key[1]: key for key in keys if named[key[1]] == 1} | {
+        ".".join(key): key for key in keys
+    }
     columns: dict[tuple[str, str], dict[int, Float]] = {}
     for column in table.columns:
         if column == _TIME:
@@ -73,7 +88,9 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
             key, element = names.get(found[1]), int(found[2])
         if key is None:
             known = [".".join(key) for key in dict.fromkeys(names.values())]
-            raise FmuInputError(said("inputs.no_column", column=column, path=path, to=binding, known=known))
+            raise FmuInputError(
+                said("inputs.no_column", column=column, path=path, to=binding, known=known)
+            )
         taken = columns.setdefault(key, {})
         if element in taken or (taken and 0 in (element, *taken)):
             raise FmuInputError(f"{path} gives {'.'.join(key)} in more than one column; keep one.")
@@ -82,13 +99,17 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
     for (role, name), elements in columns.items():
         lost = {*range(1, len(elements) + 1)} - elements.keys()
         if lost and 0 not in elements:
-            raise FmuInputError(f"{path} lacks the column {role}.{name}[{min(lost)}]; count from 1.")
+            raise FmuInputError(
+                f"{path} lacks the column {role}.{name}[{min(lost)}]; count from 1."
+            )
         array = np.column_stack([elements[number] for number in sorted(elements)])
         roles.setdefault(role, {})[name] = elements.get(0, array)
     return len(time), roles
 
 
-def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> None:
+def write_history(
+    path: Path, asset: FmiAsset, source: tuple[str, str], history: ObservationHistory
+) -> None:
     """Write what came out of a simulation, whole or not at all: NetCDF if the name ends with .nc, else CSV.
 
     Parameters
@@ -112,7 +133,9 @@ def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history:
         return
     observed = dict(zip(asset.binding.observation_variables, history.values.T, strict=True))
     observed[_TIME] = history.time
-    atomic_write_text(path, table_text({_TIME: history.time, **observed, **(history.extra | observed)}))
+    atomic_write_text(
+        path, table_text({_TIME: history.time, **observed, **(history.extra | observed)})
+    )
 
 
 def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:
@@ -121,7 +144,11 @@ def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistor
     binding, units = asset.binding, asset.recorded_units
     observed_units = [unit for vector in binding.observation.values() for unit in vector.units]
     extra_units = [units[name] for name in history.extra]
-    extra = np.column_stack([*history.extra.values()]) if history.extra else np.empty((len(history.time), 0))
+    extra = (
+        np.column_stack([*history.extra.values()])
+        if history.extra
+        else np.empty((len(history.time), 0))
+    )
     data = xr.Dataset(
         {
             "observation": (("time", "observation_name"), history.values),
@@ -131,7 +158,10 @@ def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistor
         },
         coords={
             "time": ("time", history.time, {"units": "s", "long_name": "end of the step"}),
-            "observation_name": ("observation_name", np.array(binding.observation_variables, dtype=str)),
+            "observation_name": (
+                "observation_name",
+                np.array(binding.observation_variables, dtype=str),
+            ),
             "extra_name": ("extra_name", np.array([*history.extra], dtype=str)),
         },
         attrs={"fmu": source[0], "fmu_sha256": source[1], "binding": binding.name},
@@ -304,7 +334,9 @@ def _steps_to(start: float, end: float, size: float | None) -> tuple[int, float]
     steps = max(1, round((end - start) / size))
     if steps > _MOST_STEPS:
         ends = start, end
-        raise FmuInputError(said("inputs.most_steps", ends=ends, steps=steps, size=size, most=_MOST_STEPS))
+        raise FmuInputError(
+            said("inputs.most_steps", ends=ends, steps=steps, size=size, most=_MOST_STEPS)
+        )
     return steps, size
 
 
@@ -354,7 +386,10 @@ def simulate_from_now(asset: FmiAsset, steps: int, roles: InputHistories) -> Obs
     return ObservationHistory(
         np.concatenate(([first.time], then.time)),
         np.vstack((first.values, then.values)),
-        {name: np.concatenate(([first.extra[name]], values)) for name, values in then.extra.items()},
+        {
+            name: np.concatenate(([first.extra[name]], values))
+            for name, values in then.extra.items()
+        },
         then.ended,
     )
 

@@ -35,7 +35,9 @@ class VariableElements(NamedTuple):
     elements: range
 
 
-def find_variable(description: FmuDescription, name: str, label: str, causality: str) -> VariableElements:
+def find_variable(
+    description: FmuDescription, name: str, label: str, causality: str
+) -> VariableElements:
     """Return what a name of a binding means in an FMU.
 
     Parameters
@@ -73,11 +75,15 @@ def find_variable(description: FmuDescription, name: str, label: str, causality:
     started = causality == "parameter" and variable.startable
     if variable.causality not in _CAUSALITY[causality] and not sent and not started:
         wanted = f"{label} must be of causality {causality}, but {name!r}"
-        raise BindingError(said("binding.causality", wanted=wanted, variable=variable, fmu=description))
+        raise BindingError(
+            said("binding.causality", wanted=wanted, variable=variable, fmu=description)
+        )
     if not variable.numeric:
         raise BindingError(said("binding.numbers_only", label=label, name=name, variable=variable))
     if variable.clocked:
-        raise BindingError(f"{label} names {name!r}, which changes with a clock; clocks are not supported.")
+        raise BindingError(
+            f"{label} names {name!r}, which changes with a clock; clocks are not supported."
+        )
     return place
 
 
@@ -131,10 +137,14 @@ class BlockLayout:
         unique = {variable.name: variable for variable in variables if variable.size}
         self.variables = tuple(sorted(unique.values(), key=kind))
         begins = accumulate((variable.size for variable in self.variables), initial=begin)
-        self._begins = dict(zip((variable.name for variable in self.variables), begins, strict=False))
+        self._begins = dict(
+            zip((variable.name for variable in self.variables), begins, strict=False)
+        )
         groups = [(key, list(members)) for key, members in groupby(self.variables, kind)]
         self.groups = tuple(
-            VariableGroup(name, tuple(v.reference for v in members), sum(v.size for v in members), not held)
+            VariableGroup(
+                name, tuple(v.reference for v in members), sum(v.size for v in members), not held
+            )
             for (held, _, name), members in groups
         )
 
@@ -147,7 +157,9 @@ class BlockLayout:
         return [name for variable in self.variables for name in variable.elements]
 
 
-def start_values(description: FmuDescription, variable: VariableInfo, *, given: bool = False) -> list[float]:
+def start_values(
+    description: FmuDescription, variable: VariableInfo, *, given: bool = False
+) -> list[float]:
     """Return the declared start values; one value stands for all elements of an array.
 
     Parameters
@@ -173,7 +185,9 @@ def start_values(description: FmuDescription, variable: VariableInfo, *, given: 
     if len(values) == 1:
         values *= variable.size
     if len(values) != variable.size:
-        raise FmuFileError(said("archive.start_values", variable=variable, fmu=description, came=len(values)))
+        raise FmuFileError(
+            said("archive.start_values", variable=variable, fmu=description, came=len(values))
+        )
     return values
 
 
@@ -303,14 +317,18 @@ def with_structural_parameters(
         label = f"structural_parameters.{name}"
         where = f"{label} of the binding {binding.name}"
         variable = find_variable(description, name, where, "structuralParameter").variable
-        numbers = InputSlot(label, (0,), *variable.bounds, IDENTITY, variable).numbers(value).tolist()
+        numbers = (
+            InputSlot(label, (0,), *variable.bounds, IDENTITY, variable).numbers(value).tolist()
+        )
         found.append((variable.kind, variable.reference, numbers))
         lengths[name] = int(numbers[0])
     if not lengths:
         return description, found
     if description.interface == "model-exchange":
         raise BindingError(said("binding.structural", description=description))
-    return replace(description, variables=tuple(v.resized(lengths) for v in description.variables)), found
+    return replace(
+        description, variables=tuple(v.resized(lengths) for v in description.variables)
+    ), found
 
 
 class Observation(NamedTuple):
@@ -380,7 +398,11 @@ class OutputTable:
     """
 
     def __init__(
-        self, observed: int, extra: Sequence[str], positions: Sequence[int], conversions: Sequence[Conversion]
+        self,
+        observed: int,
+        extra: Sequence[str],
+        positions: Sequence[int],
+        conversions: Sequence[Conversion],
     ) -> None:
         self._observed, self._extra = observed, tuple(extra)
         index = np.array(positions, dtype=np.intp)

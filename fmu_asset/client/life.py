@@ -73,7 +73,9 @@ class PackedState(BaseModel):
                 raise ValueError(magic)
             head = cls.model_validate_json(content[_HEADER.size : begin])
         except (struct.error, ValueError, TypeError) as error:
-            raise FmuStateError(f"What was given is not a state of {cls.what}, or it is damaged.") from error
+            raise FmuStateError(
+                f"What was given is not a state of {cls.what}, or it is damaged."
+            ) from error
         return head.model_copy(update={"body": content[begin:]})
 
 
@@ -218,13 +220,19 @@ class OpenedFmu:
     def worker_process_id(self) -> int | None:
         """Process number of the worker; None without one."""
         instance = self._housing.instance
-        return instance.process_id if isinstance(instance, WorkerInstance) and not instance.lost else None
+        return (
+            instance.process_id
+            if isinstance(instance, WorkerInstance) and not instance.lost
+            else None
+        )
 
     @property
     def worker_memory(self) -> int | None:
         """Resident memory of the worker [bytes]; None without one."""
         instance = self._housing.instance
-        return instance.memory if isinstance(instance, WorkerInstance) and not instance.lost else None
+        return (
+            instance.memory if isinstance(instance, WorkerInstance) and not instance.lost else None
+        )
 
     def input_range(self, role: str, name: str) -> tuple[float, float]:
         """Return the range of an input in the binding's unit: that of the FMU and of the binding together.
@@ -413,7 +421,9 @@ class OpenedFmu:
         self._refuse_closed()
         if self._phase == "new":
             # Without them: what keeps its start values, and lines, which begin at them.
-            known = given if self.binding.binding.structural_parameters and not self._lines else None
+            known = (
+                given if self.binding.binding.structural_parameters and not self._lines else None
+            )
             self._begin(self._exchange.start_values(known or {}), with_inputs=False)
         return self._instance
 
@@ -432,7 +442,11 @@ class OpenedFmu:
         if math.isfinite(self._reply.dot(self._reply)):
             return
         finite = np.isfinite(self._reply).tolist()
-        bad = [name for name, good in zip(self._exchange.output_names, finite, strict=False) if not good]
+        bad = [
+            name
+            for name, good in zip(self._exchange.output_names, finite, strict=False)
+            if not good
+        ]
         if bad:
             more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
             why = said("running.not_finite", self=self, names=bad[:5], more=more, which=which)
@@ -445,6 +459,8 @@ class OpenedFmu:
             tool = what == "the start" and self.description.needs_tool
             hint = " It declares that it needs its authoring tool on this machine." if tool else ""
             raise type(error)(
-                f"{self.description.label}, {what}: {error.sentence}{hint}", error.messages, error.time
+                f"{self.description.label}, {what}: {error.sentence}{hint}",
+                error.messages,
+                error.time,
             ) from error
         raise error

@@ -153,7 +153,10 @@ class ResetTrial:
 
 
 _FAULTS = {
-    RestartMethod.RESET: ("Its reset returns OK and does not bring it back to its start", "instance"),
+    RestartMethod.RESET: (
+        "Its reset returns OK and does not bring it back to its start",
+        "instance",
+    ),
     RestartMethod.RENEWAL: (
         "Another instance in the same process does not begin as the first one did",
         "process",
@@ -213,7 +216,12 @@ class InstanceHost:
     def __init__(
         self, description: FmuDescription, plan: Plan, limits: WorkerLimits, *, isolated: bool
     ) -> None:
-        self._description, self._plan, self._limits, self._isolated = description, plan, limits, isolated
+        self._description, self._plan, self._limits, self._isolated = (
+            description,
+            plan,
+            limits,
+            isolated,
+        )
         self._extraction: Extraction | None = None
         self._release: Callable[[], object] = lambda: None
         self.instance: Instance | None = None
@@ -278,7 +286,9 @@ class InstanceHost:
         if trial.first is None:
             trial.first, trial.reply = (start, request), np.array(reply)
             return None
-        same = (start, request) != trial.first or trial.agrees(self._description.label, self._way, reply)
+        same = (start, request) != trial.first or trial.agrees(
+            self._description.label, self._way, reply
+        )
         return None if same else self.start(start)
 
     def renew(self) -> Instance:
@@ -297,7 +307,9 @@ class InstanceHost:
     def _restarted(self) -> Instance:
         """Return an instance as after its instantiation, by the fastest way that is seen to work."""
         trial = self.reset_trial
-        ways: list[tuple[RestartMethod, Callable[[], Instance]]] = [(RestartMethod.RESET, self._reset)]
+        ways: list[tuple[RestartMethod, Callable[[], Instance]]] = [
+            (RestartMethod.RESET, self._reset)
+        ]
         if self._isolated and not self._description.once_per_process:
             ways.append((RestartMethod.RENEWAL, self.renew))
         for self._way, again in ways:
@@ -364,7 +376,9 @@ class InstanceHost:
 def _release(instance: Instance, extraction: Extraction) -> None:
     instance.close()
     extraction.users -= 1
-    if isinstance(instance, FmuInstance) and not extraction.users:  # others may yet import what they need
+    if (
+        isinstance(instance, FmuInstance) and not extraction.users
+    ):  # others may yet import what they need
         forget_modules(str(extraction.folder))
 
 
@@ -385,7 +399,10 @@ def warn_without_sandbox(label: str, grants: Grants | None) -> None:
 
 
 def worker_limits(
-    binding: Binding, step_timeout: float | None, load_timeout: float | None, memory_limit: float | None
+    binding: Binding,
+    step_timeout: float | None,
+    load_timeout: float | None,
+    memory_limit: float | None,
 ) -> WorkerLimits:
     """Return what the caller says, else what the binding says, else the defaults.
 
@@ -395,5 +412,9 @@ def worker_limits(
         If one is not positive.
     """
     given = {"step_time": step_timeout, "load_time": load_timeout, "memory": memory_limit}
-    limits = binding.limits.model_dump() | {key: value for key, value in given.items() if value is not None}
-    return validate(WorkerLimits, limits, "the limits of the worker", FmuInputError, what="the limits")
+    limits = binding.limits.model_dump() | {
+        key: value for key, value in given.items() if value is not None
+    }
+    return validate(
+        WorkerLimits, limits, "the limits of the worker", FmuInputError, what="the limits"
+    )

@@ -223,7 +223,9 @@ class FmiAsset(OpenedFmu):
             begin = self.step_index
             length = max(1, _BLOCK_BYTES // max(rows[0].nbytes, replies[0].nbytes))
             for first in range(0, len(rows), length):
-                ended = self._run(rows[first : first + length], replies[first : first + length], stage)
+                ended = self._run(
+                    rows[first : first + length], replies[first : first + length], stage
+                )
                 if ended is not None:
                     made = self.step_index - begin
                     if ended.time is not None and ended.time > moments[made]:
@@ -257,7 +259,11 @@ class FmiAsset(OpenedFmu):
                 except FmuError as error:
                     failure = error
                 instance = None
-                if made and not begin and (instance := self._stand_in(rows[0].tobytes(), replies[0])):
+                if (
+                    made
+                    and not begin
+                    and (instance := self._stand_in(rows[0].tobytes(), replies[0]))
+                ):
                     report(0)
         finally:
             self.step_index += made
@@ -302,7 +308,9 @@ class FmiAsset(OpenedFmu):
             try:
                 body = self._instance.save()
             except FmuError as error:
-                told = type(error)(f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time)
+                told = type(error)(
+                    f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time
+                )
                 self._fail(told, "saving the state")
         else:
             body = b"".join(self._record)
@@ -368,7 +376,9 @@ class FmiAsset(OpenedFmu):
         except FmuError as error:
             self._phase = "broken"
             if not replayed and not isinstance(error, FmuStateError):  # whose sentence says it
-                error = type(error)(f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time)
+                error = type(error)(
+                    f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time
+                )
             self._fail(error, "restoring the state")
 
     def fork(self) -> Self:
@@ -397,13 +407,18 @@ class FmiAsset(OpenedFmu):
         if saved.fmu != self.description.sha256:
             raise FmuStateError(said("state.other_fmu", self=self))
         if (saved.step_size, saved.start_time) != (self._interval, self._start_time):
-            raise FmuStateError("The state was saved with another step size or start time; use that binding.")
+            raise FmuStateError(
+                "The state was saved with another step size or start time; use that binding."
+            )
         if (
             saved.method != self.state_method
             or len(saved.inputs) != width
             or len(saved.start_inputs) not in (0, width)
             or not saved.first_index <= saved.index
-            or (saved.method == "replay" and len(saved.body) != width * (saved.index - saved.first_index))
+            or (
+                saved.method == "replay"
+                and len(saved.body) != width * (saved.index - saved.first_index)
+            )
         ):
             raise FmuStateError(said("state.damaged"))
 

@@ -1,4 +1,4 @@
-"""What a caller gives an asset: values and histories by the binding's names."""
+"""Types of what a caller gives an asset: values and histories by the binding's names."""
 
 from collections.abc import Mapping, Sequence
 from typing import TypedDict
@@ -6,14 +6,23 @@ from typing import TypedDict
 import numpy as np
 import numpy.typing as npt
 
-Values = Mapping[str, float | str | Sequence[float] | Sequence[str]]
-"""Values by the binding's names: a number, or as many as the bound array or port has.
+Value = float | str | Sequence[float] | Sequence[str]
+"""A number, or as many as the bound array or port has.
 
-The value of an enumeration may be the name of its item; that of a parameter that is a text is the text.
+The value of an enumeration may be the name of its item, and that of a text parameter is a text.
 """
 
+Values = Mapping[str, Value]
+"""Values by the binding's names."""
+
 Histories = Mapping[str, npt.ArrayLike]
-"""Inputs by the binding's names: a number for all steps, or one for each; (n,) or (N, n) for an array."""
+"""Inputs by the binding's names: one number for all of N steps, or (N,); for an array (n,) or (N, n)."""
+
+InputsByRole = Mapping[str, Values | None]
+"""Values of inputs by role and name; see `Inputs`."""
+
+HistoriesByRole = Mapping[str, Histories | None]
+"""Histories of inputs by role and name."""
 
 
 class Inputs(TypedDict, total=False):
@@ -26,21 +35,29 @@ class Inputs(TypedDict, total=False):
 
 
 def check_roles(inputs: Inputs) -> None:
-    """Refuse a misspelt keyword, which would pass where it stands for nothing; raises `TypeError`."""
+    """Refuse a misspelt keyword, which would otherwise be ignored.
+
+    Raises
+    ------
+    TypeError
+        If a role is unknown.
+    """
+    roles = Inputs.__annotations__
     for role in inputs:
-        if role not in Inputs.__annotations__:
-            raise TypeError(f"Inputs are {', '.join(Inputs.__annotations__)}, and {role!r} came.")
+        if role not in roles:
+            raise TypeError(f"Inputs are {', '.join(roles)}, and {role!r} came.")
 
 
 PlainValue = float | str | list[float] | list[str]
+"""A value as JSON holds it."""
 
 
 def plain_values(values: Values) -> dict[str, PlainValue]:
-    """Return values as floats, texts and lists of them in the order of their names, to be kept as JSON."""
+    """Return values sorted by name, as floats, texts and lists of these, to be kept as JSON."""
     return {name: _plain_value(value) for name, value in sorted(values.items())}
 
 
-def _plain_value(value: float | str | Sequence[float] | Sequence[str]) -> PlainValue:
+def _plain_value(value: Value) -> PlainValue:
     array = np.asarray(value)
     if array.dtype.kind != "U":
         array = np.asarray(value, dtype=np.float64)
