@@ -45,7 +45,7 @@ from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import load_binding
-from fmu_asset.client.experiment import read_histories
+from fmu_asset.client.history_files import read_histories
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files

@@ -16,7 +16,8 @@ import numpy as np
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.client.binding import INPUT_ROLES, Binding, InputBinding, load_binding
+from fmu_asset.client.binding import INPUT_ROLES, Binding, load_binding
+from fmu_asset.client.bound_variables import InputBinding
 from fmu_asset.client.experiment import whole_binding
 from fmu_asset.client.layout import VariableElements, find_variable
 from fmu_asset.client.session import FmiAsset

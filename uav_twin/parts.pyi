@@ -111,11 +111,11 @@ from fmu_asset.client.binding import load_binding as load_binding
 from fmu_asset.client.draft import draft_binding as draft_binding
 from fmu_asset.client.experiment import default_experiment as default_experiment
 from fmu_asset.client.experiment import ending_with_histories as ending_with_histories
-from fmu_asset.client.experiment import read_histories as read_histories
 from fmu_asset.client.experiment import run_experiment as run_experiment
 from fmu_asset.client.experiment import run_histories as run_histories
-from fmu_asset.client.experiment import write_history as write_history
-from fmu_asset.client.layout import ObservationHistory as ObservationHistory
+from fmu_asset.client.history_files import read_histories as read_histories
+from fmu_asset.client.history_files import write_history as write_history
+from fmu_asset.client.observations import ObservationHistory as ObservationHistory
 from fmu_asset.client.session import FmiAsset as FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset as CoupledAsset
 from fmu_asset.coupling.system import system_description as system_description

@@ -10,15 +10,8 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.description import FmuModelDescription, FmuOutputSection
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.client.binding import (
-    Binding,
-    BindingHeader,
-    InputBinding,
-    ParameterBinding,
-    VectorBinding,
-    expand,
-    load_binding,
-)
+from fmu_asset.client.binding import Binding, BindingHeader, load_binding
+from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding, expand
 from reporting.words import counted
 
 REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")

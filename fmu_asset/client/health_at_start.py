@@ -13,8 +13,8 @@ import numpy.typing as npt
 from reporting.arrays import Float
 
 from .exchange import Exchange
-from .layout import InputSlot
-from .values import HistoriesByRole
+from .slots import InputSlot
+from .values import InputsByRole
 
 
 class ConstantHealthRun(NamedTuple):
@@ -77,7 +77,7 @@ class _CheckedHistory(NamedTuple):
 
 
 def split_where_health_changes(
-    exchange: Exchange, inputs: HistoriesByRole, steps: int | None
+    exchange: Exchange, inputs: InputsByRole, steps: int | None
 ) -> list[ConstantHealthRun]:
     """Return the runs of constant health that histories of inputs consist of.
 
@@ -112,7 +112,7 @@ def split_where_health_changes(
     return runs
 
 
-def _checked_histories(exchange: Exchange, inputs: HistoriesByRole) -> list[_CheckedHistory]:
+def _checked_histories(exchange: Exchange, inputs: InputsByRole) -> list[_CheckedHistory]:
     histories = []
     for role, by_name in inputs.items():
         table: Mapping[str, npt.ArrayLike] = by_name or {}

@@ -114,7 +114,7 @@ class FmuRuns:
         return {name: value for name, value in vars(self).items() if name != "asset"}
 
     def cached(self, key: Hashable, compute: Callable[[], FloatArray]) -> FloatArray:
-        """Return the result of `compute` for a key, computed once; the oldest results are dropped."""
+        """Return the result of `compute` for a key, computed once; old results are dropped."""
         result = self._results.get(key, compute)
         result.setflags(write=False)
         return result

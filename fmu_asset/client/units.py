@@ -10,9 +10,10 @@ from reporting.units import Meaning, meaning_of
 
 
 def same_dimension(first: str, second: str) -> bool | None:
-    """Return whether two units have the same dimension; None if one of them is not understood."""
+    """Return whether two units have the same dimension; None if one is not understood."""
+    # without loading pint, which takes a third of a second
     if first == second:
-        return True  # without loading pint, which takes a third of a second
+        return True
     first_meaning = meaning_of(first)
     second_meaning = meaning_of(second)
     if first_meaning is None or second_meaning is None:
@@ -21,7 +22,7 @@ def same_dimension(first: str, second: str) -> bool | None:
 
 
 class Conversion(NamedTuple):
-    """A linear conversion of units: value in the FMU = `factor` * value in the binding + `offset`."""
+    """A conversion of units: value in the FMU = `factor` * value in the binding + `offset`."""
 
     factor: float
     offset: float

@@ -1,7 +1,7 @@
 """Types of what a caller gives an asset: values and histories by the binding's names."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypedDict
+from typing import TypedDict, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,13 +16,10 @@ Values = Mapping[str, Value]
 """Values by the binding's names."""
 
 Histories = Mapping[str, npt.ArrayLike]
-"""Inputs by the binding's names: one number for all of N steps, or (N,); for an array (n,) or (N, n)."""
+"""Inputs by the binding's names: a number for all N steps, or (N,); for arrays (n,) or (N, n)."""
 
-InputsByRole = Mapping[str, Values | None]
-"""Values of inputs by role and name; see `Inputs`."""
-
-HistoriesByRole = Mapping[str, Histories | None]
-"""Histories of inputs by role and name."""
+InputsByRole = Mapping[str, Mapping[str, npt.ArrayLike] | None]
+"""Values, or histories, of inputs by role and name."""
 
 
 class Inputs(TypedDict, total=False):
@@ -34,8 +31,10 @@ class Inputs(TypedDict, total=False):
     port: Values | None
 
 
-def check_roles(inputs: Inputs) -> None:
-    """Refuse a misspelt keyword, which would otherwise be ignored.
+def inputs_by_role(inputs: Inputs) -> InputsByRole:
+    """Return the keyword arguments of a call as inputs by role.
+
+    A misspelt keyword, which would otherwise be ignored, is refused.
 
     Raises
     ------
@@ -46,18 +45,19 @@ def check_roles(inputs: Inputs) -> None:
     for role in inputs:
         if role not in roles:
             raise TypeError(f"Inputs are {', '.join(roles)}, and {role!r} came.")
+    return cast("InputsByRole", inputs)
 
 
 PlainValue = float | str | list[float] | list[str]
 """A value as JSON holds it."""
 
 
-def plain_values(values: Values) -> dict[str, PlainValue]:
+def plain_values(values: Mapping[str, npt.ArrayLike]) -> dict[str, PlainValue]:
     """Return values sorted by name, as floats, texts and lists of these, to be kept as JSON."""
     return {name: _plain_value(value) for name, value in sorted(values.items())}
 
 
-def _plain_value(value: Value) -> PlainValue:
+def _plain_value(value: npt.ArrayLike) -> PlainValue:
     array = np.asarray(value)
     if array.dtype.kind != "U":
         array = np.asarray(value, dtype=np.float64)

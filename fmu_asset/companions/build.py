@@ -16,14 +16,14 @@ from fmu_asset.slaves.variables import VariableTable
 _IMPORTS = """import json
 
 from .companions.{name} import {behaviour} as Behaviour
-from .slaves.base import Contents
+from .slaves.base import SlaveContents
 from .slaves.variables import FmuVariable
 
 
 def load_contents(resources):
     \"\"\"Return the variables that were packed, and what is done with them.\"\"\"
     rows = json.loads((resources / "variables.json").read_text(encoding="utf-8"))
-    return Contents(tuple(FmuVariable(**row) for row in rows), Behaviour)
+    return SlaveContents(tuple(FmuVariable(**row) for row in rows), Behaviour)
 
 """
 

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
-from fmu_asset.client.binding import Binding, BindingHeader, InputBinding, ParameterBinding, VectorBinding
+from fmu_asset.client.binding import Binding, BindingHeader
+from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError, said
-from fmu_asset.instances.plan import Settings
+from fmu_asset.instances.plan import InitialValues
 
 from .structure import Component, Endpoint
 from .wiring import ConnectedVariable, Wiring
@@ -36,7 +37,7 @@ class SystemDescription(FmuDescription):
         """Return the definitions of units that hold for a variable."""
         return self.definitions[variable.name]
 
-    def of_components(self, settings: Settings) -> dict[str, dict[str, float]]:
+    def of_components(self, settings: InitialValues) -> dict[str, dict[str, float]]:
         """Return what is set in the system by component and variable, in the FMUs' units."""
         found: dict[str, dict[str, float]] = {}
         for _, reference, (value,) in settings:

@@ -96,7 +96,9 @@ class Slave:
         self._high = [math.inf if row.maximum is None else row.maximum for row in self._table]
         self._values = [0.0 if row.start is None else float(row.start) for row in self._table]
         causalities = [row.causality for row in self._table]
-        self._input_count = next(n for n, causality in enumerate(causalities) if causality != "input")
+        self._input_count = next(
+            n for n, causality in enumerate(causalities) if causality != "input"
+        )
         self._first_output = causalities.index("output")
         self._end = len(causalities) - causalities[::-1].index("output")
         self._tuned = {row.name: row.reference for row in self._table[self._end :]}
@@ -121,7 +123,9 @@ class Slave:
         if self._phase in (INSTANTIATED, REFUSED):
             self._phase = INITIALISING
         else:
-            self._refuse(Status.BAD_CALL, "initialisation was entered a second time; reset the FMU first")
+            self._refuse(
+                Status.BAD_CALL, "initialisation was entered a second time; reset the FMU first"
+            )
 
     def exit_initialization_mode(self) -> None:
         """Check parameters and inputs, and find the initial state."""
@@ -140,23 +144,31 @@ class Slave:
         if not self._may_step(current_time, step_size):
             return False
         consequence = "the step was refused and the state is as it was"
-        if not self._done(step, self._input_count, f"the step from t = {current_time:g} s", consequence):
+        if not self._done(
+            step, self._input_count, f"the step from t = {current_time:g} s", consequence
+        ):
             return False
         self._time = current_time + step_size
         return True
 
     def _initialise(self) -> bool:
         begin = partial(self._behaviour.start, self._parameters(self._values), self._time)
-        return self._done(begin, self._first_output, "the initialisation", "the initialisation was refused")
+        return self._done(
+            begin, self._first_output, "the initialisation", "the initialisation was refused"
+        )
 
-    def _done(self, act: Callable[..., Sequence[float]], last: int, what: str, consequence: str) -> bool:
+    def _done(
+        self, act: Callable[..., Sequence[float]], last: int, what: str, consequence: str
+    ) -> bool:
         """Whether values were acceptable and something was done with the inputs, whose outputs are kept."""
         try:
             if not self._acceptable(last, consequence):
                 return False
             outputs = act(self._values[: self._input_count])
         except UnacceptableValuesError as error:
-            return self._refuse(Status.OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
+            return self._refuse(
+                Status.OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}"
+            )
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
             return self._refuse(Status.INTERNAL, f"{what} failed: {error!r}")
         self._values[self._first_output : self._first_output + len(outputs)] = outputs
@@ -193,7 +205,9 @@ class Slave:
         return True
 
     def _parameters(self, values: Sequence[float]) -> dict[str, float]:
-        return {row.name: values[row.reference] for row in self._table if row.causality == "parameter"}
+        return {
+            row.name: values[row.reference] for row in self._table if row.causality == "parameter"
+        }
 
     # ------------------------------------------------------------------ values
 
@@ -203,7 +217,9 @@ class Slave:
             row = self._table[vr] if 0 <= vr < len(self._table) else None
             if row is None or row.causality == "output" or row.kind not in _KINDS[kind]:
                 name = "an unknown variable" if row is None else row.name
-                self._refuse(Status.BAD_CALL, f"{name} (value reference {vr}) cannot be set as {kind}")
+                self._refuse(
+                    Status.BAD_CALL, f"{name} (value reference {vr}) cannot be set as {kind}"
+                )
             elif row.variability == "fixed" and self._phase in (READY, TERMINATED):
                 self._refuse(
                     Status.BAD_CALL,
@@ -308,7 +324,8 @@ class Slave:
             row = self._table[index]
             if not math.isfinite(value):
                 return self._refuse(
-                    Status.NOT_FINITE, f"{row.name} is {value!r}, which is not finite; {consequence}"
+                    Status.NOT_FINITE,
+                    f"{row.name} is {value!r}, which is not finite; {consequence}",
                 )
             return self._refuse(
                 Status.OUTSIDE_RANGE,

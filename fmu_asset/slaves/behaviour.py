@@ -77,7 +77,9 @@ class StructureBehaviour:
         self._acting: ActiveEffects | None = None  # of the effects
         self._vector: FloatArray | None = None
         self._integrator: ModalIntegrator | None = None
-        self._state: TransientState | None = None  # without an integrator, the model itself is at rest
+        self._state: TransientState | None = (
+            None  # without an integrator, the model itself is at rest
+        )
         self._static: StaticResponse | None = None
         self._filters: list[float] | None = None
         self._shown: list[float] = []
@@ -86,7 +88,9 @@ class StructureBehaviour:
         """Take the variables of the effects by name, and the time at the start of the simulation [s]."""
         self._tuned = values, start
 
-    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> Sequence[float]:
+    def start(
+        self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]
+    ) -> Sequence[float]:
         """Begin in equilibrium under the inputs, or just let go of where a force held the structure aside.
 
         Raises
@@ -107,9 +111,16 @@ class StructureBehaviour:
         if self._vector is None:
             raise RuntimeError("the structure was not initialised")
         if group == MODES:
-            modes = self._model.modes(self._vector) if self._integrator is None else self._integrator.modes
+            modes = (
+                self._model.modes(self._vector)
+                if self._integrator is None
+                else self._integrator.modes
+            )
             frequency = modes.frequency[:MODE_COUNT]
-            return [*frequency.tolist(), *rayleigh_damping_ratio(*self._damping, frequency).tolist()]
+            return [
+                *frequency.tolist(),
+                *rayleigh_damping_ratio(*self._damping, frequency).tolist(),
+            ]
         if group == POINT_OR_BOUND and self._roles.load_point is not None:
             # as sensors show it, where they are on
             return [self._shown[-1] if self._shown else self._point()]
@@ -130,7 +141,9 @@ class StructureBehaviour:
         motion = () if now is None else (now.displacement, now.velocity, now.load, *now.memory)
         parts = (self._vector, values, (self._begun,), self._filters, self._shown, *motion)
         # a part that is not there has the length -1
-        told = (item for part in parts for item in ((-1.0,) if part is None else (len(part), *part)))
+        told = (
+            item for part in parts for item in ((-1.0,) if part is None else (len(part), *part))
+        )
         return [float(len(parts)), *map(float, told)]
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
@@ -153,7 +166,9 @@ class StructureBehaviour:
         if motion and self._vector is not None:
             self._integrator = self._made(self._vector)
             place, velocity, load, *memory = map(np.array, motion)
-            self._state = TransientState(place, velocity, load, *([np.array(memory)] if memory else []))
+            self._state = TransientState(
+                place, velocity, load, *([np.array(memory)] if memory else [])
+            )
 
     # ------------------------------------------------------------ parts
 
@@ -163,7 +178,11 @@ class StructureBehaviour:
         self._moves = int(parameters["response"]) == TRANSIENT
 
     def _whole(
-        self, time: float, duration: float, inputs: Sequence[float], start: Mapping[str, float] | None = None
+        self,
+        time: float,
+        duration: float,
+        inputs: Sequence[float],
+        start: Mapping[str, float] | None = None,
     ) -> list[float]:
         """Make a step, or a start with parameters, completely, or leave everything as it was."""
         before = dict(self.__dict__)
@@ -178,7 +197,9 @@ class StructureBehaviour:
             if not isinstance(error, FiniteElementError):
                 raise
             sentence = str(error)
-            raise UnacceptableValuesError(sentence if sentence.endswith(".") else f"{sentence}.") from error
+            raise UnacceptableValuesError(
+                sentence if sentence.endswith(".") else f"{sentence}."
+            ) from error
 
     def _go(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
         """Begin, where there is no state yet, or advance; return the outputs."""
@@ -205,9 +226,16 @@ class StructureBehaviour:
             elif self._roles.release is None:
                 state = integrator.at_rest(load)
             else:
-                state = integrator.released(parameters[self._roles.release], load, self._held(integrator))
+                state = integrator.released(
+                    parameters[self._roles.release], load, self._held(integrator)
+                )
             outputs = integrator.outputs(state).tolist()
-        self._vector, self._integrator, self._state, self._static = vector, integrator, state, static
+        self._vector, self._integrator, self._state, self._static = (
+            vector,
+            integrator,
+            state,
+            static,
+        )
         return outputs if self._acting is None else self._show(outputs, duration, time + duration)
 
     def _held(self, integrator: ModalIntegrator) -> int:
@@ -234,8 +262,14 @@ class StructureBehaviour:
             self._filters, self._shown = None, []
             return values
         across = None
-        if self._integrator is not None and self._state is not None and self._acting.changes_structure:
-            seen = self._integrator.structure.components @ self._integrator.displacement(self._state)
+        if (
+            self._integrator is not None
+            and self._state is not None
+            and self._acting.changes_structure
+        ):
+            seen = self._integrator.structure.components @ self._integrator.displacement(
+                self._state
+            )
             across = np.pad(seen, ((0, 0), (0, len(values) + 1 - seen.shape[1])))
         release = self._parameters.get(self._roles.release or "", 0.0)
         kind = "flight" if not self._moves else "ringdown" if release else "forced"
@@ -273,5 +307,7 @@ def load_contents(resources: Path) -> SlaveContents:
     arrays = PatchArrays.load(file) if file.is_file() else None
     rows = effect_rows(effects, len(table), start)
     return SlaveContents(
-        table + rows, lambda: behaviour(SwitchableEffects(effects, len(model.gauges), arrays)), later
+        table + rows,
+        lambda: behaviour(SwitchableEffects(effects, len(model.gauges), arrays)),
+        later,
     )

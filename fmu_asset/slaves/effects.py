@@ -37,7 +37,11 @@ RANGES: Mapping[str, tuple[float, float]] = {"side": (-1.0, 1.0), "element_count
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
     """Return names and quantities of the outputs that sensors show, in the behaviour's order."""
     strains = tuple((f"strain[{gauge}]", "strain") for gauge in range(1, gauge_count + 1))
-    return (*strains, ("tip_displacement", "displacement"), ("load_point_displacement", "displacement"))
+    return (
+        *strains,
+        ("tip_displacement", "displacement"),
+        ("load_point_displacement", "displacement"),
+    )
 
 
 def numbers_of(effect: Mapping[str, Any]) -> dict[str, tuple[int, str]]:
@@ -59,7 +63,10 @@ def numbers_of(effect: Mapping[str, Any]) -> dict[str, tuple[int, str]]:
     ]
     often = Counter(key for _, key in found)
     return {
-        f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""): (number, key)
+        f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""): (
+            number,
+            key,
+        )
         for number, key in found
     }
 
@@ -69,12 +76,16 @@ def _unit(primitive: Mapping[str, Any], key: str) -> str:
     unit = PRIMITIVES[str(primitive["kind"])].units.get(key, "1")
     if unit in (CHANNEL_UNIT, PER_RELEASE):
         channel = str(primitive["channel"])
-        displacement = channel.endswith("displacement") or primitive.get("quantity") == "displacement"
+        displacement = (
+            channel.endswith("displacement") or primitive.get("quantity") == "displacement"
+        )
         if unit == CHANNEL_UNIT:
             return "m" if displacement else "1"
         return "1" if displacement else "1/m"
     moving, _, turning = unit.partition(" or ")
-    return (turning if turning and primitive.get("port") == ROTATING_PORT else moving).replace(" ", ".")
+    return (turning if turning and primitive.get("port") == ROTATING_PORT else moving).replace(
+        " ", "."
+    )
 
 
 def switch_name(effect: Mapping[str, Any]) -> str:
@@ -186,7 +197,10 @@ class SwitchableEffects:
     """
 
     def __init__(
-        self, effects: Sequence[Mapping[str, Any]], gauge_count: int, arrays: PatchArrays | None = None
+        self,
+        effects: Sequence[Mapping[str, Any]],
+        gauge_count: int,
+        arrays: PatchArrays | None = None,
     ) -> None:
         self._effects, self._channels = effects, output_channels(gauge_count)
         self.wing = None if arrays is None else PatchedWing(arrays)
@@ -201,7 +215,11 @@ class SwitchableEffects:
         """Return the effects as values of the variables have them; raises `InvalidPatchError`."""
         named = dict(zip(self._names, values, strict=True))
         patch = ModelPatch.from_list(active_primitives(self._effects, named))
-        filters = [(item.channel, item.quantity, item.order) for item in patch if isinstance(item, HighPass)]
+        filters = [
+            (item.channel, item.quantity, item.order)
+            for item in patch
+            if isinstance(item, HighPass)
+        ]
         return ActiveEffects(
             tuple(values), patch, named.get(TEMPERATURE, 0.0), needs_structure(patch), filters
         )
@@ -231,12 +249,21 @@ class SwitchableEffects:
             If a reading is not finite.
         """
         row = SensorRecord(
-            self._channels, time=np.array([time]), temperature=np.array([acting.temperature]), **record
+            self._channels,
+            time=np.array([time]),
+            temperature=np.array([acting.temperature]),
+            **record,
         )
         transverse, shear = (None, None) if across is None else across[:, np.newaxis]
         filters = FilterMemory(memory, duration)
         (shown,), _ = apply_sensors(
-            acting.patch, row, values[np.newaxis], None, transverse, shear, filtered=filters.filtered
+            acting.patch,
+            row,
+            values[np.newaxis],
+            None,
+            transverse,
+            shear,
+            filtered=filters.filtered,
         )
         if not math.isfinite(float(shown.sum())):
             raise UnacceptableValuesError("With the effects that are on, an output is not finite.")

@@ -32,7 +32,13 @@ _OF_THE_WING = {
 
 _CHOSEN: Mapping[str, tuple[str, Causality, str, str, str | None]] = {
     "parameters": ("", "parameter", "Factor {} on the stiffness", "1", None),
-    "regions": ("health.", "input", "Stiffness that the region {} has lost, as a fraction", "1", "%"),
+    "regions": (
+        "health.",
+        "input",
+        "Stiffness that the region {} has lost, as a fraction",
+        "1",
+        "%",
+    ),
     "masses": ("mass.", "parameter", "Mass of {}", "kg", "g"),
     "controls": ("", "input", "Control {} of the loads", "", None),
 }
@@ -86,7 +92,9 @@ def structure_table(
     """
     for name in (*model.controls, *model.parameters):
         if name in RESERVED:
-            raise ValueError(f"a structure with an FMU can have no control or parameter named {name!r}")
+            raise ValueError(
+                f"a structure with an FMU can have no control or parameter named {name!r}"
+            )
     table, wing = VariableTable(start), is_wing(model)
     texts = _OF_THE_WING if wing else {}
     nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
@@ -96,7 +104,9 @@ def structure_table(
     def add(group: str, part: slice = slice(None)) -> None:
         prefix, causality, text, unit, display = _CHOSEN[group]
         for name in getattr(model, group)[part]:
-            variable = f"{prefix}{name.removesuffix('_mass') if wing and group == 'masses' else name}"
+            variable = (
+                f"{prefix}{name.removesuffix('_mass') if wing and group == 'masses' else name}"
+            )
             table.add(
                 variable, causality, texts.get(variable, text.format(name)), display=display,
                 unit=unit or control_unit[name], box=model.validity[name], default=nominal[name],
@@ -136,14 +146,18 @@ def structure_table(
         )  # fmt: skip
     for name in model.displacements:
         variable = "tip_displacement" if wing else f"displacement.{name}"
-        table.add(variable, "output", texts.get(variable, f"Displacement {name}"), unit="m", display="mm")
+        table.add(
+            variable, "output", texts.get(variable, f"Displacement {name}"), unit="m", display="mm"
+        )
     for name in model.accelerations:
         table.add(
             f"acceleration.{name}", "output", f"Acceleration {name}; zero where the response is quasi-static",
             unit="m/s2",
         )  # fmt: skip
     bound = "Certified bound of the error of any static {} against the full finite element model"
-    table.add("strain_error_bound", "output", bound.format("strain"), unit="1", display="microstrain")
+    table.add(
+        "strain_error_bound", "output", bound.format("strain"), unit="1", display="microstrain"
+    )
 
     if wing:
         table.add_status()
@@ -153,12 +167,24 @@ def structure_table(
             unit="m", display="mm",
         )  # fmt: skip
     else:
-        table.add("displacement_error_bound", "output", bound.format("displacement"), unit="m", display="mm")
+        table.add(
+            "displacement_error_bound",
+            "output",
+            bound.format("displacement"),
+            unit="m",
+            display="mm",
+        )
     modes = range(1, min(MODE_COUNT, model.mode_count) + 1)
     for mode in modes:
         table.add(f"frequency[{mode}]", "output", f"Natural frequency of mode {mode}", unit="Hz")
     for mode in modes:
-        table.add(f"damping_ratio[{mode}]", "output", f"Damping ratio of mode {mode}", unit="1", display="%")
+        table.add(
+            f"damping_ratio[{mode}]",
+            "output",
+            f"Damping ratio of mode {mode}",
+            unit="1",
+            display="%",
+        )
     chosen = tuple(variables[name] for name in model.chosen)
     if wing:
         names = ("initial_tip_displacement", "load_point_displacement")

@@ -40,7 +40,11 @@ ENUMERATIONS = (
         "Response",
         "How the structure answers its loads",
         (
-            ("quasi_static", QUASI_STATIC, "The steady turn: static equilibrium with the inputs of the step"),
+            (
+                "quasi_static",
+                QUASI_STATIC,
+                "The steady turn: static equilibrium with the inputs of the step",
+            ),
             ("transient", TRANSIENT, "The modes are integrated exactly, inputs held over the step"),
         ),
     ),
@@ -49,10 +53,18 @@ ENUMERATIONS = (
         "What became of the last call; other than ok, the call was refused and state and outputs stay",
         (
             ("ok", Status.OK, "The outputs belong to the inputs of the last step"),
-            ("outside_range", Status.OUTSIDE_RANGE, "An input or parameter lies outside its min and max"),
+            (
+                "outside_range",
+                Status.OUTSIDE_RANGE,
+                "An input or parameter lies outside its min and max",
+            ),
             ("not_finite", Status.NOT_FINITE, "An input or parameter is NaN or infinite"),
             ("bad_step", Status.BAD_STEP, "Step size or communication point is not acceptable"),
-            ("bad_call", Status.BAD_CALL, "A call in the wrong phase, such as a step before initialisation"),
+            (
+                "bad_call",
+                Status.BAD_CALL,
+                "A call in the wrong phase, such as a step before initialisation",
+            ),
             ("bad_state", Status.BAD_STATE, "A restored state does not belong to this FMU"),
             ("internal", Status.INTERNAL, "The computation failed; the log says how"),
         ),

@@ -14,7 +14,7 @@ from pydantic import Field
 from fmu_asset import errors
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError, said
 from fmu_asset.folders import remove_folder
-from fmu_asset.instances.plan import REPORT_PERIOD, Instance, Plan, Settings
+from fmu_asset.instances.plan import REPORT_PERIOD, InitialValues, Instance, Plan
 from reporting.arrays import Float
 from reporting.toml_file import Positive, Section
 
@@ -123,7 +123,7 @@ class WorkerInstance(Instance):
             self.close()
             raise
 
-    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
         """Set parameters and inputs and initialise."""
         self._call("initialise", start_time, parameters, with_inputs)
 
@@ -218,7 +218,9 @@ class WorkerInstance(Instance):
 
     def _ask(self, kind: int, name: str, content: bytes | memoryview) -> None:
         if self.lost:
-            raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
+            raise FmuWorkerError(
+                "The FMU's worker is gone or was interrupted; reset the asset to go on."
+            )
         self.lost, (self._limit, self._what) = True, _CALLS[name]
         self._number = (self._number + 1) % 2**32
         try:
@@ -289,7 +291,9 @@ class WorkerInstance(Instance):
         if left <= 0.0:
             self._process.kill()
             most = getattr(self._limits, self._limit)
-            raise FmuTimeoutError(said("running.timeout", most=most, what=self._what, limit=self._limit))
+            raise FmuTimeoutError(
+                said("running.timeout", most=most, what=self._what, limit=self._limit)
+            )
 
     def _check_memory(self) -> None:
         self._next_glance = time.monotonic() + 5.0 * _GLANCE

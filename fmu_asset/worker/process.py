@@ -75,7 +75,17 @@ class WorkerProcess:
         try:
             with (folder / "worker.log").open("wb") as log:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", program, root, str(folder), shared, confined, watched],
+                    [
+                        sys.executable,
+                        "-P",
+                        "-c",
+                        program,
+                        root,
+                        str(folder),
+                        shared,
+                        confined,
+                        watched,
+                    ],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=log,
@@ -88,7 +98,9 @@ class WorkerProcess:
                 )
         except OSError as error:
             raise FmuWorkerError(f"The worker process could not be started ({error}).") from error
-        self._pipes = [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe is not None]
+        self._pipes = [
+            pipe for pipe in (self._process.stdin, self._process.stdout) if pipe is not None
+        ]
         self.outgoing, self.incoming = (pipe.fileno() for pipe in self._pipes)
         self._ended = os.pidfd_open(self._process.pid)
         first = bytearray(WORKER_NUMBER.size)
@@ -132,7 +144,9 @@ class WorkerProcess:
         if alive:
             how = "closed its pipe, or wrote something else into it"
         elif code < 0:
-            name = {item.value: item.name for item in signal.Signals}.get(-code, "a real-time signal")
+            name = {item.value: item.name for item in signal.Signals}.get(
+                -code, "a real-time signal"
+            )
             meaning = f": {_MEANINGS[name]}" if name in _MEANINGS else ""
             how = f"was ended by signal {-code} ({name}){meaning}"
         elif code == Exit.PIPES_GONE:
@@ -142,7 +156,8 @@ class WorkerProcess:
         else:
             how = f"ended with exit status {code}: the FMU's code ended its own process"
         return FmuWorkerError(
-            f"During {what} the worker process of the FMU {how}. {_REMEDY}{self._remark}.", self._last_words()
+            f"During {what} the worker process of the FMU {how}. {_REMEDY}{self._remark}.",
+            self._last_words(),
         )
 
     def _await_end(self, limit: float) -> bool:

@@ -43,7 +43,9 @@ class Exit(IntEnum):
 # Waking a process that sleeps on a pipe costs as much as a whole step. Whoever awaits the other side of a
 # step therefore looks again for a moment before it sleeps, if there is a processor for each of the two.
 _LOOK_AGAIN = 2.5e-4
-_PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_PROCESSORS = (
+    len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+)
 
 
 def joined(*texts: str) -> bytes:

@@ -65,7 +65,16 @@ _SIGNALLING = ("kill", "tkill", "tgkill", "ptrace", "process_vm_readv", "process
 """Calls that fail with EPERM where Landlock refuses them."""
 _RENAMING = ("rename", "renameat", "renameat2", "link", "linkat")
 """Calls that fail with EXDEV where Landlock refuses them: as if the folders were on two disks."""
-_CALLS_OF_FOLDERS = ("openat", "openat2", "mkdirat", "mknodat", "unlinkat", "renameat", "renameat2", "linkat")
+_CALLS_OF_FOLDERS = (
+    "openat",
+    "openat2",
+    "mkdirat",
+    "mknodat",
+    "unlinkat",
+    "renameat",
+    "renameat2",
+    "linkat",
+)
 """Calls whose first argument is the folder at which a relative path begins."""
 _PATH_OF_PROGRAM = ("execve", "execveat")
 
@@ -161,7 +170,9 @@ class RefusalReport:
         phrases = []
         for kind, (count, first) in self.counts.items():
             singular, plural = _KINDS[kind]
-            phrases.append(f"1 {singular} ({first})" if count == 1 else f"{count} {plural} (first {first})")
+            phrases.append(
+                f"1 {singular} ({first})" if count == 1 else f"{count} {plural} (first {first})"
+            )
         return f"The sandbox refused {', '.join(phrases)}."
 
 
@@ -215,7 +226,12 @@ class RefusalTracer:
         self._pending: dict[int, tuple[int, ...]] = {}
         """By thread: number and arguments of the system call that it is in."""
         self._libc = ctypes.CDLL(None, use_errno=True)
-        self._libc.ptrace.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]
+        self._libc.ptrace.argtypes = [
+            ctypes.c_long,
+            ctypes.c_long,
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+        ]
         self._libc.ptrace.restype = ctypes.c_long
         self._buffer = ctypes.create_string_buffer(_CALL_HEADER.size + 8 * 8)
 

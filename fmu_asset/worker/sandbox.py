@@ -19,7 +19,9 @@ from functools import cache
 # <linux/landlock.h>; the numbers of the system calls are those of every processor.
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _BENEATH, _PORT = 1, 2
-_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_FOLDER, _TRUNCATE, _DEVICE = (1 << k for k in (0, 1, 2, 3, 14, 15))
+_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_FOLDER, _TRUNCATE, _DEVICE = (
+    1 << k for k in (0, 1, 2, 3, 14, 15)
+)
 _READ = _READ_FILE | _READ_FOLDER
 _ALL = (1 << 16) - 1
 _FILE = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _DEVICE
@@ -88,10 +90,14 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
     if not version:
         return False
     if len(os.listdir("/proc/self/task")) > 1:  # noqa: PTH208
-        raise OSError("the sandbox: another thread runs in this process already, and would not be confined")
+        raise OSError(
+            "the sandbox: another thread runs in this process already, and would not be confined"
+        )
     # What a version does not know would be refused: it is left out.
     handled = _ALL >> (3, 2, 1, 1)[version - 1] if version < 5 else _ALL
-    attributes = struct.pack("QQQ", handled, _TCP * (version > 3), _SOCKETS_AND_SIGNALS * (version > 5))
+    attributes = struct.pack(
+        "QQQ", handled, _TCP * (version > 3), _SOCKETS_AND_SIGNALS * (version > 5)
+    )
     rules = _done(_libc().syscall(_CREATE_RULESET, attributes, len(attributes), 0))
     program = _EXECUTE * grants.programs
     read, write = (_READ | program) & handled, (_ALL & ~_EXECUTE | program) & handled
@@ -151,11 +157,23 @@ def _allow(rules: int, paths: Iterable[str], access: int) -> None:
 # ---------------------------------------------------------------------- system calls
 
 _LOAD, _AND, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x06  # <linux/bpf_common.h>
-_NUMBER, _PROCESSOR, _FIRST_ARGUMENT = 0, 4, 16  # of `seccomp_data`, in bytes; each argument has eight
+_NUMBER, _PROCESSOR, _FIRST_ARGUMENT = (
+    0,
+    4,
+    16,
+)  # of `seccomp_data`, in bytes; each argument has eight
 _GRANTED, _ERROR = 0x7FFF0000, 0x50000
 _OTHER_NUMBERS = 0x40000000  # of the same calls, for another size of pointers
-_INTERNET, _PLAIN_PROTOCOLS = (2, 10), (0, 6, 17)  # IPv4 and IPv6; TCP, and UDP for the names of hosts
-_LOCAL, _STREAM, _KIND, _WHOLE = (1,), (1,), 0xF, 0xFFFFFFFF  # the kind of a socket, without its flags
+_INTERNET, _PLAIN_PROTOCOLS = (
+    (2, 10),
+    (0, 6, 17),
+)  # IPv4 and IPv6; TCP, and UDP for the names of hosts
+_LOCAL, _STREAM, _KIND, _WHOLE = (
+    (1,),
+    (1,),
+    0xF,
+    0xFFFFFFFF,
+)  # the kind of a socket, without its flags
 
 # By processor: its number, those of socket(), socketpair(), setpriority() and ioprio_set(), of truncate(), of
 # calls whose first argument is the process that they change, and calls that are refused (memory, semaphores
@@ -201,7 +219,9 @@ def _filter_calls(*, tcp: bool) -> None:
 
     def where(test: int, value: int, then: bytes, *, otherwise: bool = False) -> bytes:
         skipped = len(then) // 8
-        return struct.pack("HBBI", test, skipped * otherwise, skipped * (not otherwise), value) + then
+        return (
+            struct.pack("HBBI", test, skipped * otherwise, skipped * (not otherwise), value) + then
+        )
 
     def among(argument: int, values: tuple[int, ...], bits: int = _WHOLE) -> bytes:
         """Go on if an argument is one of the values; upper halves count for none of these calls."""
@@ -222,7 +242,12 @@ def _filter_calls(*, tcp: bool) -> None:
     code += where(_AT_LEAST, _OTHER_NUMBERS, denied)
     code += b"".join(where(_EQUAL, number, denied) for number in refused)
     code += b"".join(where(_EQUAL, number, done) for number in idle)
-    code += b"".join(where(_EQUAL, number, then + granted) for number, then in conditions.items()) + granted
+    code += (
+        b"".join(where(_EQUAL, number, then + granted) for number, then in conditions.items())
+        + granted
+    )
     content = ctypes.create_string_buffer(code, len(code))
-    filter_ = ctypes.create_string_buffer(struct.pack("HxxxxxxQ", len(code) // 8, ctypes.addressof(content)))
+    filter_ = ctypes.create_string_buffer(
+        struct.pack("HxxxxxxQ", len(code) // 8, ctypes.addressof(content))
+    )
     _done(_libc().prctl(_SET_FILTER, 2, filter_, 0, 0))

@@ -16,7 +16,7 @@ import numpy as np
 
 from fmu_asset.errors import FmuError, FmuWorkerError
 from fmu_asset.instances.base import FmuInstance
-from fmu_asset.instances.co_simulation import open_instance
+from fmu_asset.instances.opening import open_instance
 from reporting.arrays import Float
 
 from .protocol import HEADER, Answer, Exit, Question, joined, look, receive, send
@@ -33,7 +33,9 @@ _last_reach: list[tuple[str, tuple[object, ...]]] = []
 
 
 def _notice(event: str, arguments: tuple[object, ...]) -> None:
-    if event.startswith(_REACHES) and event != "os.chdir":  # which is free, and which we do ourselves
+    if (
+        event.startswith(_REACHES) and event != "os.chdir"
+    ):  # which is free, and which we do ourselves
         _last_reach[:] = [(event, arguments)]
 
 
@@ -41,7 +43,9 @@ def _refusal() -> str:
     """Return the sentence on what the sandbox has refused, with its name if Python knows it."""
     tried = ""
     for event, arguments in _last_reach:
-        what = ", ".join(repr(value) for value in arguments if isinstance(value, str | bytes | list | tuple))
+        what = ", ".join(
+            repr(value) for value in arguments if isinstance(value, str | bytes | list | tuple)
+        )
         tried = f"; the last that its Python code tried was {event}({what})"
     return _NOT_GRANTED.format(tried)
 
@@ -92,14 +96,18 @@ def _restrict() -> None:
     signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
 
 
-def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[bool, FmuInstance | None]:
+def _answer_requests(
+    incoming: int, outgoing: int, *, confined: bool
+) -> tuple[bool, FmuInstance | None]:
     """Answer requests; return whether the end was asked for, and the instance that is still open."""
     if confined:
         sys.addaudithook(_notice)
     instance: FmuInstance | None = None
     header = memoryview(bytearray(HEADER.size))
     reply_header = bytearray(HEADER.size)
-    system_error = ctypes.c_int.from_address(_locate_errno())  # what a call of the FMU leaves in `errno`
+    system_error = ctypes.c_int.from_address(
+        _locate_errno()
+    )  # what a call of the FMU leaves in `errno`
     request = reply = memoryview(b"")
     own_number, poll = os.getpid(), select.poll()
     poll.register(incoming, select.POLLIN | select.POLLHUP)
@@ -137,7 +145,9 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
                 elif instance is None:
                     raise FmuWorkerError("The worker was asked before it had an FMU.")
                 request[:] = block
-                payload = _called(instance, name, arguments, answer) or (reply if name == "read" else b"")
+                payload = _called(instance, name, arguments, answer) or (
+                    reply if name == "read" else b""
+                )
             answer(Answer.RESULT, payload)
         except FmuError as error:
             refused = system_error.value == errno.EACCES or "ermission denied" in str(error)
@@ -145,14 +155,18 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
             lost = instance is None or instance.lost
             time = "" if error.time is None else repr(error.time)
             answer(
-                Answer.FAILURE, joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages)
+                Answer.FAILURE,
+                joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages),
             )
         look(poll)
     return False, instance
 
 
 def _called(
-    instance: FmuInstance, name: str, arguments: tuple[Any, ...], answer: Callable[[int, bytes], None]
+    instance: FmuInstance,
+    name: str,
+    arguments: tuple[Any, ...],
+    answer: Callable[[int, bytes], None],
 ) -> bytes:
     """Call a method of the instance and return what it answers as bytes."""
     if name == "run":

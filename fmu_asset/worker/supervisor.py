@@ -50,7 +50,9 @@ def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
     import resource
 
     twin, supervisor = os.getppid(), os.getpid()
-    gone = os.pidfd_open(twin)  # the pipe's end does not tell: an FMU can open its other side for itself
+    gone = os.pidfd_open(
+        twin
+    )  # the pipe's end does not tell: an FMU can open its other side for itself
     if os.getppid() != twin:
         os._exit(0)
     incoming, outgoing = os.dup(0), os.dup(1)
@@ -207,7 +209,9 @@ def _end_descendants() -> None:
             return
         for child in _children():
             os.kill(child, signal.SIGKILL)
-            if (group := os.getpgid(child)) != os.getpgrp():  # at once, so that nobody has a child meanwhile
+            if (
+                group := os.getpgid(child)
+            ) != os.getpgrp():  # at once, so that nobody has a child meanwhile
                 os.killpg(group, signal.SIGKILL)
         time.sleep(0.002)
 

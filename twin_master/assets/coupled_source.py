@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from fe.wing.design import load_design
-from fmu_asset.client.binding import Binding, expand
+from fmu_asset.client.binding import Binding
+from fmu_asset.client.bound_variables import expand
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.coupling.structure import (
     Component,

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from fmu_asset.client.binding import Binding, load_binding
-from fmu_asset.client.placement import warn_without_sandbox
+from fmu_asset.client.instance_host import warn_without_sandbox
 from fmu_asset.client.session import FmiAsset
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors, hash_file

@@ -15,7 +15,7 @@ from fmu_asset.client.binding import Binding, load_binding, parse_binding
 from fmu_asset.client.draft import draft_binding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.experiment import default_experiment
-from fmu_asset.client.placement import worker_limits
+from fmu_asset.client.instance_host import worker_limits
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmu_asset.client.layout import Observation
-from fmu_asset.client.life import SavedState
+from fmu_asset.client.observations import Observation
+from fmu_asset.client.saved_state import SavedState
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.errors import FmuInputError, FmuStateError

@@ -171,7 +171,7 @@ def test_an_answer_to_another_request_is_not_taken(hostile) -> None:
     """A reply that is whole but bears another number, as one that comes late."""
     with hostile() as asset:
         asset.step()
-        instance = asset._housing.instance
+        instance = asset._host.instance
         assert isinstance(instance, WorkerInstance)
         question = instance._pickled("read")
         os.write(instance._out, HEADER.pack(Question.CALL, 0, 77, len(question)) + question)
