@@ -105,7 +105,7 @@ from fmu_asset.archive.declared import VariableInfo as VariableInfo
 from fmu_asset.archive.declared import describe_fmu as describe_fmu
 from fmu_asset.archive.fmu_file import inspect_fmu as inspect_fmu
 from fmu_asset.archive.fmu_file import read_fmu as read_fmu
-from fmu_asset.check import check_fmu as check_fmu
+from fmu_asset.checks.fmu_check import check_fmu as check_fmu
 from fmu_asset.client.binding import Binding as Binding
 from fmu_asset.client.binding import load_binding as load_binding
 from fmu_asset.client.draft import draft_binding as draft_binding

@@ -61,7 +61,7 @@ def declared_companion(name: str, told: dict[str, Any]) -> Declaration:
                     for key, value in row.items()
                 }
                 source, box = given.pop("of", None), (given.pop("low", None), given.pop("high", None))
-                table.add(**given, box=box)
+                table.add(**given, limits=box)
                 if given["causality"] == "output":
                     dependencies[given["name"]] = [] if source is None else [source]
     table.add_status()

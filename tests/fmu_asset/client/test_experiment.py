@@ -8,7 +8,7 @@ import pytest
 
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.check import check_fmu
+from fmu_asset.checks.fmu_check import check_fmu
 from fmu_asset.client.binding import parse_binding
 from fmu_asset.client.experiment import default_experiment, ending_with_histories, run_experiment
 from fmu_asset.client.session import FmiAsset

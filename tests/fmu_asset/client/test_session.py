@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from fmu_asset import errors
-from fmu_asset.check import check_fmu
-from fmu_asset.client import session
+from fmu_asset.checks.fmu_check import check_fmu
+from fmu_asset.client import stepped_fmu
 from fmu_asset.client.session import FmiAsset
 from tests.fmu_asset.client.kinds import (
     BINDINGS,
@@ -53,7 +53,7 @@ def test_a_step_that_goes_wrong_ends_a_run_there(
     spring_mass, isolated, behaviour, kind, sentence, monkeypatch
 ) -> None:
     """Whatever blocks it is made in; as single steps end there."""
-    monkeypatch.setattr(session, "_BLOCK_BYTES", 3 * 6 * 8)
+    monkeypatch.setattr(stepped_fmu, "_BLOCK_BYTES", 3 * 6 * 8)
     push = np.linspace(0.0, 1.0, 10)
     with (
         FmiAsset(spring_mass, SPRING_BINDING, isolated=isolated) as asset,

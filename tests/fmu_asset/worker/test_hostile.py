@@ -174,7 +174,7 @@ def test_an_answer_to_another_request_is_not_taken(hostile) -> None:
         instance = asset._host.instance
         assert isinstance(instance, WorkerInstance)
         question = instance._pickled("read")
-        os.write(instance._out, HEADER.pack(Question.CALL, 0, 77, len(question)) + question)
+        os.write(instance._outgoing, HEADER.pack(Question.CALL, 0, 77, len(question)) + question)
         with pytest.raises(errors.FmuWorkerError, match="wrote something else into it"):
             asset.step()
 
@@ -303,7 +303,7 @@ def test_an_interruption_leaves_no_stale_answer(spring_mass, monkeypatch) -> Non
     with FmiAsset(spring_mass, SPRING_BINDING) as asset:
         expected = asset.step(PUSHED).values
         with monkeypatch.context() as patch:
-            patch.setattr("fmu_asset.worker.client.WorkerInstance._await", interrupt)
+            patch.setattr("fmu_asset.worker.client.WorkerInstance._wait_for_answer", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 asset.step({"push": 2.0})
         with pytest.raises(errors.FmuWorkerError, match="interrupted; reset the asset"):
