@@ -16,7 +16,7 @@ from fmu_asset.slaves.variables import VariableTable
 _IMPORTS = """import json
 
 from .companions.{name} import {behaviour} as Behaviour
-from .slaves.base import SlaveContents
+from .slaves.contents import SlaveContents
 from .slaves.variables import FmuVariable
 
 

@@ -148,7 +148,7 @@ def build_fmu(
             "reduced_model.npz": model.to_bytes(),
             "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),
         }
-        imports = "from .slaves.behaviour import load_contents\n"
+        imports = "from .slaves.structure_contents import load_contents\n"
         template = kept | contents.python_members(
             declared, "Structure_", imports=imports, resources=resources
         )

@@ -7,10 +7,7 @@ beside it; `structure_behaviour.c` does the same for a structure without effects
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,8 +18,8 @@ from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
-from .base import SlaveContents, UnacceptableValuesError
-from .table import MODE_COUNT, StructureRoles, structure_table
+from .contents import UnacceptableValuesError
+from .table import MODE_COUNT, StructureRoles
 from .variables import TRANSIENT, FmuVariable
 
 if TYPE_CHECKING:
@@ -37,28 +34,6 @@ modes.
 """
 _NONE_LENGTH = -1.0
 """Length that stands for a part of a saved state that is None."""
-
-
-def later_outputs(table: Sequence[FmuVariable], roles: StructureRoles) -> tuple[slice, ...]:
-    """Return the rows of the groups `BOUND`, `POINT_OR_BOUND` and `MODES`.
-
-    Parameters
-    ----------
-    table : sequence of FmuVariable
-        Variables of the FMU.
-    roles : StructureRoles
-        Roles of variables.
-    """
-    reference = {row.name: row.reference for row in table}
-    bound = reference["strain_error_bound"]
-    point_or_bound = reference[roles.load_point or roles.displacement_bound or ""]
-    first_mode = reference["frequency[1]"]
-    mode_count = sum(name.startswith("frequency[") for name in reference)
-    return (
-        slice(bound, bound + 1),
-        slice(point_or_bound, point_or_bound + 1),
-        slice(first_mode, first_mode + 2 * mode_count),  # frequencies, then damping ratios
-    )
 
 
 class StructureBehaviour:
@@ -466,40 +441,3 @@ def _parts_of_state(state: Sequence[float]) -> list[list[float] | None]:
         else:
             parts.append([next(numbers) for _ in range(int(length))])
     return parts
-
-
-def load_contents(resources: Path) -> SlaveContents:
-    """Return what the files describe that `fmu_asset.packing.structure_fmu` packed.
-
-    Parameters
-    ----------
-    resources : Path
-        Folder of resources in the FMU.
-    """
-    model = ReducedModel.load(resources / "reduced_model.npz")
-    start = json.loads((resources / "start.json").read_text(encoding="utf-8"))
-    structure_start = {}
-    for name, value in start.items():
-        if not name.startswith("effect."):
-            structure_start[name] = value
-    table, roles = structure_table(model, structure_start)
-    later = later_outputs(table, roles)
-    make_behaviour = partial(StructureBehaviour, model, table, roles)
-    effects_file = resources / "effects.json"
-    if not effects_file.is_file():
-        return SlaveContents(table, make_behaviour, later)
-    # a structure without effects needs none of these modules
-    from fe.runtime.wing_rows import PatchArrays
-
-    from .effects import SwitchableEffects, effect_rows
-
-    effects = json.loads(effects_file.read_text(encoding="utf-8"))
-    arrays_file = resources / "patch_arrays.npz"
-    arrays = PatchArrays.load(arrays_file) if arrays_file.is_file() else None
-    rows = effect_rows(effects, len(table), start)
-    gauge_count = len(model.gauges)
-    return SlaveContents(
-        table + rows,
-        lambda: make_behaviour(SwitchableEffects(effects, gauge_count, arrays)),
-        later,
-    )

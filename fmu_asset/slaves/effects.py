@@ -21,7 +21,7 @@ from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_
 from fe.runtime.transient import ModalIntegrator
 from fe.runtime.wing_rows import PatchArrays
 
-from .base import UnacceptableValuesError
+from .contents import UnacceptableValuesError
 from .variables import FmuVariable, VariableTable
 
 TEMPERATURE = "temperature_difference"

@@ -300,7 +300,7 @@ class DesignSource(_Wing, ReducedModelSource):
         if patch is None or not patch.effects:
             return super().observation_table(draws, model)
         from fmu_asset.packing.structure_fmu import arrays_for
-        from fmu_asset.slaves.base import UnacceptableValuesError
+        from fmu_asset.slaves.contents import UnacceptableValuesError
 
         scenario, where = self._scenario, str(self.patch_path)
         ask = strains_with_effects(self.wing, patch, arrays_for(self.wing_design, patch))
