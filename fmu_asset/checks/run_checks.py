@@ -131,15 +131,15 @@ class RunChecks:
         if not self._binding.binding.structural_parameters:
             return base
         for role in INPUT_ROLES:
-            for name, item in self._binding.inputs(role).items():
-                found = self._find_input(role, name, item)
-                start_count = len((found.variable.start or "0").split())
-                if start_count not in (1, found.variable.size):
-                    base[role][name] = [0.0] * len(found.elements)
+            for name, input_binding in self._binding.inputs(role).items():
+                selection = self._find_input(role, name, input_binding)
+                start_count = len((selection.variable.start or "0").split())
+                if start_count not in (1, selection.variable.size):
+                    base[role][name] = [0.0] * len(selection.elements)
         return base
 
-    def _find_input(self, role: str, name: str, item: InputBinding) -> VariableElements:
-        return find_variable(self._description, item.variable, f"{role}.{name}", "input")
+    def _find_input(self, role: str, name: str, input_binding: InputBinding) -> VariableElements:
+        return find_variable(self._description, input_binding.variable, f"{role}.{name}", "input")
 
     def _run(self) -> Float:
         """Return the outputs (N, n) of a run in a new worker, from start values."""
@@ -247,8 +247,8 @@ class RunChecks:
         failures = []
         with closing(self._asset()) as asset:
             for role in INPUT_ROLES:
-                for name, item in self._binding.inputs(role).items():
-                    if len(self._find_input(role, name, item).elements) != 1:
+                for name, input_binding in self._binding.inputs(role).items():
+                    if len(self._find_input(role, name, input_binding).elements) != 1:
                         continue
                     for value in asset.input_range(role, name):
                         if abs(value) >= _LARGEST_TRIED_LIMIT:
@@ -257,9 +257,8 @@ class RunChecks:
                         try:
                             self._step_with(asset, role, name, value)
                         except FmuError as error:
-                            failures.append(
-                                f"{item.variable} = {value:g} {item.unit}: {one_line(error)}"
-                            )
+                            limit = f"{input_binding.variable} = {value:g} {input_binding.unit}"
+                            failures.append(f"{limit}: {one_line(error)}")
         if failures:
             text = f"{len(failures)} of {tried} ends of ranges fail, such as {failures[0]}"
             return CheckResult("warning", text)

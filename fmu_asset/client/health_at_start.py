@@ -42,7 +42,7 @@ class _CheckedHistory(NamedTuple):
     ----------
     role, name : str
         Role and name in the binding.
-    given : array_like
+    values : array_like
         Values as the caller gave them.
     slot : InputSlot
         Where the input goes.
@@ -54,7 +54,7 @@ class _CheckedHistory(NamedTuple):
 
     role: str
     name: str
-    given: npt.ArrayLike
+    values: npt.ArrayLike
     slot: InputSlot
     numbers: Float
     is_at_start: bool
@@ -66,14 +66,14 @@ class _CheckedHistory(NamedTuple):
 
     def part(self, begin: int, end: int) -> npt.ArrayLike:
         """Return the values of some steps, as the caller gave them."""
-        return np.asarray(self.given)[begin:end] if self.varies else self.given
+        return np.asarray(self.values)[begin:end] if self.varies else self.values
 
     def first_value(self, begin: int) -> npt.ArrayLike:
         """Return the value of a step, as the caller gave it."""
         if self.varies:
-            first: npt.ArrayLike = np.asarray(self.given)[begin]
+            first: npt.ArrayLike = np.asarray(self.values)[begin]
             return first
-        return self.given
+        return self.values
 
 
 def split_where_health_changes(
@@ -116,11 +116,11 @@ def _checked_histories(exchange: Exchange, inputs: InputsByRole) -> list[_Checke
     histories = []
     for role, by_name in inputs.items():
         table: Mapping[str, npt.ArrayLike] = by_name or {}
-        for name, given in table.items():
+        for name, values in table.items():
             slot = exchange.slot(role, name)
-            numbers = slot.numbers(given, history=True)
+            numbers = slot.numbers(values, history=True)
             is_at_start = role == "health" and name in exchange.health_slots
-            histories.append(_CheckedHistory(role, name, given, slot, numbers, is_at_start))
+            histories.append(_CheckedHistory(role, name, values, slot, numbers, is_at_start))
     return histories
 
 

@@ -38,17 +38,19 @@ class InitialValueTable:
     def __init__(self, resolver: BindingResolver) -> None:
         self._resolver = resolver
         self.health_slots: dict[str, InputSlot] = {}
-        for name, item in resolver.binding.health.items():
-            if resolver.is_set_at_start(item.variable):
-                self.health_slots[name] = resolver.start_slot(f"health.{name}", item)
+        for name, input_binding in resolver.binding.health.items():
+            if resolver.is_set_at_start(input_binding.variable):
+                self.health_slots[name] = resolver.start_slot(f"health.{name}", input_binding)
         self._text_parameters: dict[str, VariableInfo] = {}
         self._parameter_slots: dict[str, InputSlot] = {}
-        for name, item in resolver.binding.parameter.items():
-            variable = resolver.description.variable(item.variable)
+        for name, input_binding in resolver.binding.parameter.items():
+            variable = resolver.description.variable(input_binding.variable)
             if variable is not None and variable.is_text_parameter:
                 self._text_parameters[name] = variable
             else:
-                self._parameter_slots[name] = resolver.start_slot(f"parameter.{name}", item)
+                self._parameter_slots[name] = resolver.start_slot(
+                    f"parameter.{name}", input_binding
+                )
 
     def split_inputs(
         self, inputs: InputsByRole
@@ -151,8 +153,8 @@ class InitialValueTable:
                 f"The binding {resolver.binding.name} has no parameter {name!r}; it has "
                 f"{comma_list(resolver.binding.parameter)}."
             )
-        item = InputBinding(variable=name, unit=variable.unit or "1")
-        return resolver.start_slot(f"parameter.{name}", item)
+        input_binding = InputBinding(variable=name, unit=variable.unit or "1")
+        return resolver.start_slot(f"parameter.{name}", input_binding)
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
         """Return the text parameter of a name in the binding, or else in the FMU, if it is one."""

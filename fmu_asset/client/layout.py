@@ -1,4 +1,4 @@
-"""Variables that a binding names, found in an FMU, and the order of their values in a block."""
+"""Variables that a binding names, selection in an FMU, and the order of their values in a block."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -60,16 +60,16 @@ def find_variable(
     """
     variable = description.variable(name)
     if variable is None:
-        found = _find_element(description, name, label)
-        if found is None:
+        selection = _find_element(description, name, label)
+        if selection is None:
             raise BindingError(
                 f"{label} names {name!r}, which is not a variable of {description.label}"
                 f"{description.hint(name)}"
             )
     else:
-        found = VariableElements(variable, range(variable.size))
-    _check_use(description, found.variable, causality, name, label)
-    return found
+        selection = VariableElements(variable, range(variable.size))
+    _check_use(description, selection.variable, causality, name, label)
+    return selection
 
 
 def _find_element(description: FmuDescription, name: str, label: str) -> VariableElements | None:
@@ -188,10 +188,10 @@ class BlockLayout:
             groups.append(VariableGroup(key.kind, references, count, linear=not key.is_held))
         self.groups = tuple(groups)
 
-    def positions(self, found: VariableElements) -> list[int]:
+    def positions(self, selection: VariableElements) -> list[int]:
         """Return the positions of elements of a variable in the block."""
-        begin = self._begins[found.variable.name]
-        return [begin + element for element in found.elements]
+        begin = self._begins[selection.variable.name]
+        return [begin + element for element in selection.elements]
 
     def names(self) -> list[str]:
         """Return the names of all values in the order of the block."""

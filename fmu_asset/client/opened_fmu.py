@@ -376,8 +376,8 @@ class OpenedFmu:
             needs_no_start_values = (
                 self.binding.binding.structural_parameters and not self._linear_count
             )
-            given = inputs if needs_no_start_values and inputs is not None else {}
-            request = self._exchange.request.start_values(given)
+            sent = inputs if needs_no_start_values and inputs is not None else {}
+            request = self._exchange.request.start_values(sent)
             self._start_instance(request, with_inputs=False)
         return self._instance
 

@@ -78,21 +78,23 @@ class ReplyBlock:
         extras = _extras(resolver, ports)
         requested = observations + extras
         # lay out the block
-        found = [resolver.find(item.variable, item.label, "output") for item in requested]
-        variables = [entry.variable for entry in found]
+        selections = [
+            resolver.find(request.variable, request.label, "output") for request in requested
+        ]
+        variables = [selection.variable for selection in selections]
         self.layout = BlockLayout(resolver.description, variables, begin=0)
         # units and positions of the outputs
         outputs = []
-        for item, entry in zip(requested, found, strict=True):
-            unit = item.unit or entry.variable.unit or "1"
-            definitions = resolver.description.units_of(entry.variable)
-            to_fmu = conversion(unit, entry.variable, definitions, where=item.label)
-            outputs.append(_ResolvedOutput(self.layout.positions(entry)[0], unit, to_fmu))
+        for request, selection in zip(requested, selections, strict=True):
+            unit = request.unit or selection.variable.unit or "1"
+            definitions = resolver.description.units_of(selection.variable)
+            to_fmu = conversion(unit, selection.variable, definitions, where=request.label)
+            outputs.append(_ResolvedOutput(self.layout.positions(selection)[0], unit, to_fmu))
         # an extra name that is there twice has its last value
         observed = outputs[: len(observations)]
         extra_outputs: dict[str, _ResolvedOutput] = {}
-        for item, output in zip(extras, outputs[len(observations) :], strict=True):
-            extra_outputs[item.name] = output
+        for request, output in zip(extras, outputs[len(observations) :], strict=True):
+            extra_outputs[request.name] = output
         chosen = [*observed, *extra_outputs.values()]
         self.table = OutputTable(
             observation_count=len(observed),

@@ -36,16 +36,16 @@ class _BoundInput(NamedTuple):
     ----------
     role, name : str
         Role and name in the binding.
-    item : InputBinding
+    input_binding : InputBinding
         Unit and range.
-    found : list of VariableElements
+    selections : list of VariableElements
         Its variables: one, or as many as the vector of a port has.
     """
 
     role: str
     name: str
-    item: InputBinding
-    found: list[VariableElements]
+    input_binding: InputBinding
+    selections: list[VariableElements]
 
     @property
     def label(self) -> str:
@@ -88,7 +88,7 @@ class RequestBlock:
     def __init__(self, resolver: BindingResolver, ports: Sequence[PortQuantity]) -> None:
         self._resolver = resolver
         bound_inputs = self._role_inputs() + self._port_inputs(ports)
-        variables = [entry.variable for bound in bound_inputs for entry in bound.found]
+        variables = [selection.variable for bound in bound_inputs for selection in bound.selections]
         is_linear = resolver.binding.binding.interpolation == "linear"
         self.layout = BlockLayout(resolver.description, variables, begin=2, linear=is_linear)
         if is_linear:
@@ -107,11 +107,11 @@ class RequestBlock:
         resolver = self._resolver
         bound_inputs = []
         for role in INPUT_ROLES:
-            for name, item in resolver.binding.inputs(role).items():
-                if role == "health" and resolver.is_set_at_start(item.variable):
+            for name, input_binding in resolver.binding.inputs(role).items():
+                if role == "health" and resolver.is_set_at_start(input_binding.variable):
                     continue
-                found = resolver.find(item.variable, f"{role}.{name}", "input")
-                bound_inputs.append(_BoundInput(role, name, item, [found]))
+                selection = resolver.find(input_binding.variable, f"{role}.{name}", "input")
+                bound_inputs.append(_BoundInput(role, name, input_binding, [selection]))
         return bound_inputs
 
     def _port_inputs(self, ports: Sequence[PortQuantity]) -> list[_BoundInput]:
@@ -121,9 +121,9 @@ class RequestBlock:
             if quantity.is_read:
                 continue
             names = quantity.vector.variables
-            item = InputBinding(variable=names[0], unit=quantity.vector.units[0])
-            found = [self._resolver.find(name, quantity.label, "input") for name in names]
-            bound_inputs.append(_BoundInput("port", quantity.name, item, found))
+            input_binding = InputBinding(variable=names[0], unit=quantity.vector.units[0])
+            selections = [self._resolver.find(name, quantity.label, "input") for name in names]
+            bound_inputs.append(_BoundInput("port", quantity.name, input_binding, selections))
         return bound_inputs
 
     def _slot(self, bound: _BoundInput, user_of_position: dict[int, str]) -> InputSlot:
@@ -137,15 +137,23 @@ class RequestBlock:
             Label of the input that sets each position; extended in place.
         """
         resolver = self._resolver
-        if len({(entry.variable.unit, entry.variable.kind) for entry in bound.found}) > 1:
+        if (
+            len(
+                {
+                    (selection.variable.unit, selection.variable.kind)
+                    for selection in bound.selections
+                }
+            )
+            > 1
+        ):
             raise BindingError(
                 f"The variables of {resolver.place_in_binding(bound.label)} have different units "
                 "or types in the FMU; make one port of each."
             )
-        variable = bound.found[0].variable
+        variable = bound.selections[0].variable
         positions: list[int] = []
-        for entry in bound.found:
-            positions += self.layout.positions(entry)
+        for selection in bound.selections:
+            positions += self.layout.positions(selection)
         for position in positions:
             if position in user_of_position:
                 raise BindingError(
@@ -154,7 +162,7 @@ class RequestBlock:
                     "one."
                 )
             user_of_position[position] = bound.label
-        return resolver.slot(bound.label, bound.item, variable, positions)
+        return resolver.slot(bound.label, bound.input_binding, variable, positions)
 
     def _check_linear_interpolation(self) -> None:
         """Refuse straight lines of inputs where the FMU, or none of its inputs, can follow them."""

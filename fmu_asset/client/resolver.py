@@ -1,4 +1,4 @@
-"""The names of a binding, found in the FMU: variables, units, ranges and mechanical ports."""
+"""The names of a binding, selection in the FMU: variables, units, ranges and mechanical ports."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -90,7 +90,11 @@ class BindingResolver:
         return variable.startable or (variable.causality == "parameter" and not is_tunable)
 
     def slot(
-        self, label: str, item: InputBinding, variable: VariableInfo, positions: Sequence[int]
+        self,
+        label: str,
+        input_binding: InputBinding,
+        variable: VariableInfo,
+        positions: Sequence[int],
     ) -> InputSlot:
         """Return how values of an input are checked, converted and placed.
 
@@ -98,7 +102,7 @@ class BindingResolver:
         ----------
         label : str
             Place in the binding.
-        item : InputBinding
+        input_binding : InputBinding
             Unit and range of the input.
         variable : VariableInfo
             Its variable.
@@ -111,10 +115,12 @@ class BindingResolver:
             If the unit cannot be converted, or the range lies outside that of the FMU.
         """
         definitions = self.description.units_of(variable)
-        unit_conversion = conversion(item.unit, variable, definitions, where=label)
+        unit_conversion = conversion(input_binding.unit, variable, definitions, where=label)
         low, high = variable.bounds
-        item_low, item_high = sorted(unit_conversion.to_fmu(limit) for limit in item.limits)
-        if item_low > high or item_high < low:
+        stated_low, stated_high = sorted(
+            unit_conversion.to_fmu(limit) for limit in input_binding.limits
+        )
+        if stated_low > high or stated_high < low:
             raise BindingError(
                 f"The range of {self.place_in_binding(label)} lies outside that of "
                 f"{variable.name!r}, {low:g} to {high:g}{variable.in_unit}; correct minimum or "
@@ -123,13 +129,13 @@ class BindingResolver:
         return InputSlot(
             label=label,
             positions=positions,
-            low=max(low, item_low),
-            high=min(high, item_high),
+            low=max(low, stated_low),
+            high=min(high, stated_high),
             conversion=unit_conversion,
             variable=variable,
         )
 
-    def start_slot(self, label: str, item: InputBinding) -> InputSlot:
+    def start_slot(self, label: str, input_binding: InputBinding) -> InputSlot:
         """Return the slot of a value that is set before the initialisation.
 
         Its positions count from the first value of the variable itself.
@@ -137,10 +143,10 @@ class BindingResolver:
         Raises
         ------
         BindingError
-            If the item does not fit the FMU.
+            If the binding does not fit the FMU.
         """
-        found = self.find(item.variable, label, "parameter")
-        return self.slot(label, item, found.variable, found.elements)
+        selection = self.find(input_binding.variable, label, "parameter")
+        return self.slot(label, input_binding, selection.variable, selection.elements)
 
     # ------------------------------------------------------------------ ports
 

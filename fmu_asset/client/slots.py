@@ -43,12 +43,12 @@ class InputSlot(NamedTuple):
         """Whether it takes whole numbers only."""
         return self.variable.kind not in FLOAT_KINDS
 
-    def numbers(self, given: npt.ArrayLike, *, history: bool = False) -> Float:
+    def numbers(self, values: npt.ArrayLike, *, history: bool = False) -> Float:
         """Return values in the FMU's unit, all of them checked.
 
         Parameters
         ----------
-        given : float, str or array_like
+        values : float, str or array_like
             As many values as the slot takes; for a history either these for all steps, or for each.
         history : bool
             Whether it is a history.
@@ -63,11 +63,11 @@ class InputSlot(NamedTuple):
         FmuInputError
             If there are not n values, or one is no number, not finite, not whole or out of range.
         """
-        given = self._with_item_numbers(given)
-        array = self._float_array(given, history=history)
+        values = self._with_item_numbers(values)
+        array = self._float_array(values, history=history)
         varies = self._varies(array) if history else False
         if not history:
-            self._check_count(array, given)
+            self._check_count(array, values)
         rows = array.reshape(-1, len(self.positions))
         with np.errstate(all="ignore"):
             converted = self._converted(rows)
@@ -75,30 +75,30 @@ class InputSlot(NamedTuple):
             refused = np.argwhere(~self._acceptable(converted, clipped))
         if len(refused):
             step, element = refused[0].tolist()
-            value = given if isinstance(given, int | float) else rows[step, element].item()
+            value = values if isinstance(values, int | float) else rows[step, element].item()
             sentence = self._refusal(value, converted[step, element])
             if varies:
                 sentence += f" It is the value of step {step} of the {len(rows)}."
             raise FmuInputError(sentence)
         is_inside = (self.low <= converted) & (converted <= self.high)
-        values = np.where(is_inside, converted, clipped)
-        return values if varies else values[0]
+        checked = np.where(is_inside, converted, clipped)
+        return checked if varies else checked[0]
 
     # ------------------------------------------------------------------ reading
 
-    def _with_item_numbers(self, given: npt.ArrayLike) -> npt.ArrayLike:
+    def _with_item_numbers(self, values: npt.ArrayLike) -> npt.ArrayLike:
         """Return values with the names of an enumeration's items replaced by their numbers."""
         if not self.variable.items:
-            return given
-        if isinstance(given, str):
-            return self._number_of_item(given)
-        if isinstance(given, np.ndarray) and given.dtype.kind == "U":
-            given = given.tolist()
-        if isinstance(given, list | tuple):
+            return values
+        if isinstance(values, str):
+            return self._number_of_item(values)
+        if isinstance(values, np.ndarray) and values.dtype.kind == "U":
+            values = values.tolist()
+        if isinstance(values, list | tuple):
             return [
-                self._number_of_item(entry) if isinstance(entry, str) else entry for entry in given
+                self._number_of_item(entry) if isinstance(entry, str) else entry for entry in values
             ]
-        return given
+        return values
 
     def _number_of_item(self, name: str) -> float:
         if name not in self.variable.items:
@@ -108,12 +108,12 @@ class InputSlot(NamedTuple):
             )
         return float(self.variable.items[name])
 
-    def _float_array(self, given: npt.ArrayLike, *, history: bool) -> Float:
+    def _float_array(self, values: npt.ArrayLike, *, history: bool) -> Float:
         try:
-            return np.asarray(given, dtype=np.float64)
+            return np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
             wanted = "numbers" if history else "a number"
-            raise FmuInputError(f"{self.label} must be {wanted}, but is {given!r}.") from error
+            raise FmuInputError(f"{self.label} must be {wanted}, but is {values!r}.") from error
 
     def _varies(self, history: Float) -> bool:
         """Return whether a history has values for each step; refuse one of another shape."""
@@ -128,13 +128,13 @@ class InputSlot(NamedTuple):
             )
         return True
 
-    def _check_count(self, values: Float, given: npt.ArrayLike) -> None:
+    def _check_count(self, array: Float, values: npt.ArrayLike) -> None:
         count = len(self.positions)
-        if values.size == count:
+        if array.size == count:
             return
         if count == 1:
-            raise FmuInputError(f"{self.label} must be a number, but is {given!r}.")
-        raise FmuInputError(f"{self.label} takes {count} values, but {values.size} came.")
+            raise FmuInputError(f"{self.label} must be a number, but is {values!r}.")
+        raise FmuInputError(f"{self.label} takes {count} values, but {array.size} came.")
 
     # ------------------------------------------------------------------ checking
 
@@ -163,21 +163,21 @@ class InputSlot(NamedTuple):
             acceptable &= np.isin(values, [*self.variable.items.values()])
         return acceptable
 
-    def _refusal(self, given: float, number: float) -> str:
+    def _refusal(self, value: float, number: float) -> str:
         """Return the sentence that refuses a value, which is `number` in the FMU's unit."""
         if not math.isfinite(number):
-            return f"{self.label} must be finite, but is {given!r}; nothing was sent to the FMU."
+            return f"{self.label} must be finite, but is {value!r}; nothing was sent to the FMU."
         if self.takes_whole_numbers and not float(number).is_integer():
             return (
-                f"{self.label} must be a whole number, but is {given!r}; nothing was sent to the "
+                f"{self.label} must be a whole number, but is {value!r}; nothing was sent to the "
                 "FMU."
             )
         if self.variable.items:
             return (
                 f"{self.label} must be an item of the enumeration {self.variable.name!r} "
-                f"({self.variable.item_list}), but is {given!r}; nothing was sent to the FMU."
+                f"({self.variable.item_list}), but is {value!r}; nothing was sent to the FMU."
             )
         return (
-            f"{self.label} = {given!r} lies outside the range of {self.variable.name!r}, "
+            f"{self.label} = {value!r} lies outside the range of {self.variable.name!r}, "
             f"{self.low:g} to {self.high:g}{self.variable.in_unit}; nothing was sent to the FMU."
         )

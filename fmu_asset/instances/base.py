@@ -334,7 +334,7 @@ class FmuInstance(Instance):
 
     # ------------------------------------------------------------------ C calls
 
-    def _prepared_call(self, name: str, *arguments: Any) -> Callable[[], int]:
+    def _prepared_call(self, name: str, *arguments: object) -> Callable[[], int]:
         """Return a call of a C function of the instance, such as SetReal, with C values."""
         model_prefix = f"{self._plan.fmu.model_identifier}_" if self._version == 1 else ""
         function = getattr(self._fmu.dll, f"{model_prefix}{self._prefix}{name}")

@@ -3,7 +3,6 @@
 # ruff: noqa: N802 - methods and arguments have fmpy's names
 
 import ctypes
-from typing import Any
 
 from fmpy.fmi1 import FMU1Slave
 from fmpy.fmi2 import FMU2Slave
@@ -24,7 +23,7 @@ _TERMINATED = 3
 class FMU1CoSimulation(FMU1Slave):  # type: ignore[misc]
     """FMI 1.0 co-simulation with the methods of FMI 2.0."""
 
-    def __init__(self, **arguments: Any) -> None:
+    def __init__(self, **arguments: object) -> None:
         super().__init__(**arguments)
         # fmpy 0.3.32 takes what these two return for a text, and crashes when it is not 0
         for name in ("InitializeSlave", "DoStep"):
@@ -69,7 +68,7 @@ class CoSimulation(FmuInstance):
             "DoStep", self._step_begin, self._step_size, *self._further_arguments()
         )
 
-    def _further_arguments(self) -> tuple[Any, ...]:
+    def _further_arguments(self) -> tuple[object, ...]:
         """Return the C arguments of doStep after time and step size, by the version of FMI."""
         if self._version == 1:
             return (ctypes.c_char.from_param(b"\x01"),)  # newStep

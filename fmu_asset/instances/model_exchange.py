@@ -7,8 +7,8 @@ The solver is fmpy's, with the failures and the memory that its wrapper loses.
 
 import ctypes
 import math
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Callable, MutableSequence
+from typing import Protocol
 
 from fmpy.fmi1 import FMICallException, FMU1Model
 from fmpy.fmi2 import FMU2Model
@@ -115,7 +115,7 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
         self._failure: Exception | None = None
         self._is_open = True
 
-        def get_nominals(values: Any, count: int) -> None:
+        def get_nominals(values: MutableSequence[float], count: int) -> None:
             fmu.getNominalsOfContinuousStates(values, count)
             for index in range(count):
                 # zero is no nominal value, and CVODE takes no tolerance of zero for a state of zero
@@ -140,20 +140,20 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
     # ctypes prints and forgets an exception that leaves a callback, and CVODE would go on with
     # wrong values: the exception is kept, and CVODE gets a status.
 
-    def f(self, t: float, y: Any, ydot: Any, user_data: Any) -> int:
+    def f(self, t: float, y: object, ydot: object, user_data: object) -> int:
         """Compute the right-hand side for CVODE: 1 asks for a smaller step, -1 ends integration."""
         return self._guarded(self._right_hand_side, t, y, ydot, user_data)
 
-    def _right_hand_side(self, t: float, y: Any, ydot: Any, user_data: Any) -> int:
+    def _right_hand_side(self, t: float, y: object, ydot: object, user_data: object) -> int:
         self.input.apply(t)
         return int(super().f(t, y, ydot, user_data))
 
-    def g(self, t: float, y: Any, gout: Any, user_data: Any) -> int:
+    def g(self, t: float, y: object, gout: object, user_data: object) -> int:
         """Compute the event indicators for CVODE."""
         return self._guarded(super().g, t, y, gout, user_data)
 
     def _guarded(
-        self, function: Callable[..., int], t: float, y: Any, result: Any, user_data: Any
+        self, function: Callable[..., int], t: float, y: object, result: object, user_data: object
     ) -> int:
         """Return the status of a callback; keep its exception instead of raising it."""
         try:

@@ -153,7 +153,12 @@ class Plan:
 
 # ---------------------------------------------------------------------- C calls
 
-_C_TYPES: dict[str, Any] = {
+CType = Any
+"""A simple C type by ctypes, which states none for their common use."""
+CFunction = Any
+"""A C function by ctypes, which has no public type."""
+
+_C_TYPES: dict[str, CType] = {
     "Real": ctypes.c_double,
     "Float64": ctypes.c_double,
     "Float32": ctypes.c_float,
@@ -167,7 +172,7 @@ _C_TYPES: dict[str, Any] = {
     "UInt32": ctypes.c_uint32,
     "UInt64": ctypes.c_uint64,
 }
-_BOOLEAN_TYPES: dict[int, Any] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctypes.c_bool}
+_BOOLEAN_TYPES: dict[int, CType] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctypes.c_bool}
 """C type of a Boolean, by the major version of FMI."""
 
 
@@ -183,7 +188,7 @@ class GroupArguments(NamedTuple):
         read; None if the FMU reads and writes the block itself.
     """
 
-    values: tuple[Any, ...]
+    values: tuple[object, ...]
     convert: Callable[[], object] | None
 
 
@@ -224,7 +229,7 @@ def group_arguments(
             convert = partial(np.copyto, in_block, in_fmu, casting="unsafe")
     reference_count = len(group.references)
     references = (ctypes.c_uint * reference_count)(*group.references)
-    arguments: tuple[Any, ...] = (
+    arguments: tuple[object, ...] = (
         ctypes.byref(references),
         ctypes.c_size_t.from_param(reference_count),
         ctypes.byref(values),
@@ -238,7 +243,7 @@ def group_arguments(
 _Function = ctypes.CFUNCTYPE(ctypes.c_int)
 
 
-def prepare_call(function: Any, *arguments: Any) -> Callable[[], int]:
+def prepare_call(function: CFunction, *arguments: object) -> Callable[[], int]:
     """Return a call without arguments, so that a step looks up and converts nothing.
 
     Parameters

@@ -14,7 +14,7 @@ def status_name(status: int) -> str:
     return STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
 
 
-def refuse_negative(status: int, function: Any, arguments: tuple[Any, ...]) -> int:
+def refuse_negative(status: int, function: Any, arguments: tuple[object, ...]) -> int:
     """Raise for a negative status of a C function that fmpy calls (a hook of ctypes)."""
     if status < 0:
         raise FMICallException(function=function.__name__, status=status)
