@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
-from discrepancy.judgement.closed_share import over_noise_of
+from discrepancy.judgement.closed_share import with_noise_of
 from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
 from discrepancy.verdict import GapWindow
 from fe.runtime.wing_rows import strain_gauge
@@ -42,7 +42,7 @@ def models(before: ResidualSet, after: ResidualSet | None) -> list[Shown]:
     """Return the model as it was and, where there is one, with the effect."""
     if after is None:
         return [Shown(before, style.PREDICTION, "--", "o", "model", "model as it is")]
-    after = over_noise_of(after, before)
+    after = with_noise_of(after, before)
     return [
         Shown(before, style.PREDICTION, "--", "o", "model as it was", "a  model as it was"),
         Shown(after, style.PAST, "-", "D", AFTER, f"b  {AFTER}"),
@@ -64,10 +64,13 @@ def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
 
 
 def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
-    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
+    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end.
+
+    Sizes below the scale have the colour of its end: a window whose readings are all missing has the size 0.
+    """
     found = np.asarray(values, dtype=float)
     largest = float(np.nanmax(found, initial=1.0))
-    return LogNorm(0.7, max(largest, 3.0))
+    return LogNorm(0.7, max(largest, 3.0), clip=True)
 
 
 def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
