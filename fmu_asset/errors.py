@@ -62,7 +62,7 @@ class FmuFileError(FmuError, ValueError):
 
 
 class FmuUnsupportedError(FmuError, ValueError):
-    """An FMU is sound but of a kind that cannot be flown: version, interface or platform."""
+    """An FMU is sound but cannot be run, because of its version, interface or platform."""
 
 
 class BindingError(FmuError, ValueError):
@@ -70,7 +70,7 @@ class BindingError(FmuError, ValueError):
 
 
 class CouplingError(FmuError, ValueError):
-    """FMUs cannot be connected as they were told to: an end is unknown, taken twice, or of another type."""
+    """FMUs cannot be connected: an end is unknown, connected twice, or of another type."""
 
 
 class IterationError(FmuError, RuntimeError):

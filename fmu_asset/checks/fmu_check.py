@@ -96,8 +96,10 @@ def check_fmu(
         findings.append(Finding("binding", "ok", text))
         findings += runs.findings(cycles, reporter(progress))
     # names of an FMU may hold control characters
-    shown = tuple(Finding(entry.check, entry.verdict, visible(entry.text)) for entry in findings)
-    return FmuCheck(description.path, shown)
+    printable = tuple(
+        Finding(entry.check, entry.verdict, visible(entry.text)) for entry in findings
+    )
+    return FmuCheck(description.path, printable)
 
 
 def drafted_binding(description: FmuDescription, step_size: float | None) -> Binding:

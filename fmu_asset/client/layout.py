@@ -139,14 +139,14 @@ class _GroupKey(NamedTuple):
 class BlockLayout:
     """The order of variables in a block of values: by base type, then as the binding names them.
 
-    An array stands there with all its elements, since FMI 3 sets and reads arrays as a whole.
+    An array is in it with all its elements, since FMI 3 sets and reads arrays as a whole.
 
     Parameters
     ----------
     description : FmuDescription
         The FMU.
     variables : sequence of VariableInfo
-        Variables that are exchanged; one that is there twice stands once in the block.
+        Variables that are exchanged; one that is named twice is once in the block.
     begin : int
         Position of the first value.
     linear : bool

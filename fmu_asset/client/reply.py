@@ -31,7 +31,7 @@ class _RequestedOutput(NamedTuple):
 
 
 class _ResolvedOutput(NamedTuple):
-    """Where the value of an output stands, and in which unit the caller gets it.
+    """Position of an output in the reply block, and its unit for the caller.
 
     Attributes
     ----------

@@ -74,12 +74,14 @@ class InputSlot(NamedTuple):
             clipped = np.clip(converted, self.low, self.high)
             refused = np.argwhere(~self._acceptable(converted, clipped))
         if len(refused):
+            # name the first value that is refused, as the caller gave it
             step, element = refused[0].tolist()
             value = values if isinstance(values, int | float) else rows[step, element].item()
             sentence = self._refusal(value, converted[step, element])
             if varies:
                 sentence += f" It is the value of step {step} of the {len(rows)}."
             raise FmuInputError(sentence)
+        # values that a conversion has rounded out of the range are set to its limit
         is_inside = (self.low <= converted) & (converted <= self.high)
         checked = np.where(is_inside, converted, clipped)
         return checked if varies else checked[0]

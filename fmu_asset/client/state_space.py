@@ -397,7 +397,7 @@ def _states_in_time(transition: FloatArray, first: FloatArray, samples: int) -> 
 def _in_continuous_time(
     system: DiscreteSystem, first_outputs: FloatArray, step: float
 ) -> FmuStateSpace:
-    """Return the system in continuous time whose forces, held over steps, give the one in steps.
+    """Return the continuous-time system that a system in steps samples, with forces held in a step.
 
     Parameters
     ----------

@@ -1,7 +1,5 @@
 """Communication steps of an FMU with a binding, one by one or many at once."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from fmu_asset.errors import FmuEndedError, FmuError
@@ -245,17 +243,12 @@ class SteppedFmu(OpenedFmu):
         """
         request_before = np.array(self._request)
         first_index = self.step_index
-        made = 0
-
-        def report(steps: int) -> None:
-            nonlocal made
-            stage.advance(steps - made)
-            made = steps
-
+        counter = _StepCounter(stage)
         failure: FmuError | None = None
         try:
-            failure = self._run_from_start(requests, replies, report, lambda: made)
+            failure = self._run_and_check_start(requests, replies, counter)
         finally:
+            made = counter.made
             self.step_index += made
             last_request = requests[made - 1] if made else request_before
             self._request[:] = last_request.data
@@ -269,12 +262,8 @@ class SteppedFmu(OpenedFmu):
         self._refuse_not_finite(f" It was step {first_index + made - 1}.")
         return None
 
-    def _run_from_start(
-        self,
-        requests: Float,
-        replies: Float,
-        report: Callable[[int], None],
-        steps_made: Callable[[], int],
+    def _run_and_check_start(
+        self, requests: Float, replies: Float, counter: "_StepCounter"
     ) -> FmuError | None:
         """Make a block of steps, again in other instances if the first step contradicts the start.
 
@@ -284,10 +273,8 @@ class SteppedFmu(OpenedFmu):
             Request block of each step.
         replies : (N, n_outputs) ndarray
             Filled with the reply block of each step.
-        report : callable
-            Takes the number of steps made.
-        steps_made : callable
-            Returns that number.
+        counter : _StepCounter
+            Counts the steps made.
 
         Returns
         -------
@@ -295,19 +282,20 @@ class SteppedFmu(OpenedFmu):
             Error of the step at which the FMU failed, if one did.
         """
         instance = self._opened_instance()
+        is_first_block = self.step_index == 0
         while True:
             failure: FmuError | None = None
             try:
-                instance.run(requests, replies, report)
+                instance.run(requests, replies, counter.report)
             except FmuError as error:
                 failure = error
-            if not steps_made() or self.step_index:
+            if not is_first_block or not counter.made:
                 return failure
             other = self._replaced_instance(requests[0].tobytes(), replies[0])
             if other is None:
                 return failure
             instance = other
-            report(0)
+            counter.report(0)
 
     def observe(self) -> Observation:
         """Return the observation of this moment without a step, such as the initial one.
@@ -328,3 +316,27 @@ class SteppedFmu(OpenedFmu):
         """Return the outputs of this moment as doubles, as the FMU gives them."""
         self._instance.read()
         return self._reply.tobytes()
+
+
+class _StepCounter:
+    """Counts the steps of a block and shows them as progress.
+
+    Parameters
+    ----------
+    stage : Stage
+        Where progress is shown.
+
+    Attributes
+    ----------
+    made : int
+        Number of steps made.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self.made = 0
+
+    def report(self, made: int) -> None:
+        """Take the number of steps made."""
+        self._stage.advance(made - self.made)
+        self.made = made

@@ -182,7 +182,15 @@ def _work(twin: _Twin, scratch: str, shared: str, grants: str) -> NoReturn:
 
 
 def _end_as(status: int) -> NoReturn:
-    """End this process as a process ended whose status is given (of waitpid(2))."""
+    """End this process in the way of the worker, by the same signal or exit status.
+
+    The twin sees only this process, and reports how the worker died.
+
+    Parameters
+    ----------
+    status : int
+        Status of the worker from waitpid(2).
+    """
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         if number != signal.SIGKILL:
