@@ -15,7 +15,8 @@ import numpy as np
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.modal_system import rayleigh_damping_ratio
-from fe.runtime.reduced import ReducedModel, StaticResponse
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.reduced_results import ReducedResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
 from .contents import UnacceptableValuesError
@@ -68,7 +69,7 @@ class StructureBehaviour:
         self._inputs = [row.name for row in table if row.causality == "input"]
         self._accelerations_at_rest = [0.0] * len(model.accelerations)
         # of the values of the model, those of controls come last and do not change the modes
-        self._structural_count = len(model.chosen) - len(model.controls)
+        self._structural_count = len(model.input_names) - len(model.controls)
         # set before the initialisation and between steps
         self._parameters: Mapping[str, float] = {}
         self._is_transient = False
@@ -80,7 +81,7 @@ class StructureBehaviour:
         self._vector: FloatArray | None = None
         self._integrator: ModalIntegrator | None = None
         self._state: TransientState | None = None
-        self._static: StaticResponse | None = None
+        self._static: ReducedResponse | None = None
         self._filters: list[float] | None = None
         self._readings: list[float] = []
 
@@ -166,7 +167,7 @@ class StructureBehaviour:
         damping_ratio = rayleigh_damping_ratio(alpha, beta, frequency)
         return [*frequency.tolist(), *damping_ratio.tolist()]
 
-    def _static_response(self, vector: FloatArray) -> StaticResponse:
+    def _static_response(self, vector: FloatArray) -> ReducedResponse:
         """Return the static response of the model, computed once for each step."""
         if self._static is None:
             self._static = self._model.static_response(vector)
@@ -294,7 +295,7 @@ class StructureBehaviour:
         has_patched_structure = self._active is not None and self._active.changes_structure
         integrator: ModalIntegrator | None = None
         state: TransientState | None = None
-        static: StaticResponse | None = None
+        static: ReducedResponse | None = None
         if self._is_transient or has_patched_structure:
             integrator, state = self._next_motion(vector, time, duration, has_changed=has_changed)
             outputs: list[float] = integrator.outputs(state).tolist()
@@ -334,17 +335,17 @@ class StructureBehaviour:
             integrator = self._make_integrator(vector)
             if self._integrator is not None and state is not None:
                 state = integrator.take_over(state, self._integrator)
-        load = integrator.structure.acting(vector)
+        load = integrator.structure.load_coefficients(vector)
         if not self._is_transient:
-            return integrator, integrator.settled(load, state)
+            return integrator, integrator.equilibrium(load, state)
         if state is not None:
             since_begin = time - self._begin_time
             return integrator, integrator.advance(state, duration, load, since_begin)
         if self._roles.release is None:
-            return integrator, integrator.at_rest(load)
+            return integrator, integrator.state_at_rest(load)
         release = self._parameters[self._roles.release]
         holding_load = self._holding_load(integrator)
-        return integrator, integrator.released(release, load, holding_load)
+        return integrator, integrator.state_after_release(release, load, holding_load)
 
     def _structure_differs(self, vector: FloatArray) -> bool:
         """Return whether values that change the modes differ from the last ones, to the bit."""
@@ -355,14 +356,14 @@ class StructureBehaviour:
 
     def _holding_load(self, integrator: ModalIntegrator) -> int:
         """Return the number of the load that holds the structure aside before a release."""
-        holding = integrator.structure.holding
+        holding = integrator.structure.holding_load
         return self._roles.point_load if holding is None else holding
 
     def _make_integrator(self, vector: FloatArray) -> ModalIntegrator:
         """Return the structure in time; a wing with effects in its basis for patches."""
         if self._effects is None or self._effects.wing is None:
             alpha, beta = self._damping
-            return ModalIntegrator(self._model, vector, alpha, beta)
+            return ModalIntegrator(self._model.structure_at(vector), alpha, beta)
         assert self._active is not None
         return self._effects.integrator(vector, self._damping, self._active)
 
@@ -425,7 +426,7 @@ class StructureBehaviour:
         if self._integrator is None or self._state is None or not active.changes_structure:
             return None
         displacement = self._integrator.displacement(self._state)
-        strains = self._integrator.structure.components @ displacement
+        strains = self._integrator.structure.strain_component_rows @ displacement
         missing = channels - strains.shape[1]
         return np.pad(strains, ((0, 0), (0, missing)))
 

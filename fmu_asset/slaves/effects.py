@@ -16,10 +16,10 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES, HighPass, ModelPatch
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
 from fe.runtime.transient import ModalIntegrator
-from fe.runtime.wing_rows import PatchArrays
 
 from .contents import UnacceptableValuesError
 from .variables import FmuVariable, VariableTable
@@ -380,11 +380,11 @@ class SwitchableEffects:
             None,
             transverse,
             shear,
-            filtered=filters.filtered,
+            high_pass=filters.filter_row,
         )
         if not math.isfinite(float(readings.sum())):
             raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
-        return SensorReadings(readings.tolist(), filters.after)
+        return SensorReadings(readings.tolist(), filters.states)
 
     def integrator(
         self, vector: FloatArray, damping: tuple[float, float], active: ActiveEffects
@@ -404,8 +404,7 @@ class SwitchableEffects:
         key = (vector[:-2].tobytes(), damping, active.values)
         if self._last_integrator is None or self._last_key != key:
             alpha, beta = damping
-            self._last_integrator = ModalIntegrator(
-                self.wing, vector, alpha, beta, active.patch, active.temperature
-            )
+            structure = self.wing.structure_at(vector, active.patch, active.temperature)
+            self._last_integrator = ModalIntegrator(structure, alpha, beta)
             self._last_key = key
         return self._last_integrator

@@ -60,7 +60,7 @@ def load_contents(resources: Path) -> SlaveContents:
     if not effects_file.is_file():
         return SlaveContents(table, make_behaviour, later)
     # a structure without effects needs none of these modules
-    from fe.runtime.wing_rows import PatchArrays
+    from fe.runtime.patch_arrays import PatchArrays
 
     from .effects import SwitchableEffects, effect_rows
 

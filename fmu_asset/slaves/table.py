@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import TIP_FORCE, WING
+from fe.runtime.state import TIP_FORCE, WING_MODEL_NAME
 
 from .variables import QUASI_STATIC, TRANSIENT, Causality, FmuVariable, VariableTable
 
@@ -91,7 +91,7 @@ class StructureRoles:
 
 def is_wing(model: ReducedModel) -> bool:
     """Return whether a model is that of a wing, not of a structure that only has its name."""
-    return model.name == WING and len(model.followed_shapes) > 0
+    return model.name == WING_MODEL_NAME and len(model.followed_shapes) > 0
 
 
 def structure_table(
@@ -215,13 +215,13 @@ class _ModelTable(VariableTable):
         super().__init__(start)
         self._model = model
         self._texts = texts
-        self._nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
+        self._nominal = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
         self._control_units = dict(zip(model.controls, model.control_units, strict=True))
         self._variables: dict[str, str] = {}
 
     def chosen(self) -> tuple[str, ...]:
         """Return the variables of all values that can be chosen, in the order of the model."""
-        return tuple(self._variables[name] for name in self._model.chosen)
+        return tuple(self._variables[name] for name in self._model.input_names)
 
     def add_values(self, group: _ValueGroup, names: Sequence[str]) -> None:
         """Append values that can be chosen in the model, by their names there."""
