@@ -124,7 +124,9 @@ def _templates() -> Environment:
     """Return the templates of `fmu_asset/templates` with the filters that they use."""
     environment = Environment(
         loader=PackageLoader("fmu_asset"),
-        autoescape=select_autoescape(("xml.jinja", "html.jinja", "ssd.jinja", "ssv.jinja", "ssm.jinja")),
+        autoescape=select_autoescape(
+            ("xml.jinja", "html.jinja", "ssd.jinja", "ssv.jinja", "ssm.jinja")
+        ),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

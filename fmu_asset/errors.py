@@ -41,7 +41,9 @@ class FmuError(StandsForOthersError):
         As given.
     """
 
-    def __init__(self, sentence: str, messages: Sequence[str] = (), time: float | None = None) -> None:
+    def __init__(
+        self, sentence: str, messages: Sequence[str] = (), time: float | None = None
+    ) -> None:
         self.sentence = visible(sentence)
         self.messages = tuple(visible(message) for message in messages)
         self.time = time
