@@ -258,7 +258,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched, naming_side) -> No
         seen, off = (asset.step(load={"root": root}).extra["frequency[1]"] for root in (1.0, 0.0))
     healthy = np.array([1.0, 0.0, 0.0, 0.169, 0.134, 1.0, 0.0])
     assert seen == pytest.approx(
-        naming_side.wing.at(healthy, patch_of("point_mass", "root")).modes.frequency[0]
+        naming_side.wing.structure_at(healthy, patch_of("point_mass", "root")).modes.frequency[0]
     )
     assert off > seen
 
