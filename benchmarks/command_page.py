@@ -37,7 +37,7 @@ def usage(name: str, command: Any) -> Iterator[str]:
 
 def _shown(item: Any) -> str:
     """Return an argument or option as it is written; an optional one stands in brackets."""
-    if item.name in EVERYWHERE:
+    if item.name in EVERYWHERE or getattr(item, "hidden", False):  # a former name of an option
         return ""
     if item.param_type_name == "argument":
         text = (item.metavar or item.name.upper()).strip("[]")

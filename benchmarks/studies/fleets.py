@@ -148,7 +148,7 @@ def half(twins: int) -> None:
 
 
 def score(known: Knowledge, flown: Flights) -> Float:
-    """Return the mean log probability of the true state ten turns ahead, of each twin: (B,)."""
+    """Return the mean log probability of the true state ten steps ahead, of each twin: (B,)."""
     model = known.model
     steps = flown.state.shape[1]
     result = np.zeros(len(flown.state))

@@ -6,8 +6,8 @@ and investigated. The named effect, or the most probable member of a group, goes
 model, and the mission is flown again with the same seed. A drift cannot stand in a table of
 predicted strains; there the readings are corrected before the twin sees them, with the temperature
 that the run recorded. Printed are the verdict of each mission and, before and after: the rms error
-of the health estimate in points, the share of turns whose 90 % set of states holds the truth, and
-the turns at 3g with z1 truly at or above the limit. The table compares the missions that were
+of the health estimate in points, the share of steps whose 90 % set of states holds the truth, and
+the steps at 3g with z1 truly at or above the limit. The table compares the missions that were
 flown again.
 """
 
@@ -62,7 +62,7 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of
 from twin_master.store.writing import write_run
 
-TURNS = 50
+STEPS = 50
 LIMIT = 0.6 - 1e-9
 """z1 from which on the policy of the wing without an effect leaves 3g."""
 
@@ -94,7 +94,7 @@ HIDDEN = (
     Hidden(
         "gauge_zero_drift",
         "g17",
-        (SensorDrift("strain[17]", -8e-4, float(TURNS)),),
+        (SensorDrift("strain[17]", -8e-4, float(STEPS)),),
         "gauge 17 drifts to -800 microstrain",
     ),
     Hidden(
@@ -133,9 +133,9 @@ class Flown:
     rms : (2,) ndarray
         Of the mean of z1, z2 less the truth [1].
     coverage : float
-        Share of turns whose 90 % set of states holds the truth.
+        Share of steps whose 90 % set of states holds the truth.
     decided : (2,) ndarray
-        Turns flown at 3g with z1 truly at or above the limit, behind the first of them, and turns
+        Steps flown at 3g with z1 truly at or above the limit, behind the first of them, and steps
         beyond it.
     """
 
@@ -168,7 +168,7 @@ def fly_mission(
     hidden: Sequence[Primitive] = (),
     known: Sequence[Primitive] = (),
     scenario: str = "growing_damage",
-    turns: int = TURNS,
+    steps: int = STEPS,
     draws: int = 100,
 ) -> Flown:
     """Fly a mission into a run folder, without its report.
@@ -185,7 +185,7 @@ def fly_mission(
         What the twin's model has.
     scenario : str
         A shipped one.
-    turns : int
+    steps : int
         Length of the mission.
     draws : int
         Of the calibrated parameter.
@@ -198,7 +198,7 @@ def fly_mission(
             )
             lines[name] = f'patch = "{file.name}"\n'
     text = scenario_files()[scenario].read_text(encoding="utf-8")
-    text = text.replace("steps = 50", f"steps = {turns}", 1)
+    text = text.replace("steps = 50", f"steps = {steps}", 1)
     text = text.replace("draws = 100", f"draws = {draws}", 1)
     if depends_on_temperature(hidden):
         text = scenario_in_air(text, folder.parent, f"{folder.name}_wing", patch_text(hidden))
@@ -251,7 +251,7 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Fl
 
 
 def beyond_the_limit(sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the turns at 3g with z1 at or above the limit, and all such turns.
+    """Return the steps at 3g with z1 at or above the limit, and all such steps.
 
     The first of them is left out: its control was decided before.
     """
@@ -299,7 +299,7 @@ def study(
     hidden: Hidden,
     seed: int,
     work: Path,
-    turns: int = TURNS,
+    steps: int = STEPS,
     effects: Sequence[Effect] | None = None,
     again: bool = True,
 ) -> Case:
@@ -307,7 +307,7 @@ def study(
     began = perf_counter()
     place = work / f"{HIDDEN.index(hidden)}_{seed}"
     before = fly_mission(
-        place.with_name(place.name + "_before"), seed, hidden.primitives, turns=turns
+        place.with_name(place.name + "_before"), seed, hidden.primitives, steps=steps
     )
     verdict = investigated(place.with_name(place.name + "_before"), seed, effects)
     after = None
@@ -321,7 +321,7 @@ def study(
             seed,
             (*hidden.primitives, *corrections),
             known,
-            turns=turns,
+            steps=steps,
         )
     return Case(hidden, seed, verdict, before, after, perf_counter() - began)
 
@@ -347,7 +347,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
-    parser.add_argument("--turns", type=int, default=TURNS)
+    parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--once", action="store_true", help="do not fly again with what was found")
     parser.add_argument(
         "--catalogue", help="identifiers of effects that are looked for, with commas"
@@ -373,7 +373,7 @@ def main() -> int:
             cases = []
             for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
                 case = study(
-                    hidden, seed, Path(folder), arguments.turns, effects or None, not arguments.once
+                    hidden, seed, Path(folder), arguments.steps, effects or None, not arguments.once
                 )
                 cases.append(case)
                 after = (

@@ -98,13 +98,13 @@ HEADINGS = (
     "twin's model",
     "model error",
     "first seed",
-    "2g within 2 turns",
+    "2g within 2 steps",
     "early 2g",
     "rms z1, points",
     "rms z2, points",
     "bias z1, points",
     "bias z2, points",
-    "log evidence per turn",
+    "log evidence per step",
     "true state in 90 % set",
 )
 
@@ -181,7 +181,7 @@ def show_misfit(
     control = scenario.control_names.index(scenario.mission.first_control)
     title = (
         "our model less the library, "
-        "and what each gauge adds to the estimate of one turn (linearised)"
+        "and what each gauge adds to the estimate of one step (linearised)"
     )
     states = [knowledge.model.states.index(place) for place in places]
     show(title, headings, misfit_rows(misfit, control, states), page)
@@ -387,7 +387,7 @@ def main() -> int:
         arguments.markdown,
     )
     print(
-        "targets of 300 missions: 2g within 2 turns >= 98 %, early 2g <= 8 %, "
+        "targets of 300 missions: 2g within 2 steps >= 98 %, early 2g <= 8 %, "
         "rms <= 4.5 and 13 points; "
         f"{arguments.missions} missions each, {seconds:.1f} s"
     )

@@ -1,7 +1,7 @@
 """Eight gauges of 24, chosen by information, by pivoted QR and at random; docs/planning.md.
 
 `python -m benchmarks.studies.sensors --missions 300` flies `growing_damage` with eight of the
-wing's gauges; the others are lost from the first turn on. The table shows for each choice the rms
+wing's gauges; the others are lost from the first step on. The table shows for each choice the rms
 error of z1 and z2 in points, and the share of missions that leave the sharp turn before the damage
 asks for it. Pivoted QR of the readings in all states is how PySensors places sensors.
 """

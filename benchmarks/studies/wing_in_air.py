@@ -14,7 +14,7 @@ AIR = Path(__file__).with_name("swinging_air.py")
 
 _BINDING = """[binding]
 name = "wing_in_air"
-step_size = 1.0 # s, one turn
+step_size = 1.0 # s, one step
 description = "A wing in air of changing temperature: load factor as control, 24 strain gauges."
 
 [control.load_factor]

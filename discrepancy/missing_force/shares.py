@@ -479,7 +479,7 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
     if number not in hypothesis.processes:
         hypothesis = search.at[port]
     law = " and ".join(
-        term.effect.name for term in hypothesis.candidate.terms if term.place == port
+        term.name_in_words for term in hypothesis.candidate.terms if term.place == port
     )
     courses = _force_courses(hypothesis, number, has_law=bool(law))
     unit, *_ = search.problem.model.port_units(port)
@@ -610,7 +610,7 @@ def seen_force(
     if missing is None or not missing.law or hypothesis is None:
         return missing
     at_port = missing.at_port
-    laws = [(term.effect.name, term.place) for term in terms if term.place in ports]
+    laws = [(term.name_in_words, term.place) for term in terms if term.place in ports]
     if len({place for _, place in laws}) > 1:
         at_port = replace(at_port, law=" and ".join(f"{name} at {place}" for name, place in laws))
     with suppress(*UNSEEN_ERRORS):

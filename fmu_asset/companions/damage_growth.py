@@ -10,7 +10,7 @@ The loss of a region is the sum of three parts, kept below a ceiling:
   n is the load factor that was held before the mark.
 
 A mark is a multiple of `period` after the start. What happens at a mark belongs to the step that begins at
-it, so that the damage that a turn does is felt from the next turn on. The numbers of a mark follow from the
+it, so that the damage that a step does is felt from the next step on. The numbers of a mark follow from the
 seed, the region and the mark alone: they do not depend on the step size, on the other region or on earlier
 marks.
 """

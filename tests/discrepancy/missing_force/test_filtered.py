@@ -16,7 +16,7 @@ from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
-from discrepancy.missing_force.windows import _most_telling, residual_windows
+from discrepancy.missing_force.windows import _most_telling, residual_windows, sized_windows
 from discrepancy.report.residual_figures import time_line_figure
 from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
@@ -303,6 +303,19 @@ def test_a_window_whose_readings_are_all_missing_is_drawn():
     ]
     figure = time_line_figure(windows)
     assert len(figure.axes[0].collections) >= len(windows)
+
+
+def test_a_window_without_a_reading_is_none():
+    fitted = Bench(count=300).fit(np.random.default_rng(4))
+    trial = fitted.trials[0].trial
+    first, second, third = (float(time) for time in trial.time[100:103])
+    between = (Moment(value, value, value) for value in (first + 0.1 * (second - first), second - 1e-9))
+    around = (Moment(value, value, value) for value in (first, third))
+    ends = {"first": float(trial.time[0]), "last": float(trial.time[-1]), "size": 1.0}
+    windows = [GapWindow(trial.name, trial.channels, *moments, **ends) for moments in (between, around)]
+    (window,) = sized_windows(windows, fitted, fitted)
+    assert window.begin.value == first
+    assert window.size > 0.0
 
 
 def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
