@@ -190,6 +190,9 @@ class BlockLayout:
 
     def positions(self, selection: VariableElements) -> list[int]:
         """Return the positions of elements of a variable in the block."""
+        # an array without elements has no place in the block
+        if not selection.elements:
+            return []
         begin = self._begins[selection.variable.name]
         return [begin + element for element in selection.elements]
 
