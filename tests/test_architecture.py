@@ -44,7 +44,6 @@ LONGER: dict[str, str] = {
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
     "discrepancy/missing_force/backward.py:backward": "One compiled loop over the samples of a record.",
     "discrepancy/missing_force/kalman.py:forward": "One compiled loop over the samples of a record.",
-    "fmu_asset/slaves/table.py:structure_table": "A table: one call a variable.",
 }
 """What may be longer, each with its reason."""
 

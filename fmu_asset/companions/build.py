@@ -11,19 +11,19 @@ from typing import Any
 
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.packing.contents import python_members, sealed
-from fmu_asset.slaves.variables import Table
+from fmu_asset.slaves.variables import VariableTable
 
 _IMPORTS = """import json
 
 from .companions.{name} import {behaviour} as Behaviour
-from .slaves.base import Contents
+from .slaves.contents import SlaveContents
 from .slaves.variables import FmuVariable
 
 
 def load_contents(resources):
     \"\"\"Return the variables that were packed, and what is done with them.\"\"\"
     rows = json.loads((resources / "variables.json").read_text(encoding="utf-8"))
-    return Contents(tuple(FmuVariable(**row) for row in rows), Behaviour)
+    return SlaveContents(tuple(FmuVariable(**row) for row in rows), Behaviour)
 
 """
 
@@ -52,7 +52,7 @@ def declared_companion(name: str, told: dict[str, Any]) -> Declaration:
 
     An output depends directly on the input that `of` names, if it does; losses are states.
     """
-    table, dependencies = Table({}), {"status": list[str]()}
+    table, dependencies = VariableTable({}), {"status": list[str]()}
     for group in told["group"]:
         for number in range(1, group.get("repeat", 1) + 1):
             for row in group["variables"]:
@@ -61,7 +61,7 @@ def declared_companion(name: str, told: dict[str, Any]) -> Declaration:
                     for key, value in row.items()
                 }
                 source, box = given.pop("of", None), (given.pop("low", None), given.pop("high", None))
-                table.add(**given, box=box)
+                table.add(**given, limits=box)
                 if given["causality"] == "output":
                     dependencies[given["name"]] = [] if source is None else [source]
     table.add_status()

@@ -23,7 +23,7 @@ from fe.runtime.reduced_arrays import ReducedArrays
 from fmu_asset import description
 from fmu_asset.errors import FmuBuildError, said
 from fmu_asset.instances.plan import Interface
-from fmu_asset.slaves.table import Roles
+from fmu_asset.slaves.table import StructureRoles
 from fmu_asset.slaves.variables import ENUMERATIONS, TRANSIENT, FmuVariable
 from reporting.choices import require_one_of
 
@@ -251,7 +251,7 @@ HOST = "It is compiled C and needs nothing but the C library; its sources are in
 def compiled_members(
     model: ReducedArrays,
     declared: description.Declaration,
-    roles: Roles,
+    roles: StructureRoles,
     *,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
@@ -264,7 +264,7 @@ def compiled_members(
         The reduced structure.
     declared : Declaration
         What it declares for co-simulation.
-    roles : Roles
+    roles : StructureRoles
         Which of its variables is what.
     fmi : {2, 3}
         Version of FMI: the same sources but for its functions. In 3 numbered variables, and inputs and
@@ -306,7 +306,7 @@ def compiled_members(
 
 
 def variable_sources(
-    table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[description.ArrayVariable] = ()
+    table: Sequence[FmuVariable], roles: StructureRoles, arrays: Sequence[description.ArrayVariable] = ()
 ) -> dict[str, bytes]:
     """Return the C sources that say what the variables are; placeholders stand for GUID and content tag.
 
@@ -314,7 +314,7 @@ def variable_sources(
     ----------
     table : sequence of FmuVariable
         The variables, in order of their value reference.
-    roles : Roles
+    roles : StructureRoles
         Which of them is what.
     arrays : sequence of ArrayVariable
         Which rows of the table pass together, in FMI 3.

@@ -11,13 +11,14 @@ from typing import Literal, Self, cast
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fmu_asset.door.binding import Binding
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.life import PackedState
-from fmu_asset.door.placement import Housing, ResetTrial, Start
-from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import IDENTITY
-from fmu_asset.door.values import Values
+from fmu_asset.client.binding import Binding
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.instance_host import InstanceHost
+from fmu_asset.client.reset_trial import InstanceStart, ResetTrial
+from fmu_asset.client.saved_state import PackedState
+from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.units import IDENTITY
+from fmu_asset.client.values import Values
 from fmu_asset.errors import (
     BindingError,
     CouplingError,
@@ -27,7 +28,7 @@ from fmu_asset.errors import (
     IterationError,
     said,
 )
-from fmu_asset.instances.plan import Instance, Settings
+from fmu_asset.instances.plan import InitialValues, Instance
 
 from .structure import Endpoint, SystemStructure
 from .system import Part, SystemDescription, parts_of, system_description, wiring_hash
@@ -92,7 +93,7 @@ def naming(component: str) -> Iterator[None]:
         raise type(error)(sentence, error.messages, time) from error
 
 
-class CoupledFmus(Housing):
+class CoupledFmus(InstanceHost):
     """Several FMUs as one instance, and where it lives: what `FmiAsset` asks of an instance and its housing.
 
     Parameters
@@ -149,12 +150,12 @@ class CoupledFmus(Housing):
 
     # ------------------------------------------------------------------ life
 
-    def start(self, start: Start, *, renewed: bool = False) -> Self:
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> Self:
         """Bring the components to their start."""
-        start.make(self)
+        start.initialise(self)
         return self
 
-    def contradicted(self, request: bytes, reply: FloatArray) -> None:
+    def replace_if_contradicted(self, request: bytes, reply: FloatArray) -> None:
         """Leave it to the components whether they began where they should."""
 
     def renew(self) -> Instance:
@@ -178,7 +179,7 @@ class CoupledFmus(Housing):
 
     # ------------------------------------------------------------------ what an asset asks
 
-    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
         """Initialise the components in their order; each takes the initial outputs of those before it.
 
         An input whose source comes later starts at the FMU's own start value.
@@ -408,7 +409,7 @@ class CoupledAsset(FmiAsset):
             exchange, plan, parts, assets, jacobi=jacobi, iterations=iterations, tolerance=tolerance
         )
         self._parts = parts
-        self._settle(exchange, housing, parameters or {})
+        self._set_up(exchange, housing, parameters or {})
 
     @property
     def schedule(self) -> Schedule:
@@ -420,6 +421,6 @@ class CoupledAsset(FmiAsset):
         """The last messages of the FMUs: status, and component with text."""
         return tuple(
             (status, f"{name}: {text}")
-            for name, asset in cast("CoupledFmus", self._housing).assets.items()
+            for name, asset in cast("CoupledFmus", self._host).assets.items()
             for status, text in asset.log
         )

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo
-from fmu_asset.door.binding import expand
-from fmu_asset.door.units import IDENTITY, Conversion
+from fmu_asset.client.bound_variables import expand
+from fmu_asset.client.units import IDENTITY, Conversion
 from fmu_asset.errors import CouplingError, said
 from fmu_asset.instances.plan import Interface
 

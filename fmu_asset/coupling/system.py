@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
-from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.units import IDENTITY
+from fmu_asset.client.binding import Binding, BindingHeader
+from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError, said
-from fmu_asset.instances.plan import Settings
+from fmu_asset.instances.plan import InitialValues
 
 from .structure import Component, Endpoint
 from .wiring import ConnectedVariable, Wiring
@@ -36,7 +37,7 @@ class SystemDescription(FmuDescription):
         """Return the definitions of units that hold for a variable."""
         return self.definitions[variable.name]
 
-    def of_components(self, settings: Settings) -> dict[str, dict[str, float]]:
+    def of_components(self, settings: InitialValues) -> dict[str, dict[str, float]]:
         """Return what is set in the system by component and variable, in the FMUs' units."""
         found: dict[str, dict[str, float]] = {}
         for _, reference, (value,) in settings:
@@ -231,7 +232,7 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
         return {key: variables[key].unit or "1" for group in groups for key in group}
 
     own = Binding(
-        binding=Header(
+        binding=BindingHeader(
             name=name,
             step_size=binding.step_size / component.substeps,
             decimation=component.substeps if linear else 1,
@@ -242,10 +243,14 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
             tolerance=binding.binding.tolerance,
         ),
         limits=binding.limits,
-        load={key: Input(variable=key, unit=unit) for key, unit in units(fed, given, constants).items()},
-        parameter={key: Parameter(variable=key, unit=unit) for key, unit in units(settings, tuned).items()},
+        load={
+            key: InputBinding(variable=key, unit=unit) for key, unit in units(fed, given, constants).items()
+        },
+        parameter={
+            key: ParameterBinding(variable=key, unit=unit) for key, unit in units(settings, tuned).items()
+        },
         observation={
-            key: Vector(variables=(key,), unit=unit)
+            key: VectorBinding(variables=(key,), unit=unit)
             for key, unit in units(end.variable for end in ends).items()
         },
     )

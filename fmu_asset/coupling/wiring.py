@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.units import IDENTITY, Conversion, between
+from fmu_asset.client.units import IDENTITY, Conversion, between
 from fmu_asset.errors import CouplingError, FmuError, said
 
 from .structure import Component, Connection, Endpoint, Setting, SystemStructure

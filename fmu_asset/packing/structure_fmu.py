@@ -36,7 +36,7 @@ from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError, said
 from fmu_asset.instances.plan import Interface
 from fmu_asset.packing import contents
-from fmu_asset.slaves.effects import effect_rows, switch_of
+from fmu_asset.slaves.effects import effect_rows, switch_name
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.choices import require_one_of
 from reporting.files import hash_members
@@ -136,7 +136,7 @@ def build_fmu(
     name, kept = stem_of(model), {}
     if patch is not None:
         effects = patch.for_gauges(len(model.gauges)).plain
-        values |= {switch_of(effect): float(options.get("activate", False)) for effect in effects}
+        values |= {switch_name(effect): float(options.get("activate", False)) for effect in effects}
         table += effect_rows(effects, len(table), values)
         kept = _patched_members(model, effects, options.get("arrays"))
     contents.check_start(table)
@@ -147,7 +147,7 @@ def build_fmu(
             "reduced_model.npz": model.to_bytes(),
             "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),
         }
-        imports = "from .slaves.behaviour import load_contents\n"
+        imports = "from .slaves.structure_contents import load_contents\n"
         template = kept | contents.python_members(
             declared, "Structure_", imports=imports, resources=resources
         )

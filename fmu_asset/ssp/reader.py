@@ -17,6 +17,7 @@ from typing import Any
 from lxml import etree
 
 from fmu_asset.archive.declared import UnitInfo
+from fmu_asset.client.units import IDENTITY, Conversion
 from fmu_asset.coupling.structure import (
     CONNECTOR_KINDS,
     Component,
@@ -26,7 +27,6 @@ from fmu_asset.coupling.structure import (
     Setting,
     SystemStructure,
 )
-from fmu_asset.door.units import IDENTITY, Conversion
 from fmu_asset.errors import SspError, said
 from reporting.files import atomic_write_bytes
 from reporting.units import BASE_UNITS
