@@ -60,6 +60,7 @@ from discrepancy.report.text import needs as needs
 from discrepancy.report.text import neighbours as neighbours
 from discrepancy.report.text import seen_of as seen_of
 from discrepancy.report.text import unit_text as unit_text
+from discrepancy.self_calibration import SelfCalibration as SelfCalibration
 from discrepancy.self_calibration import self_calibrate as self_calibrate
 from discrepancy.sources.examples import example_campaign as example_campaign
 from discrepancy.sources.examples import plan_of as plan_of
@@ -72,6 +73,7 @@ from discrepancy.verdict_folder import check_verdict_folder as check_verdict_fol
 from discrepancy.verdict_folder import write_verdict_folder as write_verdict_folder
 from discrepancy.verdict_so_far import SearchInProgress as SearchInProgress
 from discrepancy.verdict_so_far import write_so_far as write_so_far
+from discrepancy.workflow import Investigation as Investigation
 from discrepancy.workflow import checked as checked
 from discrepancy.workflow import investigate as investigate
 from fe.reduction.model_cache import reduced_model as reduced_model
