@@ -109,8 +109,22 @@ class SearchSettings:
 
     # ---------------------------------------------------------------- begun from another size
     restart_sizes: tuple[float, ...] = (
-        0.5, 0.56, 0.63, 0.71, 0.8, 0.87, 0.93, 1.0, 1.07, 1.15, 1.25, 1.4, 1.6, 1.8, 2.0,
-    )  # fmt: skip
+        0.5,
+        0.56,
+        0.63,
+        0.71,
+        0.8,
+        0.87,
+        0.93,
+        1.0,
+        1.07,
+        1.15,
+        1.25,
+        1.4,
+        1.6,
+        1.8,
+        2.0,
+    )
     """Sizes, over that which follows the missing force, from which the leading effect is fitted again where
     no fit leaves noise alone: friction that ends a motion has optima an eighth to a quarter of it apart."""
     restarts: int = 6

@@ -244,10 +244,10 @@ def import_files(
     }
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
-    found = parts.Understanding([*map(parts.read_sheet, files)], answers)
+    found = parts.LaboratoryImport([*map(parts.read_sheet, files)], answers)
     if model is not None:
         known = parts.choose_model(model).model.output_quantity
-        found = parts.Understanding(found.sheets, answers, known)
+        found = parts.LaboratoryImport(found.sheets, answers, known)
     _show_understood(found)
     asked = sys.stdin.isatty() and sys.stdout.isatty()
     if asked and (found.questions or found.assumptions):
@@ -267,7 +267,7 @@ def import_files(
     options.show("import", folder=folder, campaign=campaign, given=given, assumed=assumed)
 
 
-def _asked(found: "parts.Understanding") -> "parts.Understanding":
+def _asked(found: "parts.LaboratoryImport") -> "parts.LaboratoryImport":
     """Return what is understood with one answer more; one that does not fit is told, and changes nothing.
 
     What must be said comes first, then what has a default, which an empty line takes.
@@ -287,7 +287,7 @@ def _asked(found: "parts.Understanding") -> "parts.Understanding":
         return found
 
 
-def _show_understood(found: "parts.Understanding") -> None:
+def _show_understood(found: "parts.LaboratoryImport") -> None:
     rows = []
     for item in found.columns:
         cells = item.sheet.columns[item.sheet.heads.index(item.head)]
