@@ -22,7 +22,7 @@ from discrepancy.campaign.records import Campaign, IntArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.document import Origin, plain
 from discrepancy.errors import ModelError
-from discrepancy.judgement.separability import usable
+from discrepancy.judgement.separability import usable_effects
 from discrepancy.simulation import Hidden, Simulator
 from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
@@ -220,7 +220,7 @@ def self_calibrate(
     """
     campaign, _ = checked(campaign, model)
     simulator = Simulator(campaign, model)
-    testable = usable(effects, simulator.setting)
+    testable = usable_effects(effects, simulator.setting)
     drawing_seed, *case_seeds = np.random.SeedSequence(seed).spawn(count + 1)
     hidden, not_detectable = _hidden_effects(simulator, testable, count, np.random.default_rng(drawing_seed))
     cases: list[CalibrationCase] = []

@@ -10,11 +10,11 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
-from discrepancy.judgement.separability import DETECTED, as_predicted, began_before
+from discrepancy.judgement.separability import DETECTED, as_predicted, has_free_initial_state
 from discrepancy.system.interface import Model
 
 TRIES = 60
@@ -27,7 +27,7 @@ REFINEMENT = 2
 class Hidden:
     """An effect to hide: the term, its scaled parameters, its d^2."""
 
-    term: Term
+    term: EffectTerm
     normal: FloatArray
     distance: float
 
@@ -76,10 +76,10 @@ class Simulator:
         """
         places = effect.places(self.setting)
         for _ in range(TRIES):
-            term = Term(effect, places[int(generator.integers(len(places)))])
+            term = EffectTerm(effect, places[int(generator.integers(len(places)))])
             normal = generator.standard_normal(len(term.parameters))
             try:
-                distance = screen.change(term, normal).size
+                distance = screen.change(term, normal).squared_size
             except DiscrepancyError:  # more than the structure can carry
                 continue
             if distance >= DETECTED:
@@ -112,7 +112,7 @@ class Simulator:
             trial = data.trial
             fitted_local = self.nuisances.local[number]
             local = _drawn(fitted_local, data.unknowns.precision, generator)
-            if began_before(trial):  # the prior has no information: the state stays as fitted
+            if has_free_initial_state(trial):  # the prior has no information: the state stays as fitted
                 initial_state = slice(*data.unknowns.ends[:2])
                 local[initial_state] = fitted_local[initial_state]
             effect_acts = trial.kind in candidate.acts_on

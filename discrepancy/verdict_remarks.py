@@ -67,9 +67,9 @@ def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> t
         The search, with all its fits.
     """
     along_force: set[str] = set()  # fitted along the missing force
-    for fitted_force in search.forces:
+    for fitted_force in search.force_hypotheses:
         along_force.update(term.effect.identifier for term in fitted_force.candidate.terms)
-    fitted = search.fitted() | along_force
+    fitted = search.fitted_effects() | along_force
     rows = []
     for effect in effects:
         identifier = effect.identifier
@@ -77,7 +77,7 @@ def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> t
         if unavailable is not None:
             rows.append(NotFitted(identifier, unavailable))
         elif identifier not in fitted:
-            gain = search.promised.get(identifier, nan)
+            gain = search.screened_gains.get(identifier, nan)
             refusal = search.problem.refusals.get(identifier)
             if refusal is not None and not 0.0 < gain < SEARCH.worth_fitting:
                 reason = f"could not be fitted: {refusal}"

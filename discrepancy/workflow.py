@@ -19,22 +19,22 @@ from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError
-from discrepancy.fits.beginnings import refitted_from_beginnings
+from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
-from discrepancy.fits.gates import solver_share
+from discrepancy.fits.gates import time_step_error
 from discrepancy.fits.predictive import held_out_fit, residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import (
     NO_GAP,
     calibrated_parameters,
-    dated,
     look_alike_remark,
+    with_date,
     with_untested,
 )
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
-from discrepancy.judgement.naming import name
+from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
 from discrepancy.location.locate import Location, locate, outlier_remarks
@@ -43,9 +43,9 @@ from discrepancy.missing_force.shares import MissingForce, seen_force
 from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
 from discrepancy.model_choice import load_model
 from discrepancy.proof_record import Proof
-from discrepancy.search.starts import Tell
+from discrepancy.search.starts import OnProgress
 from discrepancy.search.strategy import Search
-from discrepancy.search.whole_search import OnSearch, nobody_looks
+from discrepancy.search.whole_search import OnSearch, ignore_search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
@@ -114,7 +114,7 @@ def investigate(
     seed: int = 0,
     thorough: bool = True,
     progress: Progress | None = None,
-    on_search: OnSearch = nobody_looks,
+    on_search: OnSearch = ignore_search,
 ) -> Investigation:
     """Find out what a model lacks.
 
@@ -150,7 +150,7 @@ def investigate(
     shown, seconds = reporter(progress), {}
 
     @contextmanager
-    def stage(description: str, key: str) -> Iterator[Tell]:
+    def stage(description: str, key: str) -> Iterator[OnProgress]:
         began = time.perf_counter()
         with shown.stage(description) as under_way:
             yield lambda what: under_way.advance(0, what)
@@ -168,19 +168,19 @@ def investigate(
         problem = without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = name(problem, catalogue, tell=tell, on_search=on_search)
+        verdict, search, fit = reach_verdict(problem, catalogue, on_progress=tell, on_search=on_search)
         verdict = with_untested(verdict, setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
-        share = solver_share(problem, fit)
+        share = time_step_error(problem, fit)
         if share > SEARCH.solver_share:
             remarks.append(
                 f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
                 f"{SEARCH.solver_share:g} that is wanted: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
-        before = residual_set(problem, search.none, sensitivities=thorough)
-        after = residual_set(problem, fit, sensitivities=False) if fit is not search.none else before
+        before = residual_set(problem, search.no_effect, sensitivities=thorough)
+        after = residual_set(problem, fit, sensitivities=False) if fit is not search.no_effect else before
     location, missing, proof = None, None, None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
@@ -194,7 +194,7 @@ def investigate(
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP and not verdict.unfitted:
         with stage("Seeing the missing force", "force"):
-            missing = seen_force(problem, search.force, search.forces, fit)
+            missing = seen_force(problem, search.force_search, search.force_hypotheses, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, effects=added_effects(fit), seed=seed)
@@ -204,13 +204,13 @@ def investigate(
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
         verdict,
-        sentence=dated(verdict, windows),
+        sentence=with_date(verdict, windows),
         remarks=tuple(remarks),
         next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search),
         windows=windows,
         parameters=calibrated_parameters(problem, fit),
-        force=None if missing is None else missing.told,
+        force=None if missing is None else missing.at_port,
     )
     return Investigation(
         campaign,
@@ -248,7 +248,7 @@ def _remarks(
     remarks += strained(problem, fit)
     remarks += without_port(problem.setting, catalogue)
     if verdict.kind not in NO_GAP:
-        remarks += exact_sensor_remarks(problem, search.none)
+        remarks += exact_sensor_remarks(problem, search.no_effect)
     look_alikes = look_alike_remark(verdict, search.effects)
     if look_alikes is not None:
         remarks.append(look_alikes)
@@ -316,7 +316,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     from_start = fit_to(problem, Candidate(), problem.start(Candidate()))
-    none = refitted_from_beginnings(problem, from_start)
+    none = refit_from_first_readings(problem, from_start)
     fits = [(problem, none)]
     if problem.campaign.held_out:
         fits.append(held_out_fit(problem, none))

@@ -180,3 +180,11 @@ class Event:
                 f"{subject} begins at {self.time:g} s and must end later, but `until` is "
                 f"{self.until:g} s"
             )
+
+    @property
+    def moments(self) -> dict[str, float]:
+        """Times of its begin and, if it is stated, of its end [s], by the names in expressions."""
+        moments = {self.name: self.time}
+        if self.until is not None:
+            moments[f"{self.name}_until"] = self.until
+        return moments

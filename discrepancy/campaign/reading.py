@@ -1,9 +1,9 @@
 """Reading a campaign from a folder with `campaign.toml` and tables."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
 
@@ -157,15 +157,13 @@ def _remarks_on_unused_columns(
     return remarks
 
 
-def placed_events(
-    events: Iterable[Event], trials: tuple[Trial, ...], source: str
-) -> Iterator[Event]:
-    """Yield events with the names of all trials in which they happened.
+def placed_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
+    """Return events with the names of all trials in which they happened.
 
     Parameters
     ----------
     events : iterable of Event
-        Events of a file; without a trial they happened in all records in time.
+        Events of a file, with one trial, several, or none, which means all records in time.
     trials : tuple of Trial
         Trials of the campaign.
     source : str
@@ -174,43 +172,26 @@ def placed_events(
     Raises
     ------
     CampaignFileError
-        If an event names a trial that is not there or is not a record in time, or two moments of
-        one name are in a trial.
+        If a trial of an event is not there or is not a record in time, two events have moments of
+        one name, or an event begins again before it is over.
     CampaignDataError
         If a moment lies outside the record of its trial.
     """
     trials_by_name = {trial.name: trial for trial in trials}
     recorded_in_time = tuple(trial.name for trial in trials if trial.is_dynamic)
-    earlier_moments: set[tuple[str, str]] = set()
+    placed = []
     for event in events:
         names = (event.trial,) if event.trial else event.trials or recorded_in_time
-        for name in names:
+        placed.append(replace(event, trial=None, trials=names))
+    for event in placed:
+        for name in event.trials:
             _check_trial_of_event(event, name, trials_by_name, source)
-            for moment in _moments(event):
-                if (moment.name, name) in earlier_moments:
-                    raise CampaignFileError(
-                        f"{source}: there is more than one moment {moment.name!r} in the trial "
-                        f"{name!r}: rename one, or name the trial once."
-                    )
-                _check_moment(event, moment, trials_by_name[name])
-                earlier_moments.add((moment.name, name))
-        yield replace(event, trial=None, trials=names)
-
-
-class _Moment(NamedTuple):
-    """A moment of an event: the key that states it, its name in expressions, and its time [s]."""
-
-    key: str
-    name: str
-    time: float
-
-
-def _moments(event: Event) -> list[_Moment]:
-    """Return the begin of an event and, if it is stated, its end."""
-    moments = [_Moment("time", event.name, event.time)]
-    if event.until is not None:
-        moments.append(_Moment("until", f"{event.name}_until", event.until))
-    return moments
+            _check_moments(event, trials_by_name[name])
+    for name in recorded_in_time:
+        events_of_trial = [event for event in placed if name in event.trials]
+        _check_names_of_moments(events_of_trial, name, source)
+        _check_occurrences(events_of_trial, name, source)
+    return placed
 
 
 def _check_trial_of_event(
@@ -230,15 +211,47 @@ def _check_trial_of_event(
         )
 
 
-def _check_moment(event: Event, moment: _Moment, trial: Trial) -> None:
-    """Refuse a moment outside the record of a trial."""
+def _check_moments(event: Event, trial: Trial) -> None:
+    """Refuse an event whose begin or end lies outside the record of a trial."""
     first, last = trial.time[[0, -1]].tolist()
-    if not first <= moment.time <= last:
-        raise CampaignDataError(
-            f"The event {event.name!r} has {moment.key} = {moment.time:g} s, but the record of the "
-            f"trial {trial.name!r} goes from {first:g} to {last:g} s: times count from the trial's "
-            "start."
-        )
+    for key, moment in (("time", event.time), ("until", event.until)):
+        if moment is not None and not first <= moment <= last:
+            raise CampaignDataError(
+                f"The event {event.name!r} has {key} = {moment:g} s, but the record of the trial "
+                f"{trial.name!r} goes from {first:g} to {last:g} s: times count from the trial's "
+                "start."
+            )
+
+
+def _check_names_of_moments(events: Sequence[Event], trial: str, source: str) -> None:
+    """Refuse different events of a trial that have moments of one name."""
+    owners: dict[str, str] = {}
+    for event in events:
+        for moment in event.moments:
+            if owners.setdefault(moment, event.name) != event.name:
+                raise CampaignFileError(
+                    f"{source}: two events have a moment {moment!r} in the trial {trial!r}: rename "
+                    "one."
+                )
+
+
+def _check_occurrences(events: Sequence[Event], trial: str, source: str) -> None:
+    """Refuse an event of a trial that begins again before it is over."""
+    in_order = sorted(events, key=lambda event: (event.name, event.time))
+    for event, following in pairwise(in_order):
+        if event.name != following.name:
+            continue
+        if event.until is None:
+            raise CampaignFileError(
+                f"{source}: the event {event.name!r} happens several times in the trial {trial!r}, "
+                f"and that at {event.time:g} s has no end: give it `until`."
+            )
+        if following.time < event.until:
+            raise CampaignFileError(
+                f"{source}: the event {event.name!r} begins again at {following.time:g} s in the "
+                f"trial {trial!r}, before it is over at {event.until:g} s: its intervals must not "
+                "overlap."
+            )
 
 
 def _read_table(folder: Path, name: str) -> TextTable:

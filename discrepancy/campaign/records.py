@@ -4,10 +4,11 @@
 in metres.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
+from itertools import product
 from typing import Annotated, Any
 
 import numpy as np
@@ -285,7 +286,8 @@ class Campaign:
         Channels and inputs ("force": of forced trials) that share a clock, by logger; empty: one
         has all.
     events : tuple of Event
-        In the order of the file; those of one name are in different trials.
+        Events in the order of the file; those of one name follow each other in a trial, or are in
+        different trials.
     accept : tuple of str
         Faults of the data that the user accepts, in all channels and trials: words of `ACCEPTABLE`.
     """
@@ -320,20 +322,43 @@ class Campaign:
                 faults.update(candidate.accept)
         return frozenset(faults)
 
-    def event_times(self, trial: str) -> dict[str, float]:
-        """Return the moments of the events in a trial [s], by the names that expressions use.
-
-        An event that ends has two of them: ``NAME`` and ``NAME_until``.
-        """
-        starts: dict[str, float] = {}
-        ends: dict[str, float] = {}
+    def moment_names(self, trial: str) -> frozenset[str]:
+        """Return the names by which expressions know the moments of events in a trial."""
+        names: set[str] = set()
         for event in self.events:
-            if trial not in event.trials:
-                continue
-            starts[event.name] = event.time
-            if event.until is not None:
-                ends[f"{event.name}_until"] = event.until
-        return starts | ends
+            if trial in event.trials:
+                names |= event.moments.keys()
+        return frozenset(names)
+
+    def event_moments(self, trial: str, names: Collection[str]) -> list[dict[str, float]]:
+        """Return the moments of a trial's events, once for each time that the events happened.
+
+        Parameters
+        ----------
+        trial : str
+            Name of the trial.
+        names : collection of str
+            Names of the moments that an expression uses, such as `pump_on` and `pump_on_until`.
+
+        Returns
+        -------
+        list of dict of str to float
+            Moments by name [s]. If several events are used, every occurrence of one is combined
+            with every occurrence of the other. Empty if a name has no moment in the trial.
+        """
+        occurrences: dict[str, list[dict[str, float]]] = {}
+        for event in self.events:
+            is_used = not event.moments.keys().isdisjoint(names)
+            if trial in event.trials and is_used:
+                occurrences.setdefault(event.name, []).append(event.moments)
+        combined = []
+        for combination in product(*occurrences.values()):
+            moments: dict[str, float] = {}
+            for moments_of_event in combination:
+                moments |= moments_of_event
+            if moments.keys() >= set(names):
+                combined.append(moments)
+        return combined
 
     def records(self, channel: str) -> Iterator[tuple[Trial, FloatArray, BoolArray]]:
         """Yield the trials of a channel, with its readings (N,) and which of them are used (N,)."""

@@ -210,10 +210,7 @@ class _PrimitiveTemplate:
         return "begin" in self.conditions or "end" in self.conditions
 
     def primitives(self, context: BuildContext) -> Iterator[Primitive]:
-        """Yield the primitive once, or once for each trial that has its events.
-
-        Not if `if` is zero.
-        """
+        """Yield the primitive for each time that its events happened; none if `if` is zero."""
         numbers = dict(context.values)
         for name in self.scales:
             numbers[name] = SCALES[name](context)
@@ -223,14 +220,15 @@ class _PrimitiveTemplate:
             yield self._primitive(numbers, context.target)
             return
         for trial in context.setting.campaign.trials:
-            moments = context.setting.campaign.event_times(trial.name)
-            if not trial.is_dynamic or not self.moments <= moments.keys():
+            if not trial.is_dynamic:
                 continue
-            numbers_of_trial = {**numbers, **moments}
-            begin = self._moment("begin", numbers_of_trial)
-            end = self._moment("end", numbers_of_trial)
-            primitive = self._primitive(numbers_of_trial, context.target)
-            yield replace(primitive, windows=(Window(trial.name, begin, end),))
+            occurrences = context.setting.campaign.event_moments(trial.name, self.moments)
+            for moments in occurrences:
+                numbers_then = {**numbers, **moments}
+                begin = self._moment("begin", numbers_then)
+                end = self._moment("end", numbers_then)
+                primitive = self._primitive(numbers_then, context.target)
+                yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
     def _moment(self, key: str, numbers: Mapping[str, float]) -> float | None:
         """Return when it begins or ends [s]; None if it states no such moment."""

@@ -37,12 +37,10 @@ def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None
 def _no_event(effect: EffectInSetting) -> str | None:
     """Return why no fitted trial has the events that it needs, or None."""
     campaign = effect.setting.campaign
-    moments_of_trials = [campaign.event_times(trial.name) for trial in campaign.fitted]
-    if not effect.moments:
+    names_of_trials = [campaign.moment_names(trial.name) for trial in campaign.fitted]
+    if not effect.moments or any(effect.moments <= names for names in names_of_trials):
         return None
-    if any(effect.moments <= moments.keys() for moments in moments_of_trials):
-        return None
-    known = sorted({name for moments in moments_of_trials for name in moments})
+    known = sorted({name for names in names_of_trials for name in names})
     return (
         f"No trial to fit has {' and '.join(sorted(effect.moments))} as [[event]]; those that are "
         f"fitted have {', '.join(known) or 'none'}."

@@ -18,7 +18,7 @@ from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit, normal_equations
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.separability import begun
+from discrepancy.judgement.separability import prior_point_with_initial_states
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -38,7 +38,7 @@ def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     channel_weights = np.ones(len(problem.channel_names))
-    at_prior = fit(problem, Candidate(), begun(problem), iterations=0)
+    at_prior = fit(problem, Candidate(), prior_point_with_initial_states(problem), iterations=0)
     information = normal_equations(problem, at_prior, Candidate(), channel_weights).matrix
     covariance = np.linalg.pinv(information, hermitian=True)
     count = problem.shared.count

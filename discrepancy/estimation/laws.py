@@ -1,4 +1,7 @@
-"""The force of a law along a motion, and its tangents: what a filter needs to have the law inside of it."""
+"""The force of a law along a motion, and its tangents.
+
+What a filter needs to have the law inside of it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,10 +60,11 @@ def along(
     by_position: FloatArray,
     by_speed: FloatArray,
 ) -> None:
-    """Fill force and tangents (F,) of a law along positions and speeds (F,) that follow one another.
+    """Fill force and tangents (F,) of a law along positions and speeds (F,).
 
-    A law of speed is averaged over a window of speeds, so that the step of dry friction has a tangent. The
-    tangent of a law with memory is that at its present state: how the past would have changed is left out.
+    A law of speed is averaged over a window of speeds, so that the step of dry friction has a
+    tangent. The tangent of a law with memory is that at its present state: how the past would have
+    changed is left out.
     """
     for j in range(len(positions)):
         x, v = positions[j], speeds[j]
@@ -89,7 +93,9 @@ def _compiled_along() -> Callable[..., None]:
 def force_along(
     law: PortForce, time: FloatArray, positions: FloatArray, speeds: FloatArray, smoothing: float
 ) -> ForceAlong:
-    """Return the force of a law along a motion of its port, and its tangents; zero outside of its windows.
+    """Return the force of a law along a motion of its port, and its tangents.
+
+    Zero outside of its windows.
 
     Parameters
     ----------

@@ -20,11 +20,11 @@ from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import MOST_OF_PRIOR
 from discrepancy.errors import CampaignDataError, ModelError
-from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
-from discrepancy.search.honest_evidence import left_by
+from discrepancy.search.wide_noise import residual_process_of
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
 from reporting.progress import Progress, reporter
@@ -87,7 +87,8 @@ def calibrate_parameters(
         posterior = parameter_posterior(problem, samples, seed)
     # noise that is coloured beyond what its record shows is not a discrepancy
     best = posterior.optima[0]
-    gate = absolute_gate(problem, replace(best, remainder=left_by(problem, best)))
+    best = replace(best, residual_process=residual_process_of(problem, best))
+    gate = check_absolute_fit(problem, best)
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
     return Calibration(
         asset=campaign.name if asset is None else asset,

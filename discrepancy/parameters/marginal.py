@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, fit, normal_equations, solved, upper_factor
+from discrepancy.fits.fitting import (
+    CandidateFit,
+    cholesky_factor,
+    fit,
+    normal_equations,
+    solve_factored,
+)
 from discrepancy.fits.problem import Problem
 from discrepancy.parameters.cut_gaussian import CutGaussian
 
@@ -196,7 +202,7 @@ class Marginal:
         indices = self.free[which]
         equations = normal_equations(problem, fitted, NOTHING, problem.precisions(fitted.sums))
         # the Newton step to the maximum without the range
-        step = solved(upper_factor(equations.matrix), equations.gradient)
+        step = solve_factored(cholesky_factor(equations.matrix), equations.gradient)
         return CutGaussian(
             mean=fitted.point.shared[indices] + step[indices],
             covariance=fitted.covariance[np.ix_(indices, indices)],

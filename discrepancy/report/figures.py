@@ -157,7 +157,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     row_titles = {"force": "missing force"}
     if missing.law:
         row_titles["left"] = "what is left"
-    name_of_force, displacement_unit, speed_unit = motion_of(missing.told)
+    name_of_force, displacement_unit, speed_unit = motion_of(missing.at_port)
     if displacement_unit:
         motions = {
             "position": f"displacement, {displacement_unit}",
@@ -177,7 +177,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
             _draw_over_motion(axes, missing, motion, series, law, drawn_samples)
             axes.set_xlabel(label)
         _draw_over_time(row[2], missing, series, has_law=bool(law))
-        row[0].set_ylabel(f"{name_of_force}, {missing.told.unit}")
+        row[0].set_ylabel(f"{name_of_force}, {missing.at_port.unit}")
         for axes in row:
             axes.axhline(0.0, color=style.REFERENCE, lw=0.6, zorder=0)
             axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
@@ -325,7 +325,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     investigation = content.investigation
     missing = investigation.missing
     if missing is not None:
-        sentence = force_sentence(missing.told)
+        sentence = force_sentence(missing.at_port)
         _add(figures, "missing_force", missing_force_figure(missing), sentence=sentence)
     if investigation.before is not None:
         _add_residual_figures(figures, content, investigation.before)

@@ -80,7 +80,7 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
     problem, search, fit = investigation.problem, investigation.search, investigation.fit
     if problem is None or search is None or fit is None:
         return []
-    fits = [search.none]
+    fits = [search.no_effect]
     if fit.candidate.terms:
         fits.append(fit)
     estimates_of_fits = [calibrated_parameters(problem, fitted) for fitted in fits]

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity
-from discrepancy.judgement.closed_share import over_noise_of
+from discrepancy.judgement.closed_share import with_noise_of
 from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import WingDesign
@@ -41,7 +41,7 @@ def models(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
     if after is None:
         return [was]
     was = was._replace(label="model as it was", title="a  model as it was")
-    with_effect = over_noise_of(after, before)
+    with_effect = with_noise_of(after, before)
     return [was, DrawnModel(with_effect, style.PAST, "-", "D", AFTER, f"b  {AFTER}")]
 
 
@@ -68,9 +68,13 @@ def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
 
 
 def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
-    """Return the logarithmic colour scale of sizes of residuals; 1 (noise) is dark."""
+    """Return the logarithmic colour scale of sizes of residuals; 1 (noise) is dark.
+
+    Sizes below the scale have the colour of its end: a window whose readings are all missing has
+    the size 0.
+    """
     largest = float(np.nanmax(np.asarray(values, dtype=float), initial=1.0))
-    return LogNorm(0.7, max(largest, 3.0))
+    return LogNorm(0.7, max(largest, 3.0), clip=True)
 
 
 def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:

@@ -1,7 +1,9 @@
-"""Kill a run at random moments, resume it, and compare it with an uninterrupted one, byte for byte.
+"""A killed and resumed run has the files of an uninterrupted one; docs/benchmarks.md shows it.
 
-`python -m benchmarks.kill_and_resume --trials 20` flies the shipped mission; further options after `--` go to
-`python -m twin_master`, for example `-- --strain-library FOLDER`. Exit code 1 if any trial differs.
+`python -m benchmarks.studies.kill_and_resume --trials 20` flies the shipped mission, kills it at
+random moments, resumes it, and compares every file byte for byte. Further options after `--` go to
+`python -m twin_master`, for example `-- --strain-library FOLDER`. The exit code is 1 if any trial
+differs.
 """
 
 import argparse
@@ -13,7 +15,14 @@ import tempfile
 import time
 from pathlib import Path
 
-COMPARED = ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "journal.jsonl")
+COMPARED = (
+    "run.nc",
+    "config.json",
+    "summary.json",
+    "calibration.json",
+    "wing.vtu",
+    "journal.jsonl",
+)
 
 
 def command(*arguments: str) -> list[str]:
@@ -44,12 +53,16 @@ def wait_for_moment(
         time.sleep(0.001)
 
 
-def trial(scenario: str, options: list[str], folder: Path, moment: random.Random, seconds: float) -> int:
+def trial(
+    scenario: str, options: list[str], folder: Path, moment: random.Random, seconds: float
+) -> int:
     """Fly with one to three kills; return how many kills met the run alive."""
     kills = 0
     for _ in range(moment.randint(1, 3)):
         begun = (folder / "config.json").exists()
-        arguments = ["--resume", str(folder)] if begun else [scenario, "--out", str(folder), *options]
+        arguments = (
+            ["--resume", str(folder)] if begun else [scenario, "--out", str(folder), *options]
+        )
         with subprocess.Popen(command(*arguments)) as process:
             wait_for_moment(process, folder, moment, seconds)
             if process.poll() is None:
@@ -67,25 +80,33 @@ def main() -> int:
     parser.add_argument("--scenario", default="level_turns")
     parser.add_argument("--seed", type=int, default=0, help="seed of the moments")
     parser.add_argument("options", nargs="*", help="options of the run, after --")
-    given = parser.parse_args()
-    moment = random.Random(given.seed)
+    arguments = parser.parse_args()
+    moment = random.Random(arguments.seed)
     different = 0
     with tempfile.TemporaryDirectory() as place:
         whole = Path(place) / "whole"
         begin = time.monotonic()
-        subprocess.run(command(given.scenario, "--out", str(whole), *given.options), check=True)
+        subprocess.run(
+            command(arguments.scenario, "--out", str(whole), *arguments.options), check=True
+        )
         seconds = time.monotonic() - begin
         expected = contents(whole)
-        for number in range(given.trials):
+        for number in range(arguments.trials):
             folder = Path(place) / f"trial-{number}"
-            kills = trial(given.scenario, given.options, folder, moment, seconds)
+            kills = trial(arguments.scenario, arguments.options, folder, moment, seconds)
             found = contents(folder)
-            unequal = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
+            unequal = sorted(
+                name for name in {*expected, *found} if expected.get(name) != found.get(name)
+            )
             leftovers = [str(path.relative_to(folder)) for path in folder.rglob(".*")]
             different += bool(unequal or leftovers)
-            outcome = f"differs in {', '.join(unequal + leftovers)}" if unequal or leftovers else "identical"
+            outcome = (
+                f"differs in {', '.join(unequal + leftovers)}"
+                if unequal or leftovers
+                else "identical"
+            )
             print(f"trial {number + 1}: {kills} kills, {len(found)} files, {outcome}", flush=True)
-    print(f"{given.trials - different} of {given.trials} trials bit-identical")
+    print(f"{arguments.trials - different} of {arguments.trials} trials bit-identical")
     return 1 if different else 0
 
 

@@ -1,10 +1,12 @@
-"""What fleets learn: coverage of intervals, what groups gain from each other, what flying with it is worth.
+"""What a fleet learns about its probabilities to worsen; docs/fleets.md shows the figures.
 
-    python -m benchmarks.study_fleets coverage --fleets 200
-    python -m benchmarks.study_fleets groups --fleets 40
-    python -m benchmarks.study_fleets half --twins 1000
+    python -m benchmarks.studies.fleets coverage --fleets 200
+    python -m benchmarks.studies.fleets groups --fleets 40
+    python -m benchmarks.studies.fleets half --twins 1000
 
-Everything flies the reduced model in this process; each part prints its table.
+`coverage`: how often 95 % intervals hold the truth. `groups`: what groups gain from each other.
+`half`: what flying with the learnt probabilities is worth. Every mission flies the reduced model
+in this process; each part prints its table.
 """
 
 import argparse
@@ -33,7 +35,8 @@ AHEAD = 10
 def knowledge(true: dict[str, float], believed: dict[str, float], *, fixed: bool) -> Knowledge:
     """Return what twins of `growing_damage` know, whose damage grows with other probabilities.
 
-    With `fixed`, noise and parameter are those of the true assets, so that rates are all that is unknown.
+    With `fixed`, noise and parameter are those of the true assets, so that rates are all that is
+    unknown.
     """
     table = load_scenario("growing_damage").scenario.to_dict()
     table["transition"]["probability"] = believed
@@ -59,14 +62,15 @@ def learnt(known: Knowledge, flown: Flights) -> Grid:
     worsening = Worsening.of(known.scenario)
     likelihood, _ = scaled_likelihood(known.sensor_model, flown.row, flown.control_index)
 
-    def of(points: Float) -> Float:
-        return transition_evidence(worsening, points, likelihood, flown.control_index).sum(axis=0)
+    def log_likelihood(points: Float) -> Float:
+        evidence = transition_evidence(worsening, points, likelihood, flown.control_index)
+        return np.asarray(evidence.sum(axis=0))
 
-    return refined(of, len(worsening.names))
+    return refined(log_likelihood, len(worsening.names))
 
 
 def coverage(fleets: int, twins: int) -> None:
-    """Print how often the 95 % interval of each probability holds the true one, drawn anew for each fleet."""
+    """Print how often the 95 % interval of each probability holds the true one of a fleet."""
     generator = np.random.default_rng(1)
     inside = np.zeros((fleets, 2), dtype=bool)
     for fleet in range(fleets):
@@ -78,7 +82,10 @@ def coverage(fleets: int, twins: int) -> None:
             inside[fleet, number] = low <= rate <= high
     for name, column in zip(ASSUMED, inside.T, strict=True):
         share = column.mean()
-        print(f"| {name}, {fleets} fleets of {twins} | {100 * share:.1f} ± {error(share, fleets):.1f} % |")
+        print(
+            f"| {name}, {fleets} fleets of {twins} "
+            f"| {100 * share:.1f} ± {error(share, fleets):.1f} % |"
+        )
     share = inside.mean()
     print(f"| both | {100 * share:.1f} ± {error(share, inside.size):.1f} % |")
 
@@ -89,7 +96,7 @@ def error(share: float, count: int) -> float:
 
 
 def groups(fleets: int, twins: int) -> None:
-    """Print the rms error of the rates of 12 groups of 5 twins, alone and shared, and their coverage."""
+    """Print rms error and coverage of the rates of 12 groups of 5 twins, alone and shared."""
     generator = np.random.default_rng(2)
     errors: dict[str, list[float]] = {"alone": [], "shared": []}
     inside: dict[str, list[bool]] = {"alone": [], "shared": []}
@@ -100,19 +107,21 @@ def groups(fleets: int, twins: int) -> None:
             known = knowledge(dict(zip(ASSUMED, true.tolist(), strict=True)), ASSUMED, fixed=True)
             grids.append(learnt(known, flights(known, 10_000 * fleet + 100 * group, twins)))
             rates.append(true)
-        for what, found in (("alone", [grid.marginals for grid in grids]), ("shared", shared(grids)[1])):
+        marginals_of = {"alone": [grid.marginals for grid in grids], "shared": shared(grids)[1]}
+        for what, found in marginals_of.items():
             for true, marginals in zip(rates, found, strict=True):
                 for rate, marginal in zip(true.tolist(), marginals, strict=True):
                     low, high = marginal.interval()
                     errors[what].append(marginal.mean - rate)
                     inside[what].append(low <= rate <= high)
-    for what, found in errors.items():
-        rms, share = float(np.sqrt(np.mean(np.square(found)))), float(np.mean(inside[what]))
-        print(f"| {what} | {rms:.4f} | {100 * share:.1f} ± {error(share, len(found)):.1f} % |")
+    for what, deviations in errors.items():
+        rms = float(np.sqrt(np.mean(np.square(deviations))))
+        share = float(np.mean(inside[what]))
+        print(f"| {what} | {rms:.4f} | {100 * share:.1f} ± {error(share, len(deviations)):.1f} % |")
 
 
 def half(twins: int) -> None:
-    """Print early fallbacks and the score of predictions where the true rates are half of the assumed."""
+    """Print early fallbacks and prediction scores where true rates are half of the assumed."""
     true = {name: 0.5 * rate for name, rate in ASSUMED.items()}
     teacher = knowledge(true, ASSUMED, fixed=False)
     flown = flights(teacher, 0, twins)
@@ -126,17 +135,22 @@ def half(twins: int) -> None:
         members = [Member(row, "", 0, {}) for row in range(twins)]
         early = float(outcomes_of(known, later, members)["early"].mean())
         scores[what] = score(known, later)
-        print(f"| {what} | {100 * early:.1f} ± {error(early, twins):.1f} % | {scores[what].mean():.3f} |")
+        print(
+            f"| {what} | {100 * early:.1f} ± {error(early, twins):.1f} % "
+            f"| {scores[what].mean():.3f} |"
+        )
     for what in ("assumed", "known"):
         gain = scores["learnt"] - scores[what]
         print(
-            f"learnt against {what}: {gain.mean():.3f} ± {gain.std(ddof=1) / np.sqrt(twins):.3f} a prediction"
+            f"learnt against {what}: {gain.mean():.3f} "
+            f"± {gain.std(ddof=1) / np.sqrt(twins):.3f} a prediction"
         )
 
 
 def score(known: Knowledge, flown: Flights) -> Float:
     """Return the mean log probability of the true state ten turns ahead, of each twin: (B,)."""
-    model, steps = known.model, flown.state.shape[1]
+    model = known.model
+    steps = flown.state.shape[1]
     result = np.zeros(len(flown.state))
     begins = range(5, steps - AHEAD, 10)
     for twin in range(len(result)):
@@ -153,12 +167,14 @@ def main() -> None:
     parser.add_argument("part", choices=("coverage", "groups", "half"))
     parser.add_argument("--fleets", type=int, default=200)
     parser.add_argument("--twins", type=int)
-    given = parser.parse_args()
-    if given.part == "half":
-        half(given.twins or 1000)
+    arguments = parser.parse_args()
+    if arguments.part == "half":
+        half(arguments.twins or 1000)
         return
     parts: dict[str, Any] = {"coverage": coverage, "groups": groups}
-    parts[given.part](given.fleets, given.twins or (50 if given.part == "coverage" else 5))
+    parts[arguments.part](
+        arguments.fleets, arguments.twins or (50 if arguments.part == "coverage" else 5)
+    )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Eight gauges of 24, chosen by what they tell, by pivoted QR, and at random: flown, and compared.
+"""Eight gauges of 24, chosen by information, by pivoted QR and at random; docs/planning.md.
 
-`python -m benchmarks.study_sensors --missions 300` flies `growing_damage` with eight of the wing's gauges,
-and the others lost from the first turn on. Printed for each choice: rms error of z1 and z2 [points], and the
-share of missions that leave the sharp turn before the damage asks for it. Pivoted QR of what all gauges show
-in all states is how PySensors places sensors.
+`python -m benchmarks.studies.sensors --missions 300` flies `growing_damage` with eight of the
+wing's gauges; the others are lost from the first turn on. The table shows for each choice the rms
+error of z1 and z2 in points, and the share of missions that leave the sharp turn before the damage
+asks for it. Pivoted QR of the readings in all states is how PySensors places sensors.
 """
 
 import argparse
@@ -28,7 +28,7 @@ RANDOM = 5
 
 
 def flown(chosen: tuple[int, ...], missions: int) -> tuple[NDArray[np.float64], float]:
-    """Return the rms errors of the factors [points] and the share of early fallbacks with some gauges."""
+    """Return rms errors of the factors [points] and the share of early fallbacks."""
     scenario = load_scenario("growing_damage").scenario
     lost = tuple(number + 1 for number in range(scenario.observation.count) if number not in chosen)
     faults = (SensorFault(kind="dropout", sensors=lost, first_step=0),) if lost else ()
@@ -41,7 +41,9 @@ def flown(chosen: tuple[int, ...], missions: int) -> tuple[NDArray[np.float64], 
     mean = knowledge.model.states.mean(flights.filtered)
     members = [Member(seed, str(seed), seed, {}) for seed in range(missions)]
     early = outcomes_of(knowledge, flights, members)["early"]
-    return 100.0 * np.sqrt(((mean - flights.state) ** 2).mean(axis=(0, 1))), float(np.mean(early > 0))
+    return 100.0 * np.sqrt(((mean - flights.state) ** 2).mean(axis=(0, 1))), float(
+        np.mean(early > 0)
+    )
 
 
 def choices(knowledge: Knowledge) -> dict[str, tuple[int, ...]]:
@@ -64,11 +66,16 @@ def main() -> None:
     parser.add_argument("--missions", type=int, default=300)
     missions = parser.parse_args().missions
     scenario = load_scenario("growing_damage").scenario
-    knowledge = prepare_knowledge(scenario, ReducedModelSource(scenario, reduced_model(load_design())), 3)
+    knowledge = prepare_knowledge(
+        scenario, ReducedModelSource(scenario, reduced_model(load_design())), 3
+    )
     for name, chosen in {"all": tuple(range(24)), **choices(knowledge)}.items():
         error, early = flown(chosen, missions)
         gauges = ", ".join(str(number + 1) for number in chosen)
-        print(f"{name}: rms {error[0]:.2f} and {error[1]:.2f} points, early {100 * early:.1f} %; {gauges}")
+        print(
+            f"{name}: rms {error[0]:.2f} and {error[1]:.2f} points, "
+            f"early {100 * early:.1f} %; {gauges}"
+        )
 
 
 if __name__ == "__main__":

@@ -8,7 +8,14 @@ UNITS = {"1": {}, "s": {"s": 1}, "K": {"K": 1}}
 VARIABLES = {
     "swing": ("parameter", "K", 0.0, 60.0, 20.0, "amplitude of the swing"),
     "period": ("parameter", "s", 1.0, 1e6, 40.0, "period of the swing"),
-    "temperature_difference": ("output", "K", None, None, None, "temperature less the reference temperature"),
+    "temperature_difference": (
+        "output",
+        "K",
+        None,
+        None,
+        None,
+        "temperature less the reference temperature",
+    ),
 }
 
 
@@ -22,7 +29,9 @@ class SwingingAir(Fmi2Slave):  # type: ignore[misc]
 
     def __init__(self, **keywords: object) -> None:
         super().__init__(**keywords)
-        self.swing, self.period, self.temperature_difference = 20.0, 40.0, 0.0
+        self.swing = 20.0
+        self.period = 40.0
+        self.temperature_difference = 0.0
         for name in ("swing", "period"):
             self.register_variable(
                 Real(name, causality=Fmi2Causality.parameter, variability=Fmi2Variability.tunable)

@@ -1,12 +1,12 @@
-"""How reliably the twin steers: the paper's mission under many seeds.
+"""How reliably the twin steers the paper's mission; docs/benchmarks.md shows the figures.
 
-`python -m benchmarks.study_level_turns --missions 300` flies the reduced model of the shipped wing;
-`--strain-library FOLDER` flies the authors' library instead, `--fmu` the FMU in a worker process. The true
-Young's modulus factor is the mean of the calibration; `--draw-factor` gives every mission a wing of its own,
-with one of the twin's draws.
-`--combinations --strain-library FOLDER` flies all four combinations of asset and twin's model, without and
-with a model error in the assumed noise, and says what the misfit of the models does; `--markdown` prints the
-tables for a page. Exit code 1 if a target is missed.
+`python -m benchmarks.studies.level_turns --missions 300` flies the reduced model of the shipped
+wing under many seeds; `--strain-library FOLDER` flies the authors' library instead, `--fmu` the
+FMU in a worker process. The true Young's modulus factor is the mean of the calibration;
+`--draw-factor` gives every mission a wing of its own, with one of the twin's draws.
+`--combinations --strain-library FOLDER` flies all four combinations of asset and twin's model,
+without and with a model error in the assumed noise, and prints what the misfit of the models does;
+`--markdown` prints the tables for a page. The exit code is 1 if a target is missed.
 """
 
 import argparse
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.misfit import Misfit, find_misfit
-from benchmarks.seeds import fly_seeds, outcomes
+from benchmarks.studies.misfit import Misfit, find_misfit
+from benchmarks.studies.seeds import fly_seeds, outcomes
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import RichProgress
 from twin_master.assets.asset_source import AssetSource, PairedSource
@@ -53,7 +53,7 @@ SHOWN = 6
 
 
 class ScaledSource(PairedSource):
-    """A twin whose model was scaled, gauge by gauge, to what the undamaged asset shows without noise."""
+    """A twin whose predictions are scaled by gauge to the readings of the undamaged asset."""
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the scaled predictions (E, S, U, G)."""
@@ -94,9 +94,19 @@ class Row:
 
 
 HEADINGS = (
-    "asset", "twin's model", "model error", "first seed", "2g within 2 turns", "early 2g", "rms z1, points",
-    "rms z2, points", "bias z1, points", "bias z2, points", "log evidence per turn", "true state in 90 % set",
-)  # fmt: skip
+    "asset",
+    "twin's model",
+    "model error",
+    "first seed",
+    "2g within 2 turns",
+    "early 2g",
+    "rms z1, points",
+    "rms z2, points",
+    "bias z1, points",
+    "bias z2, points",
+    "log evidence per turn",
+    "true state in 90 % set",
+)
 
 
 def percent(figure: Estimated) -> str:
@@ -111,7 +121,9 @@ def signed(figure: Estimated) -> str:
     return f"{100 * figure.value:+.1f} ± {100 * figure.error:.1f}"
 
 
-def show(title: str, headings: Sequence[str], rows: Sequence[Sequence[tuple[str, bool]]], page: bool) -> None:
+def show(
+    title: str, headings: Sequence[str], rows: Sequence[Sequence[tuple[str, bool]]], page: bool
+) -> None:
     """Print a table for the terminal or for a page; figures that miss their target stand out."""
     if page:
         print(f"| {' | '.join(headings)} |\n|{' --- |' * len(headings)}")
@@ -130,7 +142,9 @@ def with_model_error(scenario: Scenario, error: float | tuple[float, ...]) -> Sc
     return scenario.model_copy(update={"observation": observation})
 
 
-def misfit_rows(misfit: Misfit, control: int, states: Sequence[int]) -> list[list[tuple[str, bool]]]:
+def misfit_rows(
+    misfit: Misfit, control: int, states: Sequence[int]
+) -> list[list[tuple[str, bool]]]:
     """Return the gauges that move the estimate most, the sum of the others, and the sum of all."""
     bias = 100.0 * misfit.bias_per_sensor[states, control]  # (states, F, G), points
     relative = 100.0 * misfit.relative[states, control]
@@ -146,12 +160,16 @@ def misfit_rows(misfit: Misfit, control: int, states: Sequence[int]) -> list[lis
     def rms(gauges: NDArray[np.int64]) -> float:
         return float(np.sqrt(np.mean(misfit.per_sensor[gauges] ** 2)))
 
-    rows = [row(f"{gauge + 1}", misfit.per_sensor[gauge], np.array([gauge])) for gauge in order[:SHOWN]]
+    rows = [
+        row(f"{gauge + 1}", misfit.per_sensor[gauge], np.array([gauge])) for gauge in order[:SHOWN]
+    ]
     rest = order[SHOWN:]
     return [*rows, row("the others", rms(rest), rest), row("all", rms(order), order)]
 
 
-def show_misfit(scenario: Scenario, wing: AssetSource, library: AssetSource, seed: int, page: bool) -> Misfit:
+def show_misfit(
+    scenario: Scenario, wing: AssetSource, library: AssetSource, seed: int, page: bool
+) -> Misfit:
     """Print what the library's strains do to a twin that believes the wing's model."""
     knowledge = prepare_knowledge(scenario, wing, seed)
     misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, library.open())
@@ -161,7 +179,10 @@ def show_misfit(scenario: Scenario, wing: AssetSource, library: AssetSource, see
         headings.append(f"misfit at z1 {100 * z1:.0f} %, z2 {100 * z2:.0f} %")
         headings += ["bias of z1, points", "bias of z2, points"]
     control = scenario.control_names.index(scenario.mission.first_control)
-    title = "our model less the library, and what each gauge adds to the estimate of one turn (linearised)"
+    title = (
+        "our model less the library, "
+        "and what each gauge adds to the estimate of one turn (linearised)"
+    )
     states = [knowledge.model.states.index(place) for place in places]
     show(title, headings, misfit_rows(misfit, control, states), page)
     return misfit
@@ -197,7 +218,9 @@ def combinations(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[
                 kind = ScaledSource if name == SCALED else PairedSource
                 source = known[asset] if asset == twin else kind(known[asset], known[twin])
                 study = fly_seeds(chosen, source, flown, calibration_seed=first)
-                rows.append(Row(asset, twin, LABELS.get(name) or f"{float(name):g} %", first, study))
+                rows.append(
+                    Row(asset, twin, LABELS.get(name) or f"{float(name):g} %", first, study)
+                )
     return rows
 
 
@@ -209,9 +232,12 @@ def model_error(name: str, misfit: Misfit) -> float | tuple[float, ...]:
 
 
 def fly_own_wings(
-    scenario: Scenario, source: AssetSource, wing: Callable[[ParameterDraws, int], AssetSource], seeds: range
+    scenario: Scenario,
+    source: AssetSource,
+    wing: Callable[[ParameterDraws, int], AssetSource],
+    seeds: range,
 ) -> Outcomes:
-    """Fly every mission with a wing of its own: its factor is one of the twin's draws, as likely as any."""
+    """Fly each mission with a wing whose factor is drawn uniformly from the twin's draws."""
     knowledge = prepare_knowledge(scenario, source, seeds[0])
     chosen = np.random.default_rng(seeds[0]).integers(len(knowledge.draws.values), size=len(seeds))
     assets = [wing(knowledge.draws, index).open() for index in chosen.tolist()]
@@ -227,7 +253,9 @@ def library_wings(scenario: Scenario, folder: Path) -> Callable[[ParameterDraws,
     )
 
 
-def model_wings(scenario: Scenario, wing: ReducedModel) -> Callable[[ParameterDraws, int], AssetSource]:
+def model_wings(
+    scenario: Scenario, wing: ReducedModel
+) -> Callable[[ParameterDraws, int], AssetSource]:
     """Return what gives our wing with one of the twin's draws of the factor."""
     return lambda draws, index: ReducedModelSource(
         scenario.model_copy(
@@ -277,54 +305,72 @@ def single(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[int]) 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--missions", type=int, default=300)
-    parser.add_argument("--first-seed", type=int, nargs="+", help="by default the seed of the scenario")
+    parser.add_argument(
+        "--first-seed", type=int, nargs="+", help="by default the seed of the scenario"
+    )
     parser.add_argument("--strain-library", type=Path)
     parser.add_argument("--fmu", action="store_true", help="fly the FMU in a worker process")
     parser.add_argument(
-        "--draw-factor", action="store_true",
-        help="each mission flies a wing with one of the twin's draws of Young's modulus factor, not the mean",
-    )  # fmt: skip
-    parser.add_argument("--decide-on", choices=("filtered", "predicted"), help="instead of the scenario's")
-    parser.add_argument(
-        "--combinations", action="store_true", help="fly our wing and the library, each by both twins"
+        "--draw-factor",
+        action="store_true",
+        help="each mission flies a wing with one of the twin's draws of Young's modulus factor, "
+        "not the mean",
     )
     parser.add_argument(
-        "--model-error", nargs="+", metavar="PERCENT",
-        help=f"model errors in the assumed noise, in percent of the prediction, `{MISFIT}` for the misfit of "
-        f"each gauge, or `{SCALED}` for none and predictions that are right for the undamaged wing; with "
-        f"--combinations by default 0, 3, {MISFIT} and {SCALED}",
-    )  # fmt: skip
+        "--decide-on", choices=("filtered", "predicted"), help="instead of the scenario's"
+    )
     parser.add_argument(
-        "--at-levels", action="store_true", help="a twin that takes damage to be at levels, as the paper's"
+        "--combinations",
+        action="store_true",
+        help="fly our wing and the library, each by both twins",
+    )
+    parser.add_argument(
+        "--model-error",
+        nargs="+",
+        metavar="PERCENT",
+        help="model errors in the assumed noise, in percent of the prediction, "
+        f"`{MISFIT}` for the misfit of each gauge, or `{SCALED}` for none and predictions "
+        "that are right for the undamaged wing; with "
+        f"--combinations by default 0, 3, {MISFIT} and {SCALED}",
+    )
+    parser.add_argument(
+        "--at-levels",
+        action="store_true",
+        help="a twin that takes damage to be at levels, as the paper's",
     )
     parser.add_argument("--markdown", action="store_true", help="print the tables for a page")
-    given = parser.parse_args()
-    if given.combinations and (given.strain_library is None or given.fmu):
+    arguments = parser.parse_args()
+    if arguments.combinations and (arguments.strain_library is None or arguments.fmu):
         parser.error("--combinations needs --strain-library, and flies no FMU")
-    if given.draw_factor and (given.combinations or given.fmu):
+    if arguments.draw_factor and (arguments.combinations or arguments.fmu):
         parser.error("--draw-factor goes neither with --combinations nor with --fmu")
-    given.model_error = given.model_error or (["0", "3", MISFIT, SCALED] if given.combinations else ["0"])
-    for name in given.model_error:
-        if not (name in (MISFIT, SCALED) and given.combinations) and not name.replace(".", "", 1).isdigit():
+    arguments.model_error = arguments.model_error or (
+        ["0", "3", MISFIT, SCALED] if arguments.combinations else ["0"]
+    )
+    for name in arguments.model_error:
+        if (
+            not (name in (MISFIT, SCALED) and arguments.combinations)
+            and not name.replace(".", "", 1).isdigit()
+        ):
             parser.error(
                 f"--model-error must be a number of percent, or, with --combinations, {MISFIT} or "
                 f"{SCALED}, and {name} came"
             )
-    library = None if given.combinations else given.strain_library
-    name = "paper_level_turns" if given.at_levels else "level_turns"
+    library = None if arguments.combinations else arguments.strain_library
+    name = "paper_level_turns" if arguments.at_levels else "level_turns"
     scenario = resolve_scenario(load_scenario(name), Overrides(strain_library=library))
-    if given.decide_on:
-        planner = scenario.planner.model_copy(update={"decide_on": given.decide_on})
+    if arguments.decide_on:
+        planner = scenario.planner.model_copy(update={"decide_on": arguments.decide_on})
         scenario = scenario.model_copy(update={"planner": planner})
-    seeds = given.first_seed or [scenario.mission.seed]
+    seeds = arguments.first_seed or [scenario.mission.seed]
     begin = time.perf_counter()
-    if given.combinations:
-        rows = combinations(given, scenario, seeds)
+    if arguments.combinations:
+        rows = combinations(arguments, scenario, seeds)
     else:
         rows = [
             row
-            for name in given.model_error
-            for row in single(given, with_model_error(scenario, float(name) / 100.0), seeds)
+            for name in arguments.model_error
+            for row in single(arguments, with_model_error(scenario, float(name) / 100.0), seeds)
         ]
     seconds = time.perf_counter() - begin
     table = [
@@ -334,10 +380,16 @@ def main() -> int:
         ]
         for row in rows
     ]
-    show(f"{given.missions} missions each, ± one standard error", HEADINGS, table, given.markdown)
+    show(
+        f"{arguments.missions} missions each, ± one standard error",
+        HEADINGS,
+        table,
+        arguments.markdown,
+    )
     print(
-        "targets of 300 missions: 2g within 2 turns >= 98 %, early 2g <= 8 %, rms <= 4.5 and 13 points; "
-        f"{given.missions} missions each, {seconds:.1f} s"
+        "targets of 300 missions: 2g within 2 turns >= 98 %, early 2g <= 8 %, "
+        "rms <= 4.5 and 13 points; "
+        f"{arguments.missions} missions each, {seconds:.1f} s"
     )
     return 0 if all(fine for row in rows for _, fine in row.cells()) else 1
 

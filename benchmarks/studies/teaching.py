@@ -1,10 +1,11 @@
-"""What teaching in flight is worth: missions with an effect that only the wing has, watched with `--teach`.
+"""What teaching in flight is worth; docs/watch.md shows the figures.
 
-`python -m benchmarks.study_teaching` flies level_turns with each of several hidden effects in the FMU, and
-watches the recorded strains three times: by a twin that is never taught, by one that is (`uav-twin watch
---teach`: alarm, search, trial, adoption), and by one that knew the effect. Printed: alarm, verdicts,
-adoption, the rms error of z1 and z2 in points behind the adoption (without one, from turn 30 on), and there
-the decisions for 3g with z1 truly at or above the limit; the wing with nothing hidden is the healthy twin's.
+`python -m benchmarks.studies.teaching` flies level_turns with each of several hidden effects in
+the FMU, and watches the recorded strains three times: by a twin that is never taught, by one that
+is (`uav-twin watch --teach`: alarm, search, trial, adoption), and by one that knew the effect from
+the start. Printed are the alarm, the verdicts, the adoption, the rms error of z1 and z2 in points
+after the adoption (without one, from turn 30 on), and the decisions for 3g there with z1 truly at
+or above the limit. The wing with nothing hidden shows what the healthy twin does.
 """
 
 import argparse
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import uav_twin
-from benchmarks.study_hidden_effects import beyond_the_limit, fly_mission, patch_text
+from benchmarks.studies.hidden_effects import beyond_the_limit, fly_mission, patch_text
 from fe.runtime.patch import (
     LocalStiffnessLoss,
     PointMass,
@@ -52,7 +53,7 @@ WITHOUT = 30
 
 @dataclass(frozen=True)
 class Watched:
-    """A watch of a mission; `mean` (T, 2) is what it believed of z1, z2, `sharp` (T,) whether it chose 3g."""
+    """A watch of a mission: mean (T, 2) of z1 and z2, and whether it chose 3g (T,)."""
 
     mean: NDArray[np.float64]
     sharp: NDArray[np.bool_]
@@ -61,13 +62,16 @@ class Watched:
 
 def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
     """Write the scenario of a watch whose twin knows some effects."""
-    kept, skipping = [], False
+    kept = []
+    skipping = False
     for line in scenario_files()["level_turns"].read_text(encoding="utf-8").splitlines():
         if line.startswith("["):
             skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
         if not skipping:
             kept.append(
-                line.replace("standard_deviation_microstrain = 125", "standard_deviation_microstrain = 150")
+                line.replace(
+                    "standard_deviation_microstrain = 125", "standard_deviation_microstrain = 150"
+                )
             )
     text = "\n".join([*kept, "", "[notice]", ""])
     if known:
@@ -88,14 +92,17 @@ def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
             watch.run(feed, lambda _decision: None)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]
     turns = [record for record in lines if "filtered" in record]
-    filtered, chosen = (np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control"))
+    filtered, chosen = (
+        np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control")
+    )
     mean = filtered @ watch.models[0].knowledge.model.states.coordinates
     return Watched(mean, chosen == watch.scenario.control_names.index("3g"), lines)
 
 
 def said(records: list[dict[str, Any]]) -> tuple[str, int]:
     """Return what happened, and the first turn behind the adoption."""
-    words, first = [], WITHOUT
+    words = []
+    first = WITHOUT
     for record in records:
         if "verdict" in record:
             verdict = record["verdict"]
@@ -115,7 +122,7 @@ def study(name: str, seed: int, work: Path) -> None:
     place = work / f"{[*HIDDEN].index(name)}_{seed}"
     place.mkdir()
     fly_mission(place / "run", seed, hidden, scenario="level_turns", turns=TURNS)
-    truth = uav_twin.open_run(place / "run")["truth"]["state"].values
+    truth = np.asarray(uav_twin.open_run(place / "run")["truth/state"].values)
     plain = scenario_of(place, ())
     taught = watched(place / "run", place / "taught", plain, teach=True)
     known = hidden
@@ -131,11 +138,18 @@ def study(name: str, seed: int, work: Path) -> None:
     }
     # What is decided behind a turn is in force in the next one.
     decided = {
-        way: "{} of {}".format(*beyond_the_limit(np.append(False, watch.sharp[first:-1]), truth[first:, 0]))
+        way: "{} of {}".format(
+            *beyond_the_limit(np.append(False, watch.sharp[first:-1]), truth[first:, 0])
+        )
         for way, watch in ways.items()
     }
-    figures = ", ".join(f"{way} {z1:.2f} {z2:.2f}, {decided[way]}" for way, (z1, z2) in errors.items())
-    print(f"{name}, seed {seed}: {what}. From turn {first} on rms of z1, z2, 3g: {figures}", flush=True)
+    figures = ", ".join(
+        f"{way} {z1:.2f} {z2:.2f}, {decided[way]}" for way, (z1, z2) in errors.items()
+    )
+    print(
+        f"{name}, seed {seed}: {what}. From turn {first} on rms of z1, z2, 3g: {figures}",
+        flush=True,
+    )
 
 
 def main() -> int:
@@ -143,10 +157,14 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="numbers of hidden effects from 0, with commas")
-    given = parser.parse_args()
-    names = [*HIDDEN] if given.only is None else [[*HIDDEN][int(number)] for number in given.only.split(",")]
+    arguments = parser.parse_args()
+    names = (
+        [*HIDDEN]
+        if arguments.only is None
+        else [[*HIDDEN][int(number)] for number in arguments.only.split(",")]
+    )
     with tempfile.TemporaryDirectory() as work:
-        for seed in range(given.first_seed, given.first_seed + given.seeds):
+        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
             for name in names:
                 study(name, seed, Path(work))
     return 0

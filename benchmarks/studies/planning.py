@@ -1,8 +1,9 @@
-"""Plans on the belief against an independent solver, on public problems and on the inspected wing.
+"""Bounds of plans on the belief beside an independent solver; docs/planning.md shows the wing's.
 
-`python -m benchmarks.study_planning` prints both bounds of the return from the prior, and the seconds taken.
-With `--storm` the bounds of Storm's belief exploration (Bork, Katoen and Quatmann 2022; `stormpy` of PyPI)
-stand beside them: it unfolds the beliefs for a lower bound, and puts them on a grid for an upper one.
+`python -m benchmarks.studies.planning` plans public problems and the inspected wing, and prints
+both bounds of the return from the prior, and the seconds. `--storm` adds the bounds of Storm's
+belief exploration (Bork, Katoen and Quatmann 2022; `stormpy` of PyPI), which unfolds the beliefs
+for a lower bound, and puts them on a grid for an upper one.
 """
 
 import argparse
@@ -25,13 +26,17 @@ def tiger(discount: float = 0.95) -> DecisionProblem:
     heard = np.array([[0.85, 0.15], [0.15, 0.85]])
     nothing = np.full((2, 2), 0.5)
     return DecisionProblem(
-        TransitionModel((moves,)), reward, np.full(3, discount), (heard, nothing, nothing),
-        np.array([0.5, 0.5]), moves_first=True,
-    )  # fmt: skip
+        TransitionModel((moves,)),
+        reward,
+        np.full(3, discount),
+        (heard, nothing, nothing),
+        np.array([0.5, 0.5]),
+        moves_first=True,
+    )
 
 
 def maze(discount: float = 0.95) -> DecisionProblem:
-    """Parr and Russell 1995: four by three cells, moves that slip, walls seen to the left and right."""
+    """Return the maze of 4 x 3 cells of Parr and Russell 1995; moves slip, side walls are seen."""
     cells = [(x, y) for y in range(3) for x in range(4) if (x, y) != (1, 1)]
     good, bad = cells.index((3, 2)), cells.index((3, 1))
     ways = [(0, 1), (1, 0), (0, -1), (-1, 0)]
@@ -55,14 +60,19 @@ def maze(discount: float = 0.95) -> DecisionProblem:
     reward = np.full((11, 4), -0.04)
     reward[good], reward[bad] = 1.0, -1.0
     return DecisionProblem(
-        TransitionModel((moves,)), reward, np.full(4, discount), (seen,) * 4, start, moves_first=True
+        TransitionModel((moves,)),
+        reward,
+        np.full(4, discount),
+        (seen,) * 4,
+        start,
+        moves_first=True,
     )
 
 
 def rock_sample(
     size: int, rocks: tuple[tuple[int, int], ...], start: tuple[int, int], discount: float = 0.95
 ) -> DecisionProblem:
-    """Smith and Simmons 2004: a rover looks at rocks from afar, takes good ones, and leaves to the right."""
+    """Return RockSample of Smith and Simmons 2004: a rover inspects rocks and takes good ones."""
     qualities = 2 ** len(rocks)
     end, controls = size * size * qualities, 5 + len(rocks)
     moves = np.zeros((controls, end + 1, end + 1))
@@ -86,7 +96,12 @@ def rock_sample(
     prior[(start[1] * size + start[0]) * qualities :][:qualities] = 1.0 / qualities
     likelihood = (np.ones((1, end + 1)),) * 5 + tuple(np.array([row, 1.0 - row]) for row in told)
     return DecisionProblem(
-        TransitionModel((moves,)), reward, np.full(controls, discount), likelihood, prior, moves_first=True
+        TransitionModel((moves,)),
+        reward,
+        np.full(controls, discount),
+        likelihood,
+        prior,
+        moves_first=True,
     )
 
 
@@ -95,15 +110,14 @@ def wing() -> DecisionProblem:
     from fe.reduction.model_cache import reduced_model
     from fe.wing.design import load_design
     from twin_master.assets.reduced_model import ReducedModelSource
-    from twin_master.mission.planning import decision_problem
     from twin_master.mission.preparation import prepare_knowledge
     from twin_master.scenario.reading import load_scenario
 
     scenario = load_scenario("inspected_wing").scenario
     planner = scenario.planner.model_copy(update={"policy": "mode"})
     source = ReducedModelSource(scenario, reduced_model(load_design()))
-    known = prepare_knowledge(scenario.model_copy(update={"planner": planner}), source, scenario.mission.seed)
-    return decision_problem(scenario, known.model, known.sensor_model, known.rewards)
+    by_mode = scenario.model_copy(update={"planner": planner})
+    return prepare_knowledge(by_mode, source, scenario.mission.seed).problem
 
 
 PROBLEMS: dict[str, Callable[[], DecisionProblem]] = {
@@ -117,14 +131,20 @@ PROBLEMS: dict[str, Callable[[], DecisionProblem]] = {
 def write_drn(problem: DecisionProblem, path: Path) -> float:
     """Write a problem as Storm reads it, and return what its values are too large by.
 
-    A state is one with what was observed last, the discount a way to a sink; rewards are moved up to zero.
+    A state is one with what was observed last, the discount a way to a sink; rewards are moved up
+    to zero.
     """
-    table, discount = problem.transition.matrix, float(problem.discount[0])
+    table = problem.transition.matrix
+    discount = float(problem.discount[0])
     controls = len(table)
     most = max(len(rows) for rows in problem.likelihood)
     lift = max(0.0, -float(problem.reward.min()))
-    place = {(int(state), most): 2 + number for number, state in enumerate(np.flatnonzero(problem.prior))}
-    share = " ".join(f"\n\t\t{to} : {float(problem.prior[state])!r}" for (state, _), to in place.items())
+    place = {
+        (int(state), most): 2 + number for number, state in enumerate(np.flatnonzero(problem.prior))
+    }
+    share = " ".join(
+        f"\n\t\t{to} : {float(problem.prior[state])!r}" for (state, _), to in place.items()
+    )
     text = [f"state 0 {{{most + 1}}} init\n\taction a [0]{share}"]
     text += [f"state 1 {{{most + 2}}} sink\n\taction a [0]\n\t\t1 : 1"]
     waiting = list(place)
@@ -141,12 +161,16 @@ def write_drn(problem: DecisionProblem, path: Path) -> float:
                 if key not in place:
                     place[key] = 2 + len(waiting)
                     waiting.append(key)
-                reached[place[key]] = float(discount * table[control, state, key[0]] * shown[k, column])
+                reached[place[key]] = float(
+                    discount * table[control, state, key[0]] * shown[k, column]
+                )
             lines.append(f"\taction u{control} [{float(problem.reward[state, control] + lift)!r}]")
             lines += [f"\t\t{number} : {share!r}" for number, share in sorted(reached.items())]
         text.append("\n".join(lines))
     head = f"@type: POMDP\n@parameters\n\n@reward_models\nr\n@nr_states\n{len(text)}\n"
-    path.write_text(f"{head}@nr_choices\n{2 + controls * len(waiting)}\n@model\n" + "\n".join(text) + "\n")
+    path.write_text(
+        f"{head}@nr_choices\n{2 + controls * len(waiting)}\n@model\n" + "\n".join(text) + "\n"
+    )
     return lift / (1.0 - discount)
 
 
@@ -173,7 +197,7 @@ def main() -> None:
     parser.add_argument("--storm", action="store_true", help="with Storm's bounds; needs stormpy")
     parser.add_argument("--size", type=int, default=100_000, help="beliefs that Storm unfolds")
     parser.add_argument("--resolution", type=int, default=8, help="of Storm's grid")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     for name, made in PROBLEMS.items():
         problem = made()
         begun = time.process_time()
@@ -181,8 +205,10 @@ def main() -> None:
         taken = time.process_time() - begun
         gap = (plan.upper - plan.lower) / abs(plan.upper)
         line = f"{name}: {plan.lower:.4f} to {plan.upper:.4f}, gap {100 * gap:.2f} %, {taken:.1f} s"
-        if given.storm:
-            line += ", Storm {:.4f} to {:.4f}".format(*by_storm(problem, given.size, given.resolution))
+        if arguments.storm:
+            line += ", Storm {:.4f} to {:.4f}".format(
+                *by_storm(problem, arguments.size, arguments.resolution)
+            )
         print(line, flush=True)
 
 

@@ -21,7 +21,11 @@ def outcomes(knowledge: Knowledge, flights: Flights) -> Outcomes:
 
 
 def fly_seeds(
-    scenario: Scenario, source: AssetSource, seeds: Sequence[int], *, calibration_seed: int | None = None
+    scenario: Scenario,
+    source: AssetSource,
+    seeds: Sequence[int],
+    *,
+    calibration_seed: int | None = None,
 ) -> Outcomes:
     """Fly a mission under many seeds in this process, without a store, whatever its source is.
 
@@ -36,7 +40,8 @@ def fly_seeds(
     """
     seed = seeds[0] if calibration_seed is None else calibration_seed
     knowledge = prepare_knowledge(scenario, source, seed)
-    truths, asset = [knowledge.truth(seed) for seed in seeds], source.open()
+    truths = [knowledge.truth(seed) for seed in seeds]
+    asset = source.open()
     start = asset.save_state()
 
     def again(_twin: int, _sound: bool) -> Asset:
@@ -44,7 +49,11 @@ def fly_seeds(
         return asset
 
     try:
-        if isinstance(asset, StatelessAsset) and scenario.learning is None and scenario.notice is None:
+        if (
+            isinstance(asset, StatelessAsset)
+            and scenario.learning is None
+            and scenario.notice is None
+        ):
             return outcomes(knowledge, fly_side_by_side(knowledge, truths, [asset] * len(truths)))
         return outcomes(knowledge, fly_one_by_one(knowledge, truths, again))
     finally:

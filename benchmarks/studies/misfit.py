@@ -1,7 +1,4 @@
-"""By how much the model that the twin believes differs from the asset that flies.
-
-A `Misfit` says what the difference does to an estimate.
-"""
+"""Misfit between the model of a twin and the asset that flies, for the study `level_turns`."""
 
 from dataclasses import dataclass
 
@@ -27,8 +24,9 @@ class Misfit:
     observation : (S, U, G)
         What the asset shows without noise, SI.
     gain : (S, U, F, G)
-        How much an error of one in a sensor moves the weighted least-squares estimate of each factor of the
-        state, linearised about each state, with the spread of the parameter draws as correlated noise.
+        How much an error of one in a sensor moves the weighted least-squares estimate of each
+        factor of the state, linearised about each state, with the spread of the parameter draws as
+        correlated noise.
     """
 
     difference: Float
@@ -51,7 +49,7 @@ class Misfit:
 
     @property
     def per_sensor(self) -> Float:
-        """Root mean square of the relative difference of each sensor over states and controls: (G,)."""
+        """Rms relative difference of each sensor over states and controls: (G,)."""
         return np.asarray(np.sqrt(np.nanmean(self.relative**2, axis=(0, 1))))
 
     @property
@@ -78,7 +76,7 @@ class Misfit:
 def find_misfit(
     scenario: Scenario, model: GraphicalModel, sensor_model: GaussianSensorModel, asset: Asset
 ) -> Misfit:
-    """Ask an asset for every state and control from where it stands, and compare; NaN where it refuses.
+    """Compare predictions with the asset for every state and control; NaN where the asset refuses.
 
     Parameters
     ----------

@@ -75,11 +75,17 @@ def scenario_in_air(text: str, folder: Path, name: str, patch: str) -> str:
         replace=True,
     )
     asset = [
-        "[asset]", 'kind = "coupled"', 'binding = "wing_in_air.toml"',
+        "[asset]",
+        'kind = "coupled"',
+        'binding = "wing_in_air.toml"',
         "parameters = { young_modulus_factor = 1.0073 }",
-        "[[asset.component]]", 'name = "air"', 'fmu = "air.fmu"',
-        "[[asset.component]]", 'name = "wing"', f'fmu = "{name}.fmu"',
-    ]  # fmt: skip
+        "[[asset.component]]",
+        'name = "air"',
+        'fmu = "air.fmu"',
+        "[[asset.component]]",
+        'name = "wing"',
+        f'fmu = "{name}.fmu"',
+    ]
     for source, target in _CONNECTIONS:
         asset += ["[[asset.connection]]", f'source = "{source}"', f'target = "{target}"']
     begin, end = text.index("[asset]"), text.index("[belief]")

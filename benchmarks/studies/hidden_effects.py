@@ -1,13 +1,14 @@
-"""Missions with an effect that the twin does not know: found from the run, added to its model, flown again.
+"""Missions with an effect unknown to the twin; docs/discrepancy_missions.md shows the figures.
 
-`python -m benchmarks.study_hidden_effects --seeds 5` flies the scenario growing_damage with each of several
-hidden effects in the FMU of the wing. The run folder alone is then read as a campaign and investigated. What
-is named, or the most probable member of a group, goes into the twin's model, and the mission is flown again
-with the same seed. A drift cannot stand in a table of predicted strains; there the readings are corrected
-before the twin sees them, as with the temperature, which the run records. Printed: the verdict of each
-mission; rms error of the health estimate in points, the share of turns whose 90 % set of states holds the
-truth, and the turns at 3g with z1 truly at or above the limit, before and after; the table compares the
-missions that were flown again.
+`python -m benchmarks.studies.hidden_effects --seeds 5` flies the scenario growing_damage with each
+of several hidden effects in the FMU of the wing. The run folder alone is then read as a campaign
+and investigated. The named effect, or the most probable member of a group, goes into the twin's
+model, and the mission is flown again with the same seed. A drift cannot stand in a table of
+predicted strains; there the readings are corrected before the twin sees them, with the temperature
+that the run recorded. Printed are the verdict of each mission and, before and after: the rms error
+of the health estimate in points, the share of turns whose 90 % set of states holds the truth, and
+the turns at 3g with z1 truly at or above the limit. The table compares the missions that were
+flown again.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.wing_in_air import depends_on_temperature, scenario_in_air
+from benchmarks.studies.wing_in_air import depends_on_temperature, scenario_in_air
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.sources.from_run import run_campaign, run_model
@@ -91,23 +92,36 @@ class Hidden:
 HIDDEN = (
     Hidden("", "", (), "nothing"),
     Hidden(
-        "gauge_zero_drift", "g17", (SensorDrift("strain[17]", -8e-4, float(TURNS)),),
+        "gauge_zero_drift",
+        "g17",
+        (SensorDrift("strain[17]", -8e-4, float(TURNS)),),
         "gauge 17 drifts to -800 microstrain",
     ),
-    Hidden("gauge_gain", "g17", (SensorGain("strain[17]", -0.12),), "gauge 17 shows 12 % too little"),
+    Hidden(
+        "gauge_gain", "g17", (SensorGain("strain[17]", -0.12),), "gauge 17 shows 12 % too little"
+    ),
     Hidden("washout", "", (Washout(0.08, 1.0),), "washout of 8 % per g at the tip"),
     Hidden(
-        "local_stiffness_loss", "", (LocalStiffnessLoss(0.15, 0.45, 0.4),),
+        "local_stiffness_loss",
+        "",
+        (LocalStiffnessLoss(0.15, 0.45, 0.4),),
         "skin from 0.45 to 0.85 m has lost 15 %",
     ),
     Hidden(
-        "thermal_strain", "*", (ThermalStrain("*", 15e-6),),
+        "thermal_strain",
+        "*",
+        (ThermalStrain("*", 15e-6),),
         "all gauges show 15 microstrain/K, swing of 20 K",
     ),
-    Hidden("inertia_relief", "", (InertiaRelief(0.25),), "structure's weight relieves the lift by 25 % more"),
+    Hidden(
+        "inertia_relief",
+        "",
+        (InertiaRelief(0.25),),
+        "structure's weight relieves the lift by 25 % more",
+    ),
     Hidden("point_mass", "", (PointMass(0.2, 2.0),), "0.2 kg at 2 m"),
     Hidden("point_mass", "", (PointMass(0.5, 2.0),), "0.5 kg at 2 m"),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -121,7 +135,8 @@ class Flown:
     coverage : float
         Share of turns whose 90 % set of states holds the truth.
     decided : (2,) ndarray
-        Turns flown at 3g with z1 truly at or above the limit, behind the first of them, and turns beyond it.
+        Turns flown at 3g with z1 truly at or above the limit, behind the first of them, and turns
+        beyond it.
     """
 
     rms: NDArray[np.float64]
@@ -178,7 +193,9 @@ def fly_mission(
     lines = {}
     for name, primitives in (("asset", hidden), ("belief", known)):
         if primitives and not depends_on_temperature(hidden):
-            file = atomic_write_text(folder.with_name(f"{folder.name}_{name}.json"), patch_text(primitives))
+            file = atomic_write_text(
+                folder.with_name(f"{folder.name}_{name}.json"), patch_text(primitives)
+            )
             lines[name] = f'patch = "{file.name}"\n'
     text = scenario_files()[scenario].read_text(encoding="utf-8")
     text = text.replace("steps = 50", f"steps = {turns}", 1)
@@ -194,9 +211,11 @@ def fly_mission(
     source.check()
     portable = resolved.portable()
     config = {
-        "kind": "uav-twin run", "format": 1, "scenario": portable.to_dict(),
+        "kind": "uav-twin run",
+        "format": 1,
+        "scenario": portable.to_dict(),
         "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
-    }  # fmt: skip
+    }
     with create_run_folder(folder, config, source.files()):
         pass
     source.prepare(folder, SilentProgress())
@@ -214,16 +233,20 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Fl
         asset.close()
     result = MissionResult(scenario, knowledge, flight, truth, units)
     attributes = {
-        "title": scenario.mission.title, "scenario": scenario.mission.name, "seed": seed,
+        "title": scenario.mission.title,
+        "scenario": scenario.mission.name,
+        "seed": seed,
         "parameter": knowledge.draws.name,
-    }  # fmt: skip
+    }
     write_run(folder, groups_of(result), attributes)
     state = flight.state
     error = flight.filtered @ knowledge.model.states.coordinates - state
     held = in_credible_set(knowledge.model, flight.filtered, state, 0.9)
     sharp = flight.control_index == scenario.control_names.index("3g")
     return Flown(
-        np.sqrt(np.mean(error**2, axis=0)), float(np.mean(held)), beyond_the_limit(sharp, state[:, 0])
+        np.sqrt(np.mean(error**2, axis=0)),
+        float(np.mean(held)),
+        beyond_the_limit(sharp, state[:, 0]),
     )
 
 
@@ -237,7 +260,7 @@ def beyond_the_limit(sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> NDArr
 
 
 def outputs_of(patch: ModelPatch) -> tuple[Primitive, ...]:
-    """Return primitives whose channels g1, g2, ... are the outputs strain[1], strain[2], ... of the FMU."""
+    """Return primitives whose channels g1, g2, ... are renamed to FMU outputs strain[1], ..."""
     found = []
     for item in patch:
         channel = getattr(item, "channel", "")
@@ -248,7 +271,7 @@ def outputs_of(patch: ModelPatch) -> tuple[Primitive, ...]:
 
 
 def undone(item: Primitive) -> Primitive | None:
-    """Return what takes an effect that changes with time off the readings; None for other effects."""
+    """Return a correction of readings for an effect that drifts with time; None for others."""
     if isinstance(item, SensorDrift):
         return replace(item, amplitude=-item.amplitude)
     if isinstance(item, ThermalStrain):
@@ -258,11 +281,13 @@ def undone(item: Primitive) -> Primitive | None:
 
 def investigated(folder: Path, seed: int, effects: Sequence[Effect] | None = None) -> Verdict:
     """Return the verdict on the run in a folder, by the whole catalogue or some of its effects."""
-    return investigate(run_campaign(folder), run_model(folder)[0], effects, seed=seed, thorough=False).verdict
+    return investigate(
+        run_campaign(folder), run_model(folder)[0], effects, seed=seed, thorough=False
+    ).verdict
 
 
 def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
-    """Return the effects that the twin is given: those named, or of a group the most probable member."""
+    """Return the effects for the twin: those named, or the most probable member of a group."""
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
         return verdict.effects
     if verdict.kind is VerdictKind.GROUP and verdict.hypotheses:
@@ -281,7 +306,9 @@ def study(
     """Fly with a hidden effect, find it, and fly again with what was found if that is asked for."""
     began = perf_counter()
     place = work / f"{HIDDEN.index(hidden)}_{seed}"
-    before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives, turns=turns)
+    before = fly_mission(
+        place.with_name(place.name + "_before"), seed, hidden.primitives, turns=turns
+    )
     verdict = investigated(place.with_name(place.name + "_before"), seed, effects)
     after = None
     chosen = believed(verdict)
@@ -290,21 +317,28 @@ def study(
         corrections = tuple(item for item in map(undone, found) if item is not None)
         known = tuple(item for item in found if undone(item) is None)
         after = fly_mission(
-            place.with_name(place.name + "_after"), seed, (*hidden.primitives, *corrections), known,
+            place.with_name(place.name + "_after"),
+            seed,
+            (*hidden.primitives, *corrections),
+            known,
             turns=turns,
-        )  # fmt: skip
+        )
     return Case(hidden, seed, verdict, before, after, perf_counter() - began)
 
 
 def outcome(hidden: Hidden, verdict: Verdict) -> str:
-    """Return "named", "in the group", "wrong" (another one was named), or the kind of an open verdict."""
+    """Return "named", "in the group", "wrong" if another is named, or the kind of the verdict."""
     if not hidden.identifier:
         return "none" if verdict.kind is VerdictKind.NOTHING_MISSING else verdict.kind.value
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
         names = [(effect.identifier, effect.place) for effect in verdict.effects]
         return "named" if names == [(hidden.identifier, hidden.place)] else f"wrong: {names}"
     if verdict.kind is VerdictKind.GROUP:
-        return "in the group" if hidden.identifier in verdict.group else f"wrong group: {verdict.group}"
+        return (
+            "in the group"
+            if hidden.identifier in verdict.group
+            else f"wrong group: {verdict.group}"
+        )
     return verdict.kind.value
 
 
@@ -315,20 +349,32 @@ def main() -> int:
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
     parser.add_argument("--turns", type=int, default=TURNS)
     parser.add_argument("--once", action="store_true", help="do not fly again with what was found")
-    parser.add_argument("--catalogue", help="identifiers of effects that are looked for, with commas")
-    given = parser.parse_args()
-    effects = [effect_by_identifier(item, library()) for item in (given.catalogue or "").split(",") if item]
+    parser.add_argument(
+        "--catalogue", help="identifiers of effects that are looked for, with commas"
+    )
+    arguments = parser.parse_args()
+    effects = [
+        effect_by_identifier(item, library())
+        for item in (arguments.catalogue or "").split(",")
+        if item
+    ]
     console = Console(width=150)
     heads = ("rms z1, z2 {}", "90 % sets", "3g beyond the limit")
     table = Table(
         "hidden", "verdicts", *(head.format(when) for when in ("before", "after") for head in heads)
     )
-    chosen = [item for item in HIDDEN if given.only is None or item.identifier in given.only.split(",")]
+    chosen = [
+        item
+        for item in HIDDEN
+        if arguments.only is None or item.identifier in arguments.only.split(",")
+    ]
     with tempfile.TemporaryDirectory() as folder:
         for hidden in chosen:
             cases = []
-            for seed in range(given.first_seed, given.first_seed + given.seeds):
-                case = study(hidden, seed, Path(folder), given.turns, effects or None, not given.once)
+            for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
+                case = study(
+                    hidden, seed, Path(folder), arguments.turns, effects or None, not arguments.once
+                )
                 cases.append(case)
                 after = (
                     ""
@@ -336,8 +382,9 @@ def main() -> int:
                     else f"{100 * case.after.rms} {case.after.coverage:.2f} {case.after.decided}"
                 )
                 console.print(
-                    f"{hidden.text}, seed {seed}: {case.verdict.kind.value}: {case.verdict.sentence} "
-                    f"rms {100 * case.before.rms} {case.before.coverage:.2f} {case.before.decided}; "
+                    f"{hidden.text}, seed {seed}: {case.verdict.kind.value}: "
+                    f"{case.verdict.sentence} rms {100 * case.before.rms} "
+                    f"{case.before.coverage:.2f} {case.before.decided}; "
                     f"after {after} ({case.seconds:.1f} s)"
                 )
             table.add_row(*_row(hidden, cases))
@@ -348,7 +395,10 @@ def main() -> int:
 def _row(hidden: Hidden, cases: Sequence[Case]) -> tuple[str, ...]:
     counts = Counter(outcome(hidden, case.verdict) for case in cases)
     again = [case for case in cases if case.after is not None]
-    before, after = [case.before for case in again or cases], [case.after for case in again if case.after]
+    before, after = (
+        [case.before for case in again or cases],
+        [case.after for case in again if case.after],
+    )
     verdicts = ", ".join(f"{name} {count}" for name, count in counts.most_common())
     return (hidden.text, verdicts, *_shown(before), *_shown(after))
 

@@ -1,12 +1,13 @@
-"""Whether beliefs hold a truth that lies between the levels of their states.
+"""How well beliefs hold a truth between the levels of their states; docs/scenarios.md shows it.
 
-`python -m benchmarks.study_levels --missions 300` flies the wing, the bracket and the stiffened panel with
-damage that grows between levels, at the mean rate of the twin: a little in every turn ("creeps"), or in the
-turns in which the twin's damage grows, by anything up to two levels ("jumps"). The noise is what the twin
-assumes. A twin whose states stand for intervals (`observation.between_levels`) stands beside one whose truth
-is at the levels: how often 90 % sets hold the level nearest to the truth, how many states they have, the
-error, and in how many of the first `--watched` missions notices raise an alarm though nothing is wrong.
-Exit code 1 if a share of the former lies outside 85 to 95 %.
+`python -m benchmarks.studies.levels --missions 300` flies the wing, the bracket and the stiffened
+panel with damage that grows between levels, at the mean rate of the twin: a little in every turn
+("creeps"), or in the turns in which the twin's damage grows, by anything up to two levels
+("jumps"). The noise is what the twin assumes. A twin whose states stand for intervals
+(`observation.between_levels`) is compared with one whose states stand for the levels themselves:
+how often 90 % sets hold the level nearest to the truth, how many states they have, the rms error,
+and in how many of the first `--watched` missions notices raise an alarm though nothing is wrong.
+The exit code is 1 if the coverage of the former lies outside 85 to 95 %.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from benchmarks.study_level_turns import show
+from benchmarks.studies.level_turns import show
 from reporting.progress import SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.parameter import ParameterDraws
@@ -38,16 +39,21 @@ NAMES = ("level_turns", "bracket", "stiffened_panel")
 TARGET = (0.85, 0.95)
 PROBABILITY = 0.9
 FINER = 5
-"""Points between two levels at which the asset is asked; between them its readings are interpolated."""
+"""Intervals between two levels at whose ends the asset is evaluated; linear in between."""
 HEADINGS = (
-    "scenario", "damage", "a state stands for", "truth in 90 % set", "states in it",
-    "rms error, points", "alarms",
-)  # fmt: skip
+    "scenario",
+    "damage",
+    "a state stands for",
+    "truth in 90 % set",
+    "states in it",
+    "rms error, points",
+    "alarms",
+)
 
 
 @dataclass(frozen=True)
 class Study:
-    """Missions of one scenario: truth (T, B, F), belief (T, B, S), and how many watched ones had alarms."""
+    """Missions of one scenario: truth (T, B, F), belief (T, B, S), and the share with alarms."""
 
     truth: Float
     belief: Float
@@ -56,7 +62,7 @@ class Study:
 
     @property
     def held(self) -> tuple[float, float]:
-        """Share of turns in which the 90 % set holds the nearest state, and its mean number of states."""
+        """Share of turns whose 90 % set holds the nearest state, and the mean set size."""
         nearest = [
             np.abs(self.truth[..., f, None] - np.array(level)).argmin(axis=-1)
             for f, level in enumerate(self.levels)
@@ -71,42 +77,63 @@ class Study:
     @property
     def rms(self) -> Float:
         """Root mean square error of each factor (F,)."""
-        grid = np.stack([axis.ravel() for axis in np.meshgrid(*self.levels, indexing="ij")], axis=-1)
+        grid = np.stack(
+            [axis.ravel() for axis in np.meshgrid(*self.levels, indexing="ij")], axis=-1
+        )
         return np.asarray(np.sqrt(np.mean((self.belief @ grid - self.truth) ** 2, axis=(0, 1))))
 
 
-def grown(law: str, probability: Float, factors: int, step: float, random: np.random.Generator) -> Float:
-    """Return by how much the damage of missions grows in a turn, (B, F), at the mean rate of the twin."""
+def grown(
+    law: str, probability: Float, factors: int, step: float, random: np.random.Generator
+) -> Float:
+    """Return the growth of damage (B, F) in a turn, at the mean rate of the twin."""
     shape = (len(probability), factors)
     if law == "creeps":
         return random.gamma(2.0, 0.5 * step * probability[:, None], shape)
-    return np.where(random.random(shape) < probability[:, None], 2.0 * step * random.random(shape), 0.0)
+    return np.where(
+        random.random(shape) < probability[:, None], 2.0 * step * random.random(shape), 0.0
+    )
 
 
 def readings(scenario: Scenario, source: AssetSource, mean: float) -> RegularGridInterpolator:
-    """Return what the true asset shows without noise anywhere between the levels: (B, F) -> (B, U, G)."""
+    """Return an interpolator of noise-free readings between the levels: (B, F) -> (B, U, G)."""
     fine = [
-        np.interp(np.arange(FINER * (len(s.levels) - 1) + 1) / FINER, np.arange(len(s.levels)), s.levels)
+        np.interp(
+            np.arange(FINER * (len(s.levels) - 1) + 1) / FINER, np.arange(len(s.levels)), s.levels
+        )
         for s in scenario.state
     ]
     states = tuple(
-        s.model_copy(update={"levels": tuple(values.tolist()), "prior": (1.0,) + (0.0,) * (len(values) - 1)})
+        s.model_copy(
+            update={"levels": tuple(values.tolist()), "prior": (1.0,) + (0.0,) * (len(values) - 1)}
+        )
         for s, values in zip(scenario.state, fine, strict=True)
     )
     # States alone: transitions between so many are not needed.
-    still = scenario.transition.model_copy(update={"probability": dict.fromkeys(scenario.control_names, 0.0)})
-    model = build_graphical_model(scenario.model_copy(update={"state": states, "transition": still}))
+    still = scenario.transition.model_copy(
+        update={"probability": dict.fromkeys(scenario.control_names, 0.0)}
+    )
+    model = build_graphical_model(
+        scenario.model_copy(update={"state": states, "transition": still})
+    )
     name = scenario.calibration.parameter
     value = float(getattr(scenario.asset, "parameters", {}).get(name, mean))
-    table = source.observation_table(ParameterDraws(name, np.array([value]), value, 0.0, "true"), model)[0]
+    table = source.observation_table(
+        ParameterDraws(name, np.array([value]), value, 0.0, "true"), model
+    )[0]
     return RegularGridInterpolator(fine, table.reshape(*model.states.shape, *table.shape[1:]))
 
 
-def fly(knowledge: Knowledge, shown: RegularGridInterpolator, law: str, missions: int, watched: int) -> Study:
-    scenario, sensors, model = knowledge.scenario, knowledge.sensor_model, knowledge.model
+def fly(
+    knowledge: Knowledge, shown: RegularGridInterpolator, law: str, missions: int, watched: int
+) -> Study:
+    scenario = knowledge.scenario
+    sensors = knowledge.sensor_model
+    model = knowledge.model
     random = np.random.default_rng(2021)
     levels = tuple(factor.levels for factor in model.states.factors)
-    highest, step = np.array([level[-1] for level in levels]), levels[0][1] - levels[0][0]
+    highest = np.array([level[-1] for level in levels])
+    step = levels[0][1] - levels[0][0]
     probability = np.array([float(p) for p in scenario.transition.probability.values()])  # type: ignore[arg-type]
     control = np.full(missions, scenario.control_names.index(scenario.mission.first_control))
     truth, belief = np.zeros((missions, len(levels))), np.tile(model.prior, (missions, 1))
@@ -116,7 +143,9 @@ def fly(knowledge: Knowledge, shown: RegularGridInterpolator, law: str, missions
     truths, beliefs = [], []
     for turn in range(scenario.mission.steps):
         if turn:
-            truth = np.minimum(truth + grown(law, probability[control], len(levels), step, random), highest)
+            truth = np.minimum(
+                truth + grown(law, probability[control], len(levels), step, random), highest
+            )
             belief = np.einsum("bi,bij->bj", belief, model.transition.matrix[control])
         seen = shown(truth)[np.arange(missions), control]
         seen = seen + random.standard_normal(seen.shape) * sensors.standard_deviation
@@ -130,7 +159,9 @@ def fly(knowledge: Knowledge, shown: RegularGridInterpolator, law: str, missions
         truths.append(truth)
         beliefs.append(belief)
         control = np.argmax(belief @ knowledge.plan.policy, axis=1)
-    return Study(np.array(truths), np.array(beliefs), levels, float(alarmed.mean()) if watched else np.nan)
+    return Study(
+        np.array(truths), np.array(beliefs), levels, float(alarmed.mean()) if watched else np.nan
+    )
 
 
 def main() -> int:
@@ -139,9 +170,9 @@ def main() -> int:
     parser.add_argument("--watched", type=int, default=60)
     parser.add_argument("--scenario", nargs="+", default=NAMES)
     parser.add_argument("--markdown", action="store_true", help="print the table for a page")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     rows: list[list[tuple[str, bool]]] = []
-    for name in given.scenario:
+    for name in arguments.scenario:
         resolved = resolve_scenario(load_scenario(name), Overrides())
         source = asset_source(resolved)
         with tempfile.TemporaryDirectory() as folder:
@@ -149,7 +180,11 @@ def main() -> int:
             twins = [
                 prepare_knowledge(
                     resolved.model_copy(
-                        update={"observation": resolved.observation.model_copy(update={"between_levels": on})}
+                        update={
+                            "observation": resolved.observation.model_copy(
+                                update={"between_levels": on}
+                            )
+                        }
                     ),
                     source,
                     resolved.mission.seed,
@@ -159,7 +194,13 @@ def main() -> int:
             shown = readings(resolved, source, twins[0].draws.mean)
         for law in ("creeps", "jumps"):
             for knowledge in twins:
-                study = fly(knowledge, shown, law, given.missions, min(given.watched, given.missions))
+                study = fly(
+                    knowledge,
+                    shown,
+                    law,
+                    arguments.missions,
+                    min(arguments.watched, arguments.missions),
+                )
                 held, size = study.held
                 interval = knowledge.scenario.observation.between_levels
                 rows.append(
@@ -173,7 +214,7 @@ def main() -> int:
                         (f"{100 * study.alarmed:.0f} %", True),
                     ]
                 )
-    show(f"{given.missions} missions each", HEADINGS, rows, given.markdown)
+    show(f"{arguments.missions} missions each", HEADINGS, rows, arguments.markdown)
     return 0 if all(fine for row in rows for _, fine in row) else 1
 
 

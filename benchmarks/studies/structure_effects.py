@@ -1,10 +1,11 @@
-"""Effects hidden in campaigns on the shipped bracket, made by its full finite element model.
+"""Verdicts on effects hidden in the shipped bracket; docs/structures.md shows them.
 
-`python -m benchmarks.study_structure_effects` loads the bracket at its end in four cycles of load levels, or
-with `--ringdown` lets its end go from four deflections. The readings are those of the full model (981
-unknowns), with noise of gauges and of a displacement, and an effect that nobody tells. The search knows the
-FMU of the reduced structure by the file that `uav-twin structure fmu --rig` writes. Young's modulus is off.
-Printed: the verdict on each campaign, and its time.
+`python -m benchmarks.studies.structure_effects` loads the bracket at its end in four cycles of
+load levels, or with `--ringdown` releases its end from four deflections. The readings come from
+the full finite element model (981 unknowns), with noise of gauges and of a displacement, and one
+hidden effect. The search uses the FMU of the reduced structure by the file that
+`uav-twin structure fmu --rig` writes; its Young's modulus is off. The verdict on each campaign and
+its time are printed.
 """
 
 import argparse
@@ -62,7 +63,7 @@ INTERVAL, SAMPLES, DEFLECTION, MODES = 5e-4, 400, 5e-4, 12  # of a ring-down: s,
 
 @dataclass(frozen=True)
 class Hidden:
-    """An effect: of the catalogue, where, the laws at the port, and what becomes of readings and forces."""
+    """A hidden effect: name, place, laws at the port, and its changes of readings and forces."""
 
     identifier: str
     place: str = ""
@@ -78,11 +79,13 @@ class Hidden:
 HIDDEN = (
     Hidden(""),
     Hidden(
-        "gauge_gain", "heel",
+        "gauge_gain",
+        "heel",
         readings=lambda name, _time, values: values * (1.06 if name == "heel" else 1.0),
     ),
     Hidden(
-        "gauge_zero_drift", "arm",
+        "gauge_zero_drift",
+        "arm",
         readings=lambda name, time, values: values + (3e-5 * time / DAY if name == "arm" else 0.0),
     ),
     Hidden("load_cell", force=1.05),
@@ -90,7 +93,7 @@ HIDDEN = (
     Hidden("cubic_stiffness", PORT, (PowerStiffness(PORT, 40.0, 3.0, 0, 1e-3),)),
     Hidden("breathing_crack", PORT, (PowerStiffness(PORT, -8.0, 1.0, -1, 1e-3),)),
     Hidden("joint_micro_slip", PORT, (MicroSlip(PORT, 8.0, 2e4, -0.5, 24),)),
-)  # fmt: skip
+)
 IN_MOTION = (
     HIDDEN[0],
     HIDDEN[1],
@@ -124,27 +127,41 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     structure = load_and_assemble(file)
     stiffness = structure.stiffness({"e": 1.0 + 0.02 * random.standard_normal()}, {}).toarray()
     mass = (structure.mass_terms[0] + 2.5 * structure.mass_terms[1]).toarray()
-    rows = np.vstack([part.toarray() for part in (structure.displacement_output, structure.gauge_output)])
+    rows = np.vstack(
+        [part.toarray() for part in (structure.displacement_output, structure.gauge_output)]
+    )
     names = (PORT, *structure.gauges)
     quantities = [Quantity.DISPLACEMENT, *[Quantity.STRAIN] * len(structure.gauges)]
     rayleigh = structure.design.damping
     damping = rayleigh.alpha * mass + rayleigh.beta * stiffness
     end = rows[0]
-    system = LinearSystem(mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, rayleigh.beta)
+    system = LinearSystem(
+        mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, rayleigh.beta
+    )
     laws = laws_of(ModelPatch(hidden.laws), system.ports)
     channels = {
         name: Channel(
-            name, quantity, name, NoiseRecord(NOISE[quantity], 200.0), 0.005, ZERO.get(quantity, 0.0)
+            name,
+            quantity,
+            name,
+            NoiseRecord(NOISE[quantity], 200.0),
+            0.005,
+            ZERO.get(quantity, 0.0),
         )
         for name, quantity in zip(names, quantities, strict=True)
     }
     trials = []
     levels = np.concatenate([LEVELS, -LEVELS, LEVELS[:4]])
-    minutes = 60.0 * np.arange(1, len(levels) + 1)
+    minutes = 60.0 * np.arange(1, len(levels) + 1, dtype=np.float64)
     for number, sign in enumerate((1.0, -1.0, 1.0, -1.0)):
-        time, force, start, release = 1100.0 * number + minutes, sign * levels, 0.0, None
+        time = 1100.0 * number + minutes
+        force = sign * levels
+        start = 0.0
+        release = None
         if ringdown:
-            time, force, start = INTERVAL * np.arange(SAMPLES), np.zeros(SAMPLES), 1100.0 * number
+            time = INTERVAL * np.arange(SAMPLES, dtype=np.float64)
+            force = np.zeros(SAMPLES)
+            start = 1100.0 * number
             release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
@@ -153,7 +170,8 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             values = moved.response([OutputEquation.of_row(row) for row in rows]).values
         else:
             values = (
-                system.static_path(np.outer(hidden.force * force + hidden.tare, end), laws).values @ rows.T
+                system.static_path(np.outer(hidden.force * force + hidden.tare, end), laws).values
+                @ rows.T
             )
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):
             values[:, column] = hidden.readings(name, time, values[:, column])
@@ -161,26 +179,46 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
         zero = np.zeros(len(time))
         trials.append(
             Trial(
-                name=f"trial_{number + 1}", kind=TrialKind.RINGDOWN if ringdown else TrialKind.STATIC,
-                channels=names, values=values, release=release,
-                used=np.ones(values.shape, bool), time=time, start=start, force=force, load_factor=zero,
-                load_place="tip_load", temperature=zero, run="A", health=np.zeros((len(time), 2)),
+                name=f"trial_{number + 1}",
+                kind=TrialKind.RINGDOWN if ringdown else TrialKind.STATIC,
+                channels=names,
+                values=values,
+                release=release,
+                used=np.ones(values.shape, bool),
+                time=time,
+                start=start,
+                force=force,
+                load_factor=zero,
+                load_place="tip_load",
+                temperature=zero,
+                run="A",
+                health=np.zeros((len(time), 2)),
                 health_deviation=np.zeros((len(time), 2)),
             )
-        )  # fmt: skip
+        )
     return Campaign("Bracket", channels, tuple(trials), None, {}, "")
 
 
 def outcome(hidden: Hidden, verdict: Verdict) -> str:
     """Return what became of a hidden effect."""
     if not hidden.identifier:
-        return "none" if verdict.kind is VerdictKind.NOTHING_MISSING else f"wrong: {verdict.kind.value}"
+        return (
+            "none"
+            if verdict.kind is VerdictKind.NOTHING_MISSING
+            else f"wrong: {verdict.kind.value}"
+        )
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
         names = [(effect.identifier, effect.place) for effect in verdict.effects]
-        right = [name for name, _ in names] == [hidden.identifier] and names[0][1].startswith(hidden.place)
+        right = [name for name, _ in names] == [hidden.identifier] and names[0][1].startswith(
+            hidden.place
+        )
         return "named" if right else f"wrong: {names}"
     if verdict.kind is VerdictKind.GROUP:
-        return "in the group" if hidden.identifier in verdict.group else f"wrong group: {verdict.group}"
+        return (
+            "in the group"
+            if hidden.identifier in verdict.group
+            else f"wrong group: {verdict.group}"
+        )
     return verdict.kind.value
 
 
@@ -188,18 +226,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first-seed", type=int, default=2021)
-    parser.add_argument("--ringdown", action="store_true", help="ring-downs in the place of load levels")
+    parser.add_argument(
+        "--ringdown", action="store_true", help="ring-downs in the place of load levels"
+    )
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         model = load_model(rig(folder))
-        for hidden in IN_MOTION if given.ringdown else HIDDEN:
-            if given.only is not None and hidden.identifier not in given.only.split(","):
+        for hidden in IN_MOTION if arguments.ringdown else HIDDEN:
+            if arguments.only is not None and hidden.identifier not in arguments.only.split(","):
                 continue
-            for seed in range(given.first_seed, given.first_seed + given.seeds):
+            for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
                 began = process_time()
-                made = campaign(folder / "bracket.toml", hidden, seed, ringdown=given.ringdown)
+                made = campaign(folder / "bracket.toml", hidden, seed, ringdown=arguments.ringdown)
                 verdict = investigate(made, model, seed=seed, thorough=False).verdict
                 seconds = process_time() - began
                 print(
