@@ -57,16 +57,17 @@ def apply_verdict(
     replace: bool = False,
     progress: Progress | None = None,
 ) -> Applied:
-    """Write the model of a verdict with the effects that were found, and the parameters beside them.
+    """Write the model of a verdict with the effects that were found, and its parameters.
 
     Parameters
     ----------
     verdict : path
         Folder of a verdict, or its `verdict.json`.
     out : path, optional
-        The file: .json, a patch beside the model's file, which is a model itself wherever one is asked for;
-        .toml, a lumped model whose file says it by `[[law]]`; .fmu, a wing with the effects switched on. By
-        default MODEL_patched in the working folder, .toml where that can say it.
+        The file: .json, a patch beside the model's file, which is a model itself wherever one is
+        asked for; .toml, a lumped model whose file says it by `[[law]]`; .fmu, a wing with the
+        effects switched on. By default MODEL_patched in the working folder, .toml where that can
+        say it.
     member : str, optional
         Member of a group, one of `Verdict.group`; the first by default.
     replace : bool
@@ -82,7 +83,8 @@ def apply_verdict(
     Raises
     ------
     DiscrepancyError
-        If the verdict gives nothing to apply, its model has changed or is gone, or the file cannot say it.
+        If the verdict gives nothing to apply, its model has changed or is gone, or the file cannot
+        say it.
     fmu_asset.errors.PatchFileError
         If an FMU cannot carry an effect.
     FileNotWrittenError
@@ -112,8 +114,8 @@ def apply_verdict(
     if path.suffix == ".toml":
         if not has_laws_only:
             raise ModelError(
-                f"{path}: only laws at the ports of a lumped model can stand in its own file; give --out "
-                "with the ending .json, which is taken wherever a model is."
+                f"{path}: only laws at the ports of a lumped model can stand in its own file; give "
+                "--out with the ending .json, which is taken wherever a model is."
             )
         atomic_write_text(path, _lumped_text(choice, patch))
     else:
@@ -121,14 +123,20 @@ def apply_verdict(
     return Applied(path, sentence, _command_with_model(stored.origin.command, path))
 
 
-def _check_destination(path: Path, choice: ModelChoice, verdict_file: Path, *, replace: bool) -> None:
+def _check_destination(
+    path: Path, choice: ModelChoice, verdict_file: Path, *, replace: bool
+) -> None:
     """Refuse a file of another kind, one that the patched model is made of, and one that exists."""
     if path.suffix not in ENDINGS:
-        raise FileNotWrittenError(f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out.")
+        raise FileNotWrittenError(
+            f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out."
+        )
     patch_file = verdict_file.parent / files.PATCH_NAME
     sources = (choice.file, *choice.beneath, choice.path or "", verdict_file, patch_file)
     if path.exists() and path.resolve() in {Path(source).resolve() for source in sources}:
-        raise FileNotWrittenError(f"{path} is what the patched model is made of: choose another --out.")
+        raise FileNotWrittenError(
+            f"{path} is what the patched model is made of: choose another --out."
+        )
     refuse_existing(path, replace=replace)
 
 
@@ -147,7 +155,8 @@ def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
         VerdictKind.NAMED_IN_PART: "named in part: what is left has no name",
         VerdictKind.FAMILY: "of which the family is named, not the law",
         VerdictKind.GROUP: (
-            f"one of a group that the data cannot tell apart: no name (of {', '.join(stored.verdict.group)})"
+            "one of a group that the data cannot tell apart: no name (of "
+            f"{', '.join(stored.verdict.group)})"
         ),
         VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: no name",
     }
@@ -155,7 +164,10 @@ def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
 
 
 def gives(verdict: Verdict, proof: Proof | None) -> bool:
-    """Return whether a verdict gives something to apply; never effects with which the error grows."""
+    """Return whether a verdict gives something to apply.
+
+    Never effects with which the error grows.
+    """
     if proof is not None and proof.grew:
         return False
     if verdict.kind is VerdictKind.UNEXPLAINED:
@@ -163,7 +175,9 @@ def gives(verdict: Verdict, proof: Proof | None) -> bool:
     return verdict.kind in files.PATCHED
 
 
-def _patch_to_apply(stored: files.StoredVerdict, file: Path, member: str | None) -> files.StoredPatch:
+def _patch_to_apply(
+    stored: files.StoredVerdict, file: Path, member: str | None
+) -> files.StoredPatch:
     """Return the patch of the effects that are applied.
 
     Parameters
@@ -184,10 +198,13 @@ def _patch_to_apply(stored: files.StoredVerdict, file: Path, member: str | None)
     is_group = verdict.kind is VerdictKind.GROUP
     if member is not None and (not is_group or member not in verdict.group):
         members = ", ".join(map(repr, verdict.group)) if is_group else "no group"
-        raise DiscrepancyError(f"--member {member!r} is none of {file}, which has {members}: leave it out.")
+        raise DiscrepancyError(
+            f"--member {member!r} is none of {file}, which has {members}: leave it out."
+        )
     if stored.proof is not None and stored.proof.grew:
         raise DiscrepancyError(
-            f"{file} gives nothing to apply: its proof says that the error grows with what was found."
+            f"{file} gives nothing to apply: its proof says that the error grows with what was "
+            "found."
         )
     patch_file = file.parent / files.PATCH_NAME
     if member is None and verdict.kind in files.PATCHED and patch_file.is_file():
@@ -226,7 +243,10 @@ _NOTHING_TO_APPLY = {
 
 
 def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
-    """Return the hypothesis of a verdict, or of a member of its group; None if it is not recorded."""
+    """Return the hypothesis of a verdict, or of a member of its group.
+
+    None if it is not recorded.
+    """
     if verdict.kind is VerdictKind.GROUP:
         identifiers = {*(member or verdict.group[0]).split(" + ")}
     else:
@@ -238,7 +258,10 @@ def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
 
 
 def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | None:
-    """Return the hypothesis of the proof of an unexplained gap, if it lowers the error; else None."""
+    """Return the hypothesis of the proof of an unexplained gap, if it lowers the error.
+
+    Else None.
+    """
     if proof is None or not proof.effects or proof.closed is None or proof.closed.value <= 0.0:
         return None
     for hypothesis in verdict.hypotheses:
@@ -313,8 +336,8 @@ def pack_patched(
     """
     if choice.design is None:
         raise ModelError(
-            f"{path}: only a wing is packed with its effects; of {choice.label} give --out with the "
-            "ending .json, which is taken wherever a model is."
+            f"{path}: only a wing is packed with its effects; of {choice.label} give --out with "
+            "the ending .json, which is taken wherever a model is."
         )
     effect_tables = []
     for stored_effect in patch.effects:
@@ -352,7 +375,7 @@ def packed_beside(choice: ModelChoice, patch_file: Path, path: Path) -> str:
 
 
 def _command_with_model(command: str, model: Path) -> str:
-    """Return the command of a verdict with another model, and with another folder for its results."""
+    """Return the command of a verdict with another model and another folder."""
     words = shlex.split(command)
     campaign_index = 4 if words[3] == "--from-run" else 3
     campaign = Path(words[campaign_index]).name

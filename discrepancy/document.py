@@ -1,7 +1,7 @@
 """How records stand in JSON: numbers that JSON lacks, and patches by their primitives.
 
-A number that is not a number is null, an infinite one "Infinity" or "-Infinity", because JSON has neither.
-The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
+A number that is not a number is null, an infinite one "Infinity" or "-Infinity", because JSON has
+neither. The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
 """
 
 import json
@@ -24,7 +24,8 @@ from reporting.json_file import read_json
 from reporting.provenance import Provenance
 
 PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in PRIMITIVES.items()}
-"""Unit of every real parameter of every primitive (translational or rotational port: the first or second)."""
+"""Unit of every real parameter of every primitive (translational or rotational port: the first
+or second)."""
 
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
 _JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
@@ -44,7 +45,9 @@ _WINDOWS = {
 def _number(value: object) -> float:
     if value is None or isinstance(value, str):
         if value not in _WORDS:
-            raise ValueError(f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came')
+            raise ValueError(
+                f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came'
+            )
         return _WORDS[value]
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
         raise ValueError(f"a finite number is expected, and {value!r} came")
@@ -119,8 +122,9 @@ class Origin:
     provenance : Provenance
         Seed, versions, hashes of the sources.
     model_file : str or None
-        Absolute path of the model's file, or of the mission whose twin's model it is; the name of a shipped
-        model, empty for the shipped wing. None: not known, as of files before it was recorded.
+        Absolute path of the model's file, or of the mission whose twin's model it is; the name of a
+        shipped model, empty for the shipped wing. None: not known, as of files before it was
+        recorded.
     """
 
     campaign: str
@@ -147,14 +151,18 @@ def shipped_schema(name: str) -> dict[str, Any]:
         If there is none of that name.
     """
     if name not in ("verdict", "patch"):
-        raise VerdictFileError(f"There are JSON Schemas for verdict and patch, but not for {name!r}.")
-    text = resources.files("discrepancy").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+        raise VerdictFileError(
+            f"There are JSON Schemas for verdict and patch, but not for {name!r}."
+        )
+    text = (
+        resources.files("discrepancy").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+    )
     schema: dict[str, Any] = json.loads(text)
     return schema
 
 
 def plain(value: Any) -> Any:
-    """Return records as plain data for JSON: nan is null, infinities are "Infinity" and "-Infinity"."""
+    """Return records as plain data for JSON; nan is null, infinity is "Infinity"."""
 
     def not_finite(number: float) -> str | None:
         if isnan(number):
@@ -225,7 +233,9 @@ def read_document(
     """
     path = Path(path)
     if not path.exists():
-        raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
+        raise VerdictFileError(
+            f"There is no file {path}; give the one that the discrepancy workflow left."
+        )
     content = read_json(path, VerdictFileError)
     schema_of_file = content.pop("schema", None) if isinstance(content, dict) else None
     if schema_of_file != schema and schema_of_file not in older:
@@ -245,7 +255,9 @@ def read_document(
     try:
         return _record_of(kind, {**content, "origin": origin})
     except _InvalidDocumentError as cause:
-        raise VerdictFileError(f"{path} does not fit its schema: {cause}; write it again.") from cause
+        raise VerdictFileError(
+            f"{path} does not fit its schema: {cause}; write it again."
+        ) from cause
 
 
 class _InvalidDocumentError(ValueError):

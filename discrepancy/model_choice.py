@@ -1,4 +1,4 @@
-"""Which model a campaign is compared with: a wing, a structure, a lumped model, an FMU, or one patched."""
+"""Which model a campaign is compared with: wing, structure, lumped model, FMU, or a patched one."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -49,8 +49,9 @@ class ModelChoice:
     label : str
         What the command line names it by, without its folder; empty for the shipped wing.
     source_hash : str
-        SHA-256 of all that it was read from: its file, with the prior for a wing without calibration, with
-        FMU and binding for the description of an FMU, with the patch of a run's twin.
+        SHA-256 of all that it was read from: its file, with the prior for a wing without
+        calibration, with FMU and binding for the description of an FMU, with the patch of a run's
+        twin.
     design : WingDesign or None
         Of a wing.
     path : Path or None
@@ -83,9 +84,9 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     Parameters
     ----------
     name : str or Path, optional
-        A calibration (.nc); a wing design, a structure, a lumped model or the description of an FMU (.toml);
-        any of these with a patch (.json); the name of a shipped lumped model or structure; the folder of a
-        mission whose twin's model is meant. The shipped wing if left out.
+        A calibration (.nc); a wing design, a structure, a lumped model or the description of an FMU
+        (.toml); any of these with a patch (.json); the name of a shipped lumped model or structure;
+        the folder of a mission whose twin's model is meant. The shipped wing if left out.
     progress : Progress, optional
         Where the modelling of a wing or a structure reports.
 
@@ -102,16 +103,22 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
 
 
 def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
-    """Return the model of a file or a folder, or the shipped one of this name; without its `file`."""
+    """Return the model of a file or a folder, or the shipped one of this name.
+
+    Without its `file`.
+    """
     if path.is_dir():
         return choice_of_run(path)
     if path.suffix == ".fmu":
         raise ModelError(
-            f"{path} is an FMU: give a TOML file that says which of its variables are load, outputs and "
-            'ports (kind = "fmu", docs/fmu_models.md), or for the wing its calibration.nc or design.'
+            f"{path} is an FMU: give a TOML file that says which of its variables are load, "
+            'outputs and ports (kind = "fmu", docs/fmu_models.md), or for the wing its '
+            "calibration.nc or design."
         )
     if path.suffix and not path.is_file():
-        raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
+        raise ModelError(
+            f"There is no model file {path}; give a calibration (.nc) or a model (.toml)."
+        )
     if path.suffix == ".nc":
         return _wing(WingModel.of_calibration(path, progress), ModelKind.CALIBRATION, path)
     if path.suffix == ".json":
@@ -119,8 +126,8 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     if path.suffix not in ("", ".toml"):
         shipped_names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
         raise ModelError(
-            f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped model "
-            "(.toml), a patch (.json), or the name of a shipped lumped model "
+            f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped "
+            "model (.toml), a patch (.json), or the name of a shipped lumped model "
             f"({comma_list(shipped_names)}) is expected."
         )
     if path.suffix == ".toml":
@@ -186,16 +193,16 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
         model_file = Path(file).parent / model_file.name
         if not model_file.exists():
             raise ModelError(
-                f"The model {origin.model_file}, on which {file} rests, is gone: put it back there, or "
-                f"beside {Path(file).name}."
+                f"The model {origin.model_file}, on which {file} rests, is gone: put it back "
+                f"there, or beside {Path(file).name}."
             )
     choice = choose_model(model_file if origin.model_file else None, progress)
     if choice.source_hash != origin.model_hash:
         model = choice.file or "of the shipped wing"
         raise ModelError(
             f"The model {model} has changed since {file} was written (SHA-256 "
-            f"{choice.source_hash:.12}, not {origin.model_hash:.12}): run `uav-twin discrepancy run` "
-            "again."
+            f"{choice.source_hash:.12}, not {origin.model_hash:.12}): run `uav-twin discrepancy "
+            "run` again."
         )
     return choice
 
@@ -221,7 +228,9 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
     """Return the model of a patch file: that on which the patch rests, with its effects."""
     stored = read_patch(path)
     base = model_of(stored.origin, path, progress)
-    calibrated = {parameter.name: (parameter.mean, parameter.deviation) for parameter in stored.parameters}
+    calibrated = {
+        parameter.name: (parameter.mean, parameter.deviation) for parameter in stored.parameters
+    }
     return replace(
         base,
         model=base.model.patched(stored.patch, calibrated),
@@ -248,7 +257,10 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
 
 
 def _fmu(path: Path) -> ModelChoice:
-    """Return the model of an FMU's description; its hash is that of description, FMU and binding."""
+    """Return the model of an FMU's description.
+
+    Its hash is that of description, FMU and binding.
+    """
     model = FmuModel.load(path)
     fmu_file = path.parent / model.description.fmu
     binding_file = model.description.binding_file(path.parent)
@@ -266,7 +278,10 @@ def _fmu(path: Path) -> ModelChoice:
 
 
 def _wing(model: WingModel, kind: ModelKind, path: Path | None) -> ModelChoice:
-    """Return the model of a wing, from its calibration or design; without a file the shipped design."""
+    """Return the model of a wing, from its calibration or design.
+
+    Without a file the shipped design.
+    """
     if path is not None and kind is ModelKind.CALIBRATION:
         source_hash = hash_file(path)
     else:

@@ -1,9 +1,10 @@
 """Simulation-based calibration of the workflow itself, on the geometry of a user's own campaign.
 
-Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. In a third of
-them nothing is hidden; in the others an effect drawn from its prior, where this campaign can detect it
-(d^2 >= 25, the limit of `discrepancy.judgement.separability`). Each is investigated as the real one is, and
-verdicts are compared with what was hidden. Motion is simulated with half the time step of the naming side.
+Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. In a
+third of them nothing is hidden; in the others an effect drawn from its prior, where this campaign
+can detect it (d^2 >= 25, the limit of `discrepancy.judgement.separability`). Each is investigated
+as the real one is, and verdicts are compared with what was hidden. Motion is simulated with half
+the time step of the naming side.
 """
 
 import json
@@ -71,9 +72,11 @@ class CalibrationCase:
     kind : VerdictKind
         Of the verdict.
     named : tuple of str
-        Identifiers that were named; members where the verdict is a group, the nearest where it is a family.
+        Identifiers that were named; members where the verdict is a group, the nearest where it is a
+        family.
     outcome : str
-        "right", "wrong", "in part", "group", "family", "unexplained", "below detectability" or "data error".
+        "right", "wrong", "in part", "group", "family", "unexplained", "below detectability" or
+        "data error".
     covered : tuple of Covered
         Parameters of the effect, where it was named.
     """
@@ -222,7 +225,9 @@ def self_calibrate(
     simulator = Simulator(campaign, model)
     testable = usable_effects(effects, simulator.setting)
     drawing_seed, *case_seeds = np.random.SeedSequence(seed).spawn(count + 1)
-    hidden, not_detectable = _hidden_effects(simulator, testable, count, np.random.default_rng(drawing_seed))
+    hidden, not_detectable = _hidden_effects(
+        simulator, testable, count, np.random.default_rng(drawing_seed)
+    )
     cases: list[CalibrationCase] = []
     investigate_case = partial(_investigated, simulator, effects)
     with ProcessPoolExecutor(max(workers, 1), get_context("spawn")) as pool:
@@ -326,11 +331,13 @@ def _investigated(
     )
 
 
-def outcome_of(hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tuple[str, ...]) -> str:
+def outcome_of(
+    hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tuple[str, ...]
+) -> str:
     """Return how a verdict compares with what was hidden.
 
-    A group that holds the effect, and a family whose nearest member it is, are honest but less than the
-    name. A group or a family without it is wrong, and so is any name if nothing was hidden.
+    A group that holds the effect, and a family whose nearest member it is, are honest but less than
+    the name. A group or a family without it is wrong, and so is any name if nothing was hidden.
 
     Parameters
     ----------
@@ -381,7 +388,10 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
 
 
 def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str, Any]:
-    """Return the proportions of all outcomes as plain data; `null`: of campaigns that hide nothing."""
+    """Return the proportions of all outcomes as plain data.
+
+    `null`: of campaigns that hide nothing.
+    """
     table = {}
     for outcome in outcomes(self_calibration, null=null):
         table[outcome] = _proportion_table(self_calibration.share(outcome, null=null))

@@ -18,7 +18,10 @@ from discrepancy.judgement.separability import DETECTED, as_predicted, has_free_
 from discrepancy.system.interface import Model
 
 TRIES = 60
-"""Draws of an effect's prior until one is detectable; without success the effect is not detectable here."""
+"""Draws of an effect's prior until one is detectable.
+
+Without success the effect is not detectable here.
+"""
 REFINEMENT = 2
 """Finer time steps than on the naming side."""
 
@@ -38,8 +41,8 @@ class Simulator:
     Parameters
     ----------
     campaign : Campaign
-        The real one; its values count only where a nuisance has no prior (a free zero, a motion that began
-        before the record): these stay as the fit without effect has them.
+        The real one; its values count only where a nuisance has no prior (a free zero, a motion
+        that began before the record): these stay as the fit without effect has them.
     model : Model
         The model as it is.
     """
@@ -62,7 +65,9 @@ class Simulator:
         problem = Problem(predicted, self.model, self.setting)
         return Screen(problem, fit(problem, Candidate(), problem.start(Candidate()), iterations=1))
 
-    def draw_effect(self, effect: Effect, screen: Screen, generator: np.random.Generator) -> Hidden | None:
+    def draw_effect(
+        self, effect: Effect, screen: Screen, generator: np.random.Generator
+    ) -> Hidden | None:
         """Return a draw of an effect's prior that is detectable; None if several draws were not.
 
         Parameters
@@ -112,7 +117,9 @@ class Simulator:
             trial = data.trial
             fitted_local = self.nuisances.local[number]
             local = _drawn(fitted_local, data.unknowns.precision, generator)
-            if has_free_initial_state(trial):  # the prior has no information: the state stays as fitted
+            if has_free_initial_state(
+                trial
+            ):  # the prior has no information: the state stays as fitted
                 initial_state = slice(*data.unknowns.ends[:2])
                 local[initial_state] = fitted_local[initial_state]
             effect_acts = trial.kind in candidate.acts_on
@@ -138,7 +145,10 @@ class Simulator:
 
 
 def _drawn(fitted: FloatArray, precision: FloatArray, generator: np.random.Generator) -> FloatArray:
-    """Return draws (K,) of the priors of scaled unknowns; fitted values of those without a prior."""
+    """Return draws (K,) of the priors of scaled unknowns.
+
+    Fitted values of those without a prior.
+    """
     draws = generator.standard_normal(len(fitted))
     return np.where(precision > 0.0, draws, fitted)
 

@@ -1,4 +1,7 @@
-"""The folder that an investigation leaves: verdict, patch, residuals, figures, report; whole or not."""
+"""The folder that an investigation leaves: verdict, patch, residuals, figures, report.
+
+Whole or not.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,12 +27,15 @@ FIGURES = "figures"
 
 
 def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
-    """Look at the place before the work begins; a verdict that a killed process had moved aside comes back.
+    """Look at the place before the work begins.
+
+    A verdict that a killed process had moved aside comes back.
 
     Raises
     ------
     FileNotWrittenError
-        If it is no folder, holds something else than a verdict, or a verdict that is not to be replaced.
+        If it is no folder, holds something else than a verdict, or a verdict that is not to be
+        replaced.
     """
     restore_folder(folder)
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
@@ -41,7 +47,8 @@ def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
         return
     if not (folder / files.VERDICT_NAME).is_file():
         raise FileNotWrittenError(
-            f"{folder} exists and holds no {files.VERDICT_NAME}, so it is not touched: choose another --out."
+            f"{folder} exists and holds no {files.VERDICT_NAME}, so it is not touched: choose "
+            "another --out."
         )
     if not replace_it:
         raise FileNotWrittenError(
@@ -73,7 +80,8 @@ def write_verdict_folder(
     Raises
     ------
     FileNotWrittenError
-        As `check_verdict_folder`, or if the disk is full or the place not writable; the folder is as it was.
+        As `check_verdict_folder`, or if the disk is full or the place not writable; the folder is
+        as it was.
     """
     check_verdict_folder(folder, replace_it=replace_it)
     with whole_folder(folder) as fresh:
@@ -85,7 +93,9 @@ def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
     """Write all files of an investigation into an empty folder."""
     investigation = content.investigation
     origin = content.origin
-    files.write_verdict(folder / files.VERDICT_NAME, investigation.verdict, investigation.proof, origin)
+    files.write_verdict(
+        folder / files.VERDICT_NAME, investigation.verdict, investigation.proof, origin
+    )
     content = _with_patch_files(folder, content)
     if investigation.after is not None:
         attributes = {
@@ -108,7 +118,7 @@ def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
 
 
 def _with_patch_files(folder: Path, content: ReportInput) -> ReportInput:
-    """Write patch and FMU of a verdict that has them, and return the input with what is said of them."""
+    """Write patch and FMU of a verdict that has them, and return the input with their entries."""
     investigation = content.investigation
     problem = investigation.problem
     fit = investigation.fit

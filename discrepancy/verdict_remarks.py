@@ -20,8 +20,8 @@ IMPLAUSIBLE = 4.0
 def strained(problem: Problem, fit: CandidateFit) -> list[str]:
     """Return a remark on each calibrated parameter and gain that a fit takes far from its prior.
 
-    What an implausible nuisance explains leaves no residual. The absolute gate judges all gains together,
-    and all parameters.
+    What an implausible nuisance explains leaves no residual. The absolute gate judges all gains
+    together, and all parameters.
     """
     names = [f"The parameter {parameter.name!r}" for parameter in problem.model.parameters]
     names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
@@ -31,14 +31,17 @@ def strained(problem: Problem, fit: CandidateFit) -> list[str]:
     for subject, value, precision in zip(names, values, precisions, strict=True):
         if precision > 0.0 and abs(value) > IMPLAUSIBLE:
             remarks.append(
-                f"{subject} lies {abs(value):.1f} of its stated deviations off in the hypothesis of the "
-                "verdict, which rests on that deviation: check it."
+                f"{subject} lies {abs(value):.1f} of its stated deviations off in the hypothesis "
+                "of the verdict, which rests on that deviation: check it."
             )
     return remarks
 
 
 def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
-    """Return the remark on effects that were not tested because the model has no port; else nothing."""
+    """Return the remark on effects that were not tested because the model has no port.
+
+    Else nothing.
+    """
     names = [effect.name for effect in effects if NO_PORT in (effect.unavailable(setting) or "")]
     if not names:
         return []
@@ -54,7 +57,9 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     ]
 
 
-def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> tuple[NotFitted, ...]:
+def not_fitted(
+    setting: Setting, effects: Sequence[Effect], search: Search
+) -> tuple[NotFitted, ...]:
     """Return the effects of a catalogue that were not fitted, each with the reason.
 
     Parameters

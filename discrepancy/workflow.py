@@ -1,4 +1,4 @@
-"""The whole way from a campaign to a verdict: check, locate, name, prove, propose the next experiment."""
+"""From a campaign to a verdict: check, locate, name, prove, propose the next experiment."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -81,7 +81,8 @@ class Investigation:
     proof : Proof or None
         Where an effect was named, or is the most probable one.
     before, after : ResidualSet or None
-        Residuals without and with it, over the same noise; None where faults of the data stopped the work.
+        Residuals without and with it, over the same noise; None where faults of the data stopped
+        the work.
     problem, search, fit : Problem, Search, CandidateFit or None
         What the naming side worked with; `fit` stands for the verdict.
     seconds : dict of str to float
@@ -123,8 +124,8 @@ def investigate(
     campaign : Campaign or path
         Measured data: a campaign, its folder, or the folder of a mission whose flight is meant.
     model : Model or path, optional
-        The model that is to explain them, as `load_model` takes it: that of the mission's twin if left out
-        beside a mission, else the shipped wing.
+        The model that is to explain them, as `load_model` takes it: that of the mission's twin if
+        left out beside a mission, else the shipped wing.
     effects : sequence of Effect, optional
         The catalogue; the shipped one with the user's installed entries if left out.
     seed : int
@@ -168,7 +169,9 @@ def investigate(
         problem = without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = reach_verdict(problem, catalogue, on_progress=tell, on_search=on_search)
+        verdict, search, fit = reach_verdict(
+            problem, catalogue, on_progress=tell, on_search=on_search
+        )
         verdict = with_untested(verdict, setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
@@ -180,7 +183,11 @@ def investigate(
             )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.no_effect, sensitivities=thorough)
-        after = residual_set(problem, fit, sensitivities=False) if fit is not search.no_effect else before
+        after = (
+            residual_set(problem, fit, sensitivities=False)
+            if fit is not search.no_effect
+            else before
+        )
     location, missing, proof = None, None, None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
@@ -232,7 +239,10 @@ def investigate(
 def added_effects(fit: CandidateFit) -> tuple[str, ...]:
     """Return the effects of a fit with their places, sorted, as `Hypothesis.labels` has them."""
     terms = fit.candidate.terms
-    labels = [effect_label(term.effect.identifier, term.place, free_shape=term.free_shape) for term in terms]
+    labels = [
+        effect_label(term.effect.identifier, term.place, free_shape=term.free_shape)
+        for term in terms
+    ]
     return tuple(sorted(labels))
 
 
@@ -254,8 +264,8 @@ def _remarks(
         remarks.append(look_alikes)
     if not problem.model.parameters:
         remarks.append(
-            f"The model {problem.model.name!r} has no uncertain parameter, so a stiffness or damping a "
-            "little off can be taken for an effect: give it some with their deviations."
+            f"The model {problem.model.name!r} has no uncertain parameter, so a stiffness or "
+            "damping a little off can be taken for an effect: give it some with their deviations."
         )
     if fit.candidate.terms and not fit.converged:
         remarks.append(
@@ -264,7 +274,9 @@ def _remarks(
     return remarks
 
 
-def _read_input(campaign: Campaign | str | Path, model: Model | str | Path | None) -> tuple[Campaign, Model]:
+def _read_input(
+    campaign: Campaign | str | Path, model: Model | str | Path | None
+) -> tuple[Campaign, Model]:
     """Return campaign and model, read from files where paths are given."""
     if not isinstance(campaign, Campaign):
         is_run_folder = (Path(campaign) / RUN_FILE).is_file()
@@ -299,9 +311,9 @@ def checked(
     for parameter in campaign.parameters:
         if parameter not in names:
             raise CampaignDataError(
-                f"The campaign states the parameter {parameter!r}, which {model.name} does not have; it "
-                f"has {', '.join(names) or 'none'}: correct the name, or leave [parameters.{parameter}] "
-                "out."
+                f"The campaign states the parameter {parameter!r}, which {model.name} does not "
+                f"have; it has {', '.join(names) or 'none'}: correct the name, or leave "
+                f"[parameters.{parameter}] out."
             )
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
@@ -335,9 +347,9 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             for column in np.flatnonzero(is_wrong.any(axis=0)):
                 count = int(is_wrong[:, column].sum())
                 new_remarks.append(
-                    f"{count} of {len(is_wrong)} readings of {trial.channels[column]!r} in the trial "
-                    f"{trial.name!r}, at its ends, {is_or_are(count)} far off model and neighbours and "
-                    "left out."
+                    f"{count} of {len(is_wrong)} readings of {trial.channels[column]!r} in the "
+                    f"trial {trial.name!r}, at its ends, {is_or_are(count)} far off model and "
+                    "neighbours and left out."
                 )
             trials[trial.name] = replace(trial, used=trial.used & ~is_wrong)
     if not new_remarks:
@@ -359,7 +371,9 @@ def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, 
     return [(search.best_of(identifiers), probability) for identifiers, probability in ranked]
 
 
-def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:
+def patch_draws(
+    problem: Problem, fit: CandidateFit, seed: int, count: int = DRAWS
+) -> list[list[ModelPatch]]:
     """Return the patches of each effect of a fit at draws of its posterior.
 
     Draws are those of the fit if it has some, and Gaussian ones otherwise.
