@@ -117,7 +117,7 @@ def investigate(
     progress: Progress | None = None,
     on_search: OnSearch = ignore_search,
 ) -> Investigation:
-    """Find out what a model lacks.
+    """Return what a model lacks beside measured data: the verdict, its evidence and its proof.
 
     Parameters
     ----------
@@ -127,20 +127,16 @@ def investigate(
         The model that is to explain them, as `load_model` takes it: that of the mission's twin if
         left out beside a mission, else the shipped wing.
     effects : sequence of Effect, optional
-        The catalogue; the shipped one with the user's installed entries if left out.
+        The catalogue; by default the shipped one with the user's installed entries.
     seed : int
-        Of all draws.
+        Seed of all draws.
     thorough : bool
-        False: no map of residuals and no next experiment, for studies over many campaigns.
+        False to leave out the map of residuals and the next experiment, for studies over many
+        campaigns.
     progress : Progress, optional
-        Where to report.
+        Where progress is reported.
     on_search : callable, optional
-        Takes each search as it begins, to look at while it goes on.
-
-    Returns
-    -------
-    Investigation
-        Verdict, evidence, proof.
+        Called with each search as it begins, to follow it.
 
     Raises
     ------
@@ -220,19 +216,19 @@ def investigate(
         force=None if missing is None else missing.at_port,
     )
     return Investigation(
-        campaign,
-        model,
-        faults,
-        verdict,
-        location,
-        proof,
-        before,
-        after,
-        problem,
-        search,
-        fit,
-        seconds,
-        missing,
+        campaign=campaign,
+        model=model,
+        faults=faults,
+        verdict=verdict,
+        location=location,
+        proof=proof,
+        before=before,
+        after=after,
+        problem=problem,
+        search=search,
+        fit=fit,
+        seconds=seconds,
+        missing=missing,
     )
 
 
