@@ -68,8 +68,9 @@ def _against_the_full_model() -> list[Measurement]:
     from fe.reduction.model_cache import reduced_model
     from fe.runtime.state import TIP_FORCE
     from fe.runtime.transient import ModalIntegrator
+    from fe.structure.affine import natural_frequencies, static_response
     from fe.wing.design import load_design
-    from fe.wing.operators import assemble, eigenmodes, solve_static
+    from fe.wing.operators import assemble, point_masses, wing_values
 
     model = reduced_model()
     begin = time.perf_counter()
@@ -92,8 +93,10 @@ def _against_the_full_model() -> list[Measurement]:
             else tuple(random.uniform(0, 0.8, 2))
         )
         load = (1.0, 0.0) if number % 3 else (0.0, 1.0)
+        load_factor, tip_force = load
+        values = wing_values(operators, e, z, load_factor=load_factor, tip_force=tip_force)
         begin = time.perf_counter()
-        full = solve_static(operators, e, z, *load)
+        full = static_response(operators, values)
         full_times.append(time.perf_counter() - begin)
         vector = model.vector(stiffness_loss=z, young_modulus_factor=e)
         reduced = model.static_response(vector, load=np.array(load))
@@ -105,7 +108,8 @@ def _against_the_full_model() -> list[Measurement]:
         tip_errors.append(abs(reduced.displacement[0] / full.output[0] - 1.0))
         if number % 2:
             servo_mass, pitot_mass = random.uniform((0.05, 0.0), (0.30, 0.30)).tolist()
-            frequency = eigenmodes(operators, e, z, servo_mass, pitot_mass, count=6).frequency
+            values = wing_values(operators, e, z, **point_masses(servo_mass, pitot_mass))
+            frequency = natural_frequencies(operators, 6, values).frequency
             masses = {"servo_mass": servo_mass, "pitot_mass": pitot_mass}
             found = model.modes(masses, z, young_modulus_factor=e).frequency
             frequency_errors.append(np.abs(found / frequency - 1.0).max())
@@ -117,8 +121,8 @@ def _against_the_full_model() -> list[Measurement]:
     vectors = model.vectors({"z1": losses[0], "z2": losses[1], "load_factor": 3.0})
     many = median_seconds(lambda: model.static_outputs(vectors)) / len(vectors)
     modes = median_seconds(lambda: model.modes(state), inner=50)
-    integrator = ModalIntegrator(model, model.nominal, *model.damping)
-    at = integrator.released(0.02, (0.0, 0.0), TIP_FORCE)
+    integrator = ModalIntegrator(model.structure_at(model.nominal), *model.damping)
+    at = integrator.state_after_release(0.02, (0.0, 0.0), TIP_FORCE)
     step = median_seconds(
         lambda: integrator.outputs(integrator.advance(at, 0.01, (3.0, 0.0))), inner=200
     )

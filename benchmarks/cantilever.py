@@ -23,7 +23,6 @@ from discrepancy.system.response import ACROSS, Conditions, Outputs, Response
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.sensing import observe
 from discrepancy.system.time_history import RecordedHistory
-from fe.runtime.motion import laws_of
 from fe.runtime.patch import (
     INTERNAL_FORCES,
     InertiaRelief,
@@ -37,6 +36,7 @@ from fe.runtime.patch import (
     RootCompliance,
     Washout,
 )
+from fe.runtime.port_laws import port_laws
 
 FloatArray = NDArray[np.float64]
 
@@ -247,7 +247,7 @@ def _motion(
             relief += item.fraction
     row = displacement_row(min(place, LENGTH))
     force = np.where(trial.force != 0.0, gain * trial.force + tare, 0.0)
-    laws = laws_of(patch.of(*INTERNAL_FORCES), PORTS)
+    laws = port_laws(patch.of(*INTERNAL_FORCES), PORTS)
     if trial.is_dynamic:
         system = _system(float(modulus[0]), structural)
         excitation = Excitation(trial.time, conditions.stamps(trial.time))

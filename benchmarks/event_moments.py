@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from discrepancy.missing_force.events import Events, events
-from discrepancy.missing_force.windows import of_series
+from discrepancy.missing_force.windows import pattern_of_residuals
 
 FloatArray = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ def record(
 
 def found_in(time: FloatArray, values: FloatArray) -> Events:
     """Return the events of a record."""
-    one, _ = of_series("record", time, values[:, None], np.ones((len(values), 1), bool))
+    one, _ = pattern_of_residuals("record", time, values[:, None], np.ones((len(values), 1), bool))
     return events(one.view, 0, one.processes[0])
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
+from fe.structure.affine import static_response
 from fe.wing.design import load_design
-from fe.wing.operators import assemble, solve_static
+from fe.wing.operators import assemble, wing_values
 from reporting.files import atomic_write_text
 from scenarios import RECORDING_FOLDER
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
@@ -55,7 +56,8 @@ class _Wing:
         self._strain = cache(self._solved)
 
     def _solved(self, health: tuple[float, ...]) -> Float:
-        return np.asarray(solve_static(self._operators, YOUNG_MODULUS_FACTOR, health, 1.0).strain)
+        values = wing_values(self._operators, YOUNG_MODULUS_FACTOR, health, load_factor=1.0)
+        return static_response(self._operators, values).strain
 
     def observe(self, control: object, health: object) -> AssetReading:
         """Return the strains of the next turn."""

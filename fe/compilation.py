@@ -17,7 +17,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numpy as np
 
 from fe.reduction.built_once import cache_folder
-from fe.runtime import laws, motion_arrays, motion_kernel, static_path
+from fe.runtime import dry_friction, laws, motion_arrays, motion_kernel, static_path
 from fe.runtime.motion import Kernel
 from reporting.progress import note
 
@@ -142,7 +142,9 @@ def _functions(module: ModuleType) -> list[Callable[..., Any]]:
 @functools.cache
 def law_functions() -> tuple[Callable[..., Any], ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
-    tables = {choice: laws.answers(choice.__name__) for choice in (laws.advance, laws.pull)}
+    tables = {
+        choice: laws.functions_by_law(choice.__name__) for choice in (laws.advance, laws.force_and_slope)
+    }
     functions = [item for module in laws.MODULES for item in _functions(module)]
     found = tuple(dict.fromkeys((*functions, *itertools.chain(*tables.values()))))
     for function in found:
@@ -173,10 +175,16 @@ def compiled_kernel() -> Kernel:
 
     The functions of `fe.runtime` stay plain; they can be called from compiled ones from then on.
     """
-    inner = {*_functions(motion_arrays), *_functions(motion_kernel)} - {motion_kernel.integrate}
+    inner = {
+        *_functions(motion_arrays),
+        *_functions(dry_friction),
+        *_functions(motion_kernel),
+    } - {motion_kernel.integrate}
     for function in inner:
         callable_when_compiled(function, makes_arrays=False, inline=True)
-    callable_when_compiled(static_path.settle_port, makes_arrays=False)
-    callable_when_compiled(static_path.static_forces)
-    sources = (*law_functions(), *inner, static_path.settle_port)
+    static_inner = {*_functions(static_path)} - {static_path.static_path}
+    with_arrays = {static_path.static_forces, static_path.solve_static_position}
+    for function in static_inner:
+        callable_when_compiled(function, makes_arrays=function in with_arrays)
+    sources = (*law_functions(), *inner, *static_inner)
     return Kernel(compiled(motion_kernel.integrate, sources), compiled(static_path.static_path, sources))

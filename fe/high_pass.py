@@ -9,7 +9,7 @@ from scipy.special import hyp1f1, rgamma
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import HighPass
-from fe.runtime.sensors import SensorRecord, held_before
+from fe.runtime.sensors import SensorRecord, levels_before_record
 
 FAR, TERMS = 700.0, 10
 """Beyond which exp(-u) is nothing beside powers of u, and how many of these are taken, to rounding."""
@@ -25,7 +25,7 @@ def filtered_record(
         count = int(np.ceil(2.0 * span / np.median(steps)))  # a grid twice as fine as the usual step
     grid, interval = np.linspace(time[0], time[-1], count + 1), span / count
     signal, slope = _at(grid, time, signal), _at(grid, time, slope)
-    held = held_before(item, record, signal[0])
+    held = levels_before_record(item, record, signal[0])
     shown = high_pass(signal, interval, tau, item.order, held)
     if item.order == int(item.order):  # each stage obeys y' = x' - y / tau
         for order in range(1, int(item.order) + 1):

@@ -240,7 +240,7 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
 
 
 def finite_signals(work: Workbench, chance: Chance, changes: Changes) -> Signals | None:
-    """Return readings without noise, or None if the motion diverges or a load has no equilibrium."""
+    """Return readings without noise, None if it diverges or a load has no equilibrium."""
     try:
         with np.errstate(invalid="ignore", over="ignore"):
             signals = true_signals(work.rig, work.plan, chance, changes)

@@ -83,9 +83,9 @@ def report(cases: Sequence[Scored], missing: int = 0) -> str:
     lines += ["## Shares, with 95 % intervals", ""]
     lines += _table(["cases", "rig", "number", *(o.value for o in Outcome)], rows)
     lines += [
-        "right: exactly what is hidden (a trap: also an accepted verdict); group: a group or family that "
-        "holds it; open: unexplained, below detectability or data error; missed: 'nothing missing'; part: "
-        "one of two; wrong: anything else.",
+        "right: exactly what is hidden (a trap: also an accepted verdict); group: a group or "
+        "family that holds it; open: unexplained, below detectability or data error; missed: 'nothing "
+        "missing'; part: one of two; wrong: anything else.",
         "",
     ]
     for kind, title in TITLES.items():

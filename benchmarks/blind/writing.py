@@ -60,7 +60,8 @@ def _trial(trial: TrialPlan, file: str, case: Case) -> list[str]:
         rows["load_place"] = _text(plan.places[trial.place])
     if trial.kind == "ringdown":
         rows["release"] = (
-            f'{{ displacement = {trial.release!r}, unit = "m", deviation = {plan.release_deviation!r}, '
+            f'{{ displacement = {trial.release!r}, unit = "m", '
+            f"deviation = {plan.release_deviation!r}, "
             "at_rest = true, mode_count = 3, time_zero_deviation = 0.0 }"
         )
     return _table("[[trial]]", rows)

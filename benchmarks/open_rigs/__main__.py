@@ -87,7 +87,8 @@ def main() -> None:
             row = judge(arguments.out, arguments.seed, number, arguments.variant)
             rows.append(row)
             print(
-                f"{number:2d} {row['rig']:14s} {', '.join(row['identifiers']) or 'nothing':20s} gap "
+                f"{number:2d} {row['rig']:14s} "
+                f"{', '.join(row['identifiers']) or 'nothing':20s} gap "
                 f"{row['gap']:5.1f} {row['left']:5s} {row['remainder']:5.2f}  {row['outcome']:14s} "
                 f"{row['seconds']:4.0f} s  {row['sentence']}",
                 flush=True,
@@ -113,7 +114,8 @@ def tell(rows: Sequence[Mapping[str, Any]]) -> None:
         if key in row["values"]
     ]
     print(
-        f"port right: {right} of {len(effects)}; 90 % intervals that hold: {sum(held)} of {len(held)}"
+        f"port right: {right} of {len(effects)}; "
+        f"90 % intervals that hold: {sum(held)} of {len(held)}"
     )
     print(f"seconds of processor, median: {median(row['seconds'] for row in rows):.0f}")
 

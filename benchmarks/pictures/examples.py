@@ -32,5 +32,6 @@ def draw_force_at_joint() -> Drawing:
         figure.suptitle("Force that the three-mass chain lacks at its joint", x=0.02, ha="left")
         png = to_png(figure, 110.0)
     return Drawing(
-        png, {"rms": float(missing.told.rms), "largest": abs(float(missing.told.largest.force))}
+        png,
+        {"rms": float(missing.at_port.rms), "largest": abs(float(missing.at_port.largest.force))},
     )

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from benchmarks.studies.seeds import outcomes
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
+from fe.structure.affine import static_response
 from fe.wing.design import load_design
-from fe.wing.operators import assemble, solve_static
+from fe.wing.operators import assemble, wing_values
 from twin_master.assets.asset_source import Asset, AssetReading, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.reading import Estimated, Outcomes
@@ -164,9 +165,8 @@ def third_region() -> Callable[[float], NDArray[np.float64]]:
         design.changed(defects=[*(d.model_dump() for d in design.defects), THIRD_REGION])
     )
     losses = np.linspace(0.0, SOFTENING[2], 5)
-    strain = np.array(
-        [solve_static(operators, 1.0, (0.0, 0.0, loss), 3.0).strain for loss in losses]
-    )
+    states = [wing_values(operators, 1.0, (0.0, 0.0, loss), load_factor=3.0) for loss in losses]
+    strain = np.array([static_response(operators, values).strain for values in states])
     factors = strain / strain[0]
     return lambda loss: np.array([np.interp(loss, losses, column) for column in factors.T])
 

@@ -28,9 +28,9 @@ from discrepancy.system.motion import motion_of
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
-from fe.reduction.model_cache import reduced_structure
-from fe.runtime.motion import laws_of
+from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.port_laws import port_laws
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.packing.structure_fmu import build_fmu
@@ -115,7 +115,7 @@ def structure_file(folder: Path) -> Path:
 def rig(folder: Path) -> Path:
     """Pack the bracket and write its model file; return the model file."""
     file = structure_file(folder)
-    build_fmu(reduced_structure(file), folder / "bracket.fmu", kind="compiled")
+    build_fmu(reduced_model(file), folder / "bracket.fmu", kind="compiled")
     path = folder / "rig.toml"
     path.write_text(rig_text(load_structure(file), "bracket.fmu"), encoding="utf-8")
     return path
@@ -138,7 +138,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     system = LinearSystem(
         mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, rayleigh.beta
     )
-    laws = laws_of(ModelPatch(hidden.laws), system.ports)
+    laws = port_laws(ModelPatch(hidden.laws), system.ports)
     channels = {
         name: Channel(
             name,

@@ -162,7 +162,7 @@ def _check_trials_of_courses(
     timed = [
         template
         for template in templates
-        if template.in_windows or PRIMITIVES[template.kind].courses
+        if template.in_windows or PRIMITIVES[template.kind].formula_fields
     ]
     if not timed:
         return
@@ -246,7 +246,7 @@ class _PrimitiveTemplate:
             What the place stands for.
         """
         words = {"place": target.name, "quantity of the place": target.quantity}
-        courses = PRIMITIVES[self.kind].courses
+        courses = PRIMITIVES[self.kind].formula_fields
         row: dict[str, str | float] = {}
         for name, value in self.values.items():
             if isinstance(value, str):
@@ -254,7 +254,7 @@ class _PrimitiveTemplate:
             elif not isinstance(value, Expression):
                 row[name] = value
             elif name in courses:  # a formula in time stays a formula
-                used_numbers = {key: numbers[key] for key in value.used() if key in numbers}
+                used_numbers = {key: numbers[key] for key in value.used_names() if key in numbers}
                 row[name] = value.with_numbers(used_numbers)
             else:
                 row[name] = value.value(numbers)
@@ -287,8 +287,8 @@ def _primitive_template(
     if kind not in PRIMITIVES:
         raise CatalogueError(f"{place}: 'kind' is {kind!r}, but known are {', '.join(PRIMITIVES)}.")
     primitive = PRIMITIVES[kind]
-    types = primitive.values()
-    window_keys = ("begin", "end") if primitive.in_windows else ()
+    types = primitive.value_types()
+    window_keys = ("begin", "end") if primitive.can_act_in_windows else ()
     allowed_keys = ("kind", *types, *window_keys, "if")
     scales = {name for name in SCALES if SHAPES_OF_SCALES.get(name, set()) <= parameters}
     known_names = parameters | scales
@@ -306,7 +306,7 @@ def _primitive_template(
             if key not in types:
                 names = known_names | moments if key in window_keys else known_names
                 conditions[key] = Expression(text, names, repr(key))
-            elif key in primitive.courses:
+            elif key in primitive.formula_fields:
                 values[key] = Expression(text, known_names | moments | {"time"}, repr(key))
             elif isinstance(value, str) and types[key] is not str:
                 values[key] = Expression(text, known_names, repr(key))
@@ -316,7 +316,7 @@ def _primitive_template(
     used: set[str] = set()
     for expression in (*values.values(), *conditions.values()):
         if isinstance(expression, Expression):
-            used.update(expression.used())
+            used.update(expression.used_names())
     return _PrimitiveTemplate(
         place=place,
         kind=kind,
@@ -334,7 +334,7 @@ def _check_values(kind: str, values: Mapping[str, str | float | Expression]) -> 
         if not isinstance(value, Expression):
             row[key] = value
         else:
-            row[key] = "1" if key in PRIMITIVES[kind].courses else 1.0
+            row[key] = "1" if key in PRIMITIVES[kind].formula_fields else 1.0
     _primitive_of(kind, row)
 
 
@@ -383,7 +383,7 @@ class _EffectOfFile:
 
 def _primitive_of(kind: str, row: Mapping[str, str | float]) -> Primitive:
     """Return a primitive by its values; whole floats become integers where integers are needed."""
-    types = PRIMITIVES[kind].values()
+    types = PRIMITIVES[kind].value_types()
     integers: dict[str, int] = {}
     for name, value in row.items():
         if types[name] is int and isinstance(value, float) and value == int(value):

@@ -11,8 +11,8 @@ from discrepancy.catalogue.entry import ROW, EffectKeys, Number, Setting
 from discrepancy.system.interface import Model
 from discrepancy.system.scales import PortScale
 from discrepancy.system.structures import StructureModel
-from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, Primitive
+from fe.runtime.port_laws import PLANFORM
 from fe.runtime.wing_rows import PORTS
 
 Names = tuple[str, ...]

@@ -140,7 +140,7 @@ def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
     values = {parameter.name: parameter.prior.value(0.5) for parameter in effect.parameters}
     patch = effect.patch(setting, values, places[0])
     has_other_windows = patch.has_windows
-    primitives_allow_it = all(primitive.in_windows for primitive in patch)
+    primitives_allow_it = all(primitive.can_act_in_windows for primitive in patch)
     if not len(patch) or has_other_windows or not primitives_allow_it:
         return False
     only_sensors = all(isinstance(primitive, SENSORS) for primitive in patch)

@@ -23,11 +23,11 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.system.response import Response
 from discrepancy.system.sensing import observe_response
 from fe.compilation import compiled, law_functions
-from fe.runtime.arrays import HEAD, PLACE
+from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.laws import LAWS, advance, pull
+from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import steady
+from fe.runtime.laws.speed import steady_force
 from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of
 
@@ -131,11 +131,11 @@ def fill_course(
     """
     for k in range(len(positions)):
         if of_speed:
-            course[k] = steady(law, positions[k], speeds[k])
+            course[k] = steady_force(law, positions[k], speeds[k])
         else:
             advance(number, law, memory, positions[k])
-            memory[PLACE] = positions[k]
-            course[k] = pull(number, law, memory, positions[k], 1.0)[0]
+            memory[POSITION] = positions[k]
+            course[k] = force_and_slope(number, law, memory, positions[k], 1.0)[0]
 
 
 @cache
@@ -168,25 +168,25 @@ def law_course(
     holding_force : (F,) array or float
         The missing force at the port, which holds it at rest.
     """
-    row = law.row
+    row = law.parameter_row
     course = np.zeros(len(position))
-    memory = np.zeros(HEAD + max(1, len(row) - PARAMETERS))
+    memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
     kind = type(law)
     _compiled_fill_course()(
         LAWS.index(kind),
-        kind.of_speed,
+        kind.depends_on_speed,
         row,
         np.ascontiguousarray(position),
         np.ascontiguousarray(speed),
         memory,
         course,
     )
-    if kind.of_speed and speed_deviation > 0.0:
+    if kind.depends_on_speed and speed_deviation > 0.0:
         slow_speed = max(WIDER * speed_deviation, SLOW * float(np.sqrt(np.mean(speed**2))))
         moves = erf(np.abs(speed) / (np.sqrt(2.0) * slow_speed))
         held = np.clip(holding_force, -np.abs(course), np.abs(course))
         course = moves * course + (1.0 - moves) * held
-    return course * law.acts(time)
+    return course * law.acts_at(time)
 
 
 # ---------------------------------------------------------------- columns

@@ -381,12 +381,27 @@ def _static_response(structure: AffineStructure, displacement: FloatArray) -> St
     )
 
 
+class NaturalModes(NamedTuple):
+    """Lowest undamped modes of a structure.
+
+    Attributes
+    ----------
+    frequency : (count,) array
+        Natural frequencies [Hz], ascending.
+    shape : (n, count) array
+        Mass-normalised shapes of the free unknowns.
+    """
+
+    frequency: FloatArray
+    shape: FloatArray
+
+
 def natural_frequencies(
     structure: AffineStructure,
     count: int,
     values: Mapping[str, float] | None = None,
     factors: Factorisation | None = None,
-) -> tuple[FloatArray, FloatArray]:
+) -> NaturalModes:
     """Return the lowest natural frequencies and mode shapes, undamped.
 
     Parameters
@@ -399,13 +414,6 @@ def natural_frequencies(
         Parameters, losses and free masses; the others are nominal, and healthy.
     factors : Factorisation, optional
         The factorised stiffness at these values, if it is at hand.
-
-    Returns
-    -------
-    frequencies : (count,) array
-        Natural frequencies [Hz], ascending.
-    shapes : (n, count) array
-        Mass-normalised shapes.
 
     Raises
     ------
@@ -423,4 +431,4 @@ def natural_frequencies(
         raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")
     squares, shapes = lowest_eigenpairs(factors or system.stiffness, system.mass, count)
     modal_masses = np.einsum("im,im->m", shapes, system.mass @ shapes)
-    return np.sqrt(squares) / (2.0 * np.pi), shapes / np.sqrt(modal_masses)
+    return NaturalModes(frequency=np.sqrt(squares) / (2.0 * np.pi), shape=shapes / np.sqrt(modal_masses))

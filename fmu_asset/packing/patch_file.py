@@ -182,7 +182,7 @@ def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
         with PatchFileError.instead_of(InvalidPatchError):
             patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
             for item in patch:
-                if item.windows or item.courses:
+                if item.windows or item.formula_fields:
                     raise PatchFileError(said("patch.windows", where=where, name=name, item=item))
                 if isinstance(item, PortForce) and item.magnitude:
                     item.check()

@@ -16,12 +16,11 @@ from typing import Any, Literal, TypedDict, Unpack, get_args
 from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensors import needs_structure
 from fe.runtime.state import DigitalState
-from fe.runtime.transient import ModalIntegrator
-from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.compiled.package import (
@@ -199,7 +198,7 @@ def _patched_members(
     if arrays.design_hash != model.design_hash:
         raise PatchFileError(said("packing.other_design", arrays=arrays, model=model))
     with PatchFileError.instead_of(FiniteElementError, before="The wing cannot carry the patch: "):
-        ModalIntegrator(PatchedWing(arrays), model.nominal, *model.damping.tolist(), patch).modes  # noqa: B018
+        _ = PatchedWing(arrays).structure_at(model.nominal, patch).modes
     if not len(patch.of(LocalStiffnessLoss)):  # strips, which only that needs, are most of the bytes
         strips = ("strip_stiffness", "strip_of", "term_of")
         arrays = changed(arrays, **{name: getattr(arrays, name)[:0] for name in strips})
